@@ -1,0 +1,192 @@
+// DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper): what has arrived,
+// what is missing, and every way in which the two can contradict each other.
+//
+// An input is a member of a generation and announces children in the next; the sum over generation g is the size
+// of generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The tree is complete when
+// every announced input has arrived.
+#pragma once
+
+#include <dfb/error.hpp>
+#include <dfb/tile.hpp>
+
+#include <algorithm>
+#include <cstdint>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+class DependencyTracker {
+public:
+    DependencyTracker() { reset(); }
+
+    // Forgets everything and expects `rootCount` inputs of generation 0 (the paper's background tile is one).
+    void reset(int rootCount = 1)
+    {
+        generations_.clear();
+        inputs_.clear();
+        declared_.clear();
+        hasDeclaration_ = false;
+        current_ = 0;
+        closed_ = false;
+        generation(0).expected = rootCount;
+    }
+
+    // The owner's own root (generation 0) has come, and what follows in generation 1 are exactly these
+    // (source, part) pairs, each once. Used where the counts come from the senders' manifests; call it once, in
+    // place of an arriving root. Throws as arrive() does, if what came before was not declared.
+    void declare(std::vector<std::pair<std::uint32_t, std::uint16_t>> inputs)
+    {
+        std::sort(inputs.begin(), inputs.end());
+        const auto twice = std::adjacent_find(inputs.begin(), inputs.end());
+        if (twice != inputs.end())
+            fail(ErrorKind::DuplicateInput, 1, twice->first, 1, 2, "declared twice");
+        declared_ = std::move(inputs);
+        hasDeclaration_ = true;
+        for (const Input& input : inputs_)
+            if (input.generation == 1)
+                checkDeclared(input);
+        Generation& root = generation(0);
+        ++root.arrived;
+        root.children += static_cast<std::int64_t>(declared_.size());
+        advance();
+    }
+
+    // Takes note of one input. Throws Error, naming generation, source, expected and got, for: a negative number
+    // of children, a duplicate (generation, source, part), more inputs than announced, and an input of a
+    // generation or source that nobody announced. After a throw the tree is of no further use until reset().
+    void arrive(int generationIndex, std::uint32_t source, std::uint16_t part, int children)
+    {
+        const Input input{generationIndex, source, part};
+        if (generationIndex < 0)
+            fail(ErrorKind::UnannouncedInput, 0, source, 0, 0, "the generation is negative");
+        if (generationIndex >= maxGenerations)
+            fail(ErrorKind::UnannouncedInput, generationIndex, source, maxGenerations, generationIndex,
+                 "a tree has at most " + std::to_string(maxGenerations) + " generations");
+        if (children < 0)
+            fail(ErrorKind::NegativeChildren, generationIndex, source, -1, -1,
+                 "announced " + std::to_string(children) + " children");
+        const auto place = std::lower_bound(inputs_.begin(), inputs_.end(), input);
+        if (place != inputs_.end() && *place == input)
+            fail(ErrorKind::DuplicateInput, generationIndex, source, 1, 2, "part " + std::to_string(part));
+        if (hasDeclaration_ && generationIndex == 1)
+            checkDeclared(input);
+        if (closed_ && generationIndex >= current_)
+            fail(ErrorKind::UnannouncedInput, generationIndex, source, 0, 1, "no parent announced it");
+        inputs_.insert(place, input);
+        Generation& g = generation(generationIndex);
+        ++g.arrived;
+        g.children += children;
+        if (generationIndex < current_ || (generationIndex == current_ && g.arrived > g.expected))
+            fail(ErrorKind::TooManyInputs, generationIndex, source, g.expected, g.arrived, "");
+        advance();
+    }
+
+    bool complete() const noexcept { return closed_; }
+    int arrivedCount() const noexcept { return static_cast<int>(inputs_.size()); }
+
+    // What the first incomplete generation still waits for, in words; empty when complete.
+    std::string missing() const
+    {
+        if (closed_)
+            return {};
+        const Generation& g = generations_[static_cast<std::size_t>(current_)];
+        std::string text = "generation " + std::to_string(current_) + " has " + std::to_string(g.arrived) + " of "
+                           + std::to_string(g.expected) + " inputs";
+        if (hasDeclaration_ && current_ == 1) {
+            const char* separator = "; missing source ";
+            for (const auto& [source, part] : declared_)
+                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part})) {
+                    text += separator + std::to_string(source);
+                    separator = ", ";
+                }
+        }
+        return text;
+    }
+
+    static constexpr int maxGenerations = 1 << 16;
+
+private:
+    struct Generation {
+        std::int64_t expected = 0, arrived = 0, children = 0;
+    };
+    struct Input {
+        int generation;
+        std::uint32_t source;
+        std::uint16_t part;
+        bool operator==(const Input& o) const
+        {
+            return generation == o.generation && source == o.source && part == o.part;
+        }
+        bool operator<(const Input& o) const
+        {
+            if (generation != o.generation)
+                return generation < o.generation;
+            return source != o.source ? source < o.source : part < o.part;
+        }
+    };
+
+    Generation& generation(int index)
+    {
+        if (static_cast<std::size_t>(index) >= generations_.size())
+            generations_.resize(static_cast<std::size_t>(index) + 1);
+        return generations_[static_cast<std::size_t>(index)];
+    }
+
+    // Steps over every generation that is complete; its children are what the next one expects.
+    void advance()
+    {
+        while (!closed_) {
+            const Generation done = generation(current_);
+            if (done.arrived < done.expected)
+                return;
+            if (done.arrived > done.expected)
+                failAt(current_, ErrorKind::TooManyInputs, done.expected, done.arrived);
+            ++current_;
+            generation(current_).expected = done.children;
+            if (done.children == 0) {
+                closed_ = true;
+                for (std::size_t g = static_cast<std::size_t>(current_); g < generations_.size(); ++g)
+                    if (generations_[g].arrived > 0)
+                        failAt(static_cast<int>(g), ErrorKind::UnannouncedInput, 0, generations_[g].arrived);
+            }
+        }
+    }
+
+    void checkDeclared(const Input& input) const
+    {
+        if (!std::binary_search(declared_.begin(), declared_.end(), std::make_pair(input.source, input.part)))
+            fail(ErrorKind::UnannouncedInput, input.generation, input.source, 0, 1,
+                 "its rank did not declare it, part " + std::to_string(input.part));
+    }
+
+    // Blames the first input of a generation, where the culprit can not be told from the others.
+    [[noreturn]] void failAt(int generationIndex, ErrorKind kind, std::int64_t expected, std::int64_t got) const
+    {
+        const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), Input{generationIndex, 0, 0});
+        fail(kind, generationIndex, first != inputs_.end() ? first->source : 0, expected, got, "");
+    }
+
+    [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, std::int64_t expected,
+                                  std::int64_t got, std::string message)
+    {
+        ErrorInfo info;
+        info.kind = kind;
+        info.generation = generationIndex;
+        info.source = source;
+        info.expected = expected;
+        info.got = got;
+        info.message = std::move(message);
+        throw Error(std::move(info));
+    }
+
+    std::vector<Generation> generations_;
+    std::vector<Input> inputs_; // sorted
+    std::vector<std::pair<std::uint32_t, std::uint16_t>> declared_; // sorted
+    bool hasDeclaration_ = false;
+    int current_ = 0; // the first generation that is not complete
+    bool closed_ = false;
+};
+
+} // namespace dfb

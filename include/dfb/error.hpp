@@ -1,0 +1,130 @@
+// The errors of dfb: one record of what went wrong where, and the exceptions that carry it.
+//
+// InvalidArgument is thrown at once by the call that was wrong, before anything is sent. What goes wrong in
+// the background of a frame comes out of Frame::end() as FrameError, the same on every rank.
+#pragma once
+
+#include <dfb/version.hpp>
+
+#include <cstdint>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+namespace dfb {
+
+enum class ErrorKind : std::uint32_t {
+    InvalidArgument,   // a call with arguments that can never be right
+    TooManyInputs,     // a generation has received more tiles than were announced for it
+    DuplicateInput,    // the same (pass, generation, source, part) came twice for one tile
+    UnannouncedInput,  // an input of a generation or source that nobody announced
+    NegativeChildren,  // a tile announced fewer than zero children
+    MalformedMessage,  // bytes off the wire that are not a message of this framebuffer
+    Disagreement,      // ranks were given different configurations or frame parameters
+    UserCode,          // an exception out of a renderer, a tile operation or a pixel operation
+    Cancelled,         // a frame was left without end()
+    Transport          // the transport reported a failure
+};
+
+inline const char* toString(ErrorKind kind)
+{
+    switch (kind) {
+    case ErrorKind::InvalidArgument: return "invalid argument";
+    case ErrorKind::TooManyInputs: return "too many inputs";
+    case ErrorKind::DuplicateInput: return "duplicate input";
+    case ErrorKind::UnannouncedInput: return "unannounced input";
+    case ErrorKind::NegativeChildren: return "negative number of children";
+    case ErrorKind::MalformedMessage: return "malformed message";
+    case ErrorKind::Disagreement: return "ranks disagree";
+    case ErrorKind::UserCode: return "exception in user code";
+    case ErrorKind::Cancelled: return "frame cancelled";
+    case ErrorKind::Transport: return "transport failure";
+    }
+    return "unknown error";
+}
+
+// What went wrong, and where. A negative number means "does not apply".
+struct ErrorInfo {
+    ErrorKind kind = ErrorKind::InvalidArgument;
+    int rank = -1;               // the rank that noticed
+    std::int64_t frame = -1;
+    std::int64_t tile = -1;
+    std::int64_t pass = -1;
+    std::int64_t generation = -1;
+    std::int64_t source = -1;    // brick id, or rank
+    std::int64_t expected = -1;
+    std::int64_t got = -1;
+    std::string message;         // the detail in words, may be empty
+
+    // One line that names everything that applies.
+    std::string describe() const
+    {
+        std::string text = std::string("dfb: ") + toString(kind);
+        auto add = [&text, separator = ": "](const char* name, std::int64_t value) mutable {
+            if (value < 0)
+                return;
+            text += separator + std::string(name) + ' ' + std::to_string(value);
+            separator = ", ";
+        };
+        add("rank", rank);
+        add("frame", frame);
+        add("tile", tile);
+        add("pass", pass);
+        add("generation", generation);
+        add("source", source);
+        add("expected", expected);
+        add("got", got);
+        if (!message.empty())
+            text += ": " + message;
+        return text;
+    }
+};
+
+class Error : public std::runtime_error {
+public:
+    explicit Error(ErrorInfo info) : std::runtime_error(info.describe()), info_(std::move(info)) {}
+    const ErrorInfo& info() const noexcept { return info_; }
+
+private:
+    ErrorInfo info_;
+};
+
+// A call that can never be right. Nothing was sent, the object is unchanged.
+class InvalidArgument : public Error {
+public:
+    using Error::Error;
+    explicit InvalidArgument(std::string message) : Error(make(std::move(message))) {}
+
+private:
+    static ErrorInfo make(std::string message)
+    {
+        ErrorInfo info;
+        info.message = std::move(message);
+        return info;
+    }
+};
+
+// A frame failed. Every rank throws the same one out of Frame::end(); the framebuffer can begin a new frame.
+class FrameError : public Error {
+public:
+    using Error::Error;
+};
+
+// The transport can not work or has failed; the framebuffer is of no further use.
+class TransportError : public Error {
+public:
+    using Error::Error;
+    explicit TransportError(std::string message, int rank = -1) : Error(make(std::move(message), rank)) {}
+
+private:
+    static ErrorInfo make(std::string message, int rank)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Transport;
+        info.rank = rank;
+        info.message = std::move(message);
+        return info;
+    }
+};
+
+} // namespace dfb

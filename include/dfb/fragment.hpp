@@ -1,0 +1,118 @@
+// Fragment: a sparse owning handle of one input of a tile: who it is, and per channel the active row spans,
+// read in place out of the message that brought it.
+#pragma once
+
+#include <dfb/tile.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <utility>
+
+namespace dfb {
+
+// A run of active pixels in a row, counted from the region's left border.
+struct Span {
+    std::uint16_t x = 0;
+    std::uint16_t count = 0;
+};
+
+// The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its
+// colour at color + 4 * k and its depth at depth + k.
+struct FragmentRow {
+    const Span* spans = nullptr;
+    int spanCount = 0;
+    const float* color = nullptr;
+    const float* depth = nullptr; // null where the depth channel did not travel
+};
+
+// How the pixels of a fragment are stored.
+enum class FragmentEncoding : std::uint8_t {
+    Empty,    // no active pixel: "nothing here"
+    Sparse,   // row spans
+    Dense,    // every pixel of the region, no spans
+    Constant  // every pixel of the region alike: one pixel is stored
+};
+
+class Fragment {
+public:
+    // The parts of a decoded message; made by detail::decodeFragment, which has checked them.
+    struct Parts {
+        FragmentEncoding encoding = FragmentEncoding::Empty;
+        int rowBegin = 0, rowEnd = 0;               // rows that have active pixels, counted in the region
+        std::uint32_t activePixels = 0;             // that contribute, also where fewer are stored
+        const std::uint16_t* rowSpanCounts = nullptr; // Sparse: one per row in [rowBegin, rowEnd)
+        const Span* spans = nullptr;                // Sparse: all spans, row by row; else one full-width span
+        const float* color = nullptr;
+        const float* depth = nullptr;
+        Span fullRow;                               // Dense and Constant
+    };
+
+    Fragment() = default;
+    Fragment(const TileHeader& header, Buffer&& storage, const Parts& parts)
+        : header_(header), storage_(std::move(storage)), parts_(parts)
+    {
+    }
+    Fragment(Fragment&&) noexcept = default;
+    Fragment& operator=(Fragment&&) noexcept = default;
+
+    const TileHeader& header() const noexcept { return header_; }
+    bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
+    std::uint32_t activePixels() const noexcept { return parts_.activePixels; }
+    bool hasDepth() const noexcept { return parts_.depth != nullptr; }
+    FragmentEncoding encoding() const noexcept { return parts_.encoding; }
+    std::size_t storedBytes() const noexcept { return storage_.size(); }
+
+private:
+    friend class FragmentCursor;
+    TileHeader header_;
+    Buffer storage_;
+    Parts parts_;
+};
+
+// Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
+class FragmentCursor {
+public:
+    explicit FragmentCursor(const Fragment& fragment)
+        : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
+          depth_(fragment.parts_.depth)
+    {
+    }
+
+    // The active pixels of the next row of the region, starting with row 0; a row may have none.
+    FragmentRow next()
+    {
+        const int row = row_++;
+        if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
+            return {};
+        if (parts_->encoding != FragmentEncoding::Sparse) {
+            const FragmentRow result{&parts_->fullRow, 1, color_, depth_};
+            if (parts_->encoding == FragmentEncoding::Dense)
+                advance(parts_->fullRow.count);
+            return result;
+        }
+        const int count = parts_->rowSpanCounts[row - parts_->rowBegin];
+        const FragmentRow result{span_, count, color_, depth_};
+        std::size_t pixels = 0;
+        for (int i = 0; i < count; ++i)
+            pixels += span_[i].count;
+        span_ += count;
+        advance(pixels);
+        return result;
+    }
+
+private:
+    void advance(std::size_t pixels)
+    {
+        color_ += 4 * pixels;
+        if (depth_)
+            depth_ += pixels;
+    }
+
+    const Fragment::Parts* parts_;
+    const Span* span_;
+    const float* color_;
+    const float* depth_;
+    int row_ = 0;
+};
+
+} // namespace dfb

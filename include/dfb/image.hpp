@@ -1,0 +1,187 @@
+// Image: what the display rank gets, in one of the output formats; and the exact conversion of linear pixels
+// to those formats.
+#pragma once
+
+#include <dfb/buffer.hpp>
+#include <dfb/error.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <string>
+
+namespace dfb {
+
+// A half-open rectangle of pixels, [x0, x1) x [y0, y1), row 0 on top.
+struct Region {
+    int x0 = 0, y0 = 0, x1 = 0, y1 = 0;
+
+    int width() const noexcept { return x1 - x0; }
+    int height() const noexcept { return y1 - y0; }
+    bool empty() const noexcept { return x1 <= x0 || y1 <= y0; }
+    bool contains(int x, int y) const noexcept { return x >= x0 && x < x1 && y >= y0 && y < y1; }
+};
+
+inline bool operator==(const Region& a, const Region& b) noexcept
+{
+    return a.x0 == b.x0 && a.y0 == b.y0 && a.x1 == b.x1 && a.y1 == b.y1;
+}
+inline bool operator!=(const Region& a, const Region& b) noexcept { return !(a == b); }
+
+inline Region intersection(const Region& a, const Region& b) noexcept
+{
+    return {std::max(a.x0, b.x0), std::max(a.y0, b.y0), std::min(a.x1, b.x1), std::min(a.y1, b.y1)};
+}
+
+// Pixels are premultiplied RGBA, 4 channels interleaved.
+enum class OutputFormat : std::uint32_t {
+    None,    // nothing travels to the display rank and nothing is stored there
+    RGBA8,   // 8 bits a channel, linear: 255 * value, rounded to nearest, ties to even
+    SRGBA8,  // 8 bits a channel, colour through the sRGB curve (IEC 61966-2-1), alpha linear
+    RGBA32F  // 32-bit float, linear
+};
+
+inline std::size_t bytesPerPixel(OutputFormat format) noexcept
+{
+    return format == OutputFormat::None ? 0 : format == OutputFormat::RGBA32F ? 16 : 4;
+}
+
+namespace detail {
+
+// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0.
+inline std::uint8_t toUnorm8(double value) noexcept
+{
+    if (!(value > 0.0))
+        return 0;
+    if (value >= 1.0)
+        return 255;
+    // 2^52 leaves no bit below one, so the addition rounds as the current (default) mode does: to even.
+    const double shift = 4503599627370496.0;
+    return static_cast<std::uint8_t>((value * 255.0 + shift) - shift);
+}
+
+// thresholds()[k] is the least linear value whose sRGB level is k + 1: the decision is a comparison and so
+// exact, where evaluating the curve would be off near every boundary.
+inline const std::array<double, 255>& srgbThresholds()
+{
+    static const std::array<double, 255> table = [] {
+        std::array<double, 255> t{};
+        for (int k = 0; k < 255; ++k) {
+            const long double s = (static_cast<long double>(k) + 0.5L) / 255.0L;
+            t[static_cast<std::size_t>(k)] = static_cast<double>(
+                s <= 0.04045L ? s / 12.92L : std::pow((s + 0.055L) / 1.055L, 2.4L));
+        }
+        return t;
+    }();
+    return table;
+}
+
+inline std::uint8_t toSrgb8(double linear) noexcept
+{
+    const auto& t = srgbThresholds();
+    if (!(linear >= t.front()))
+        return 0;
+    return static_cast<std::uint8_t>(std::upper_bound(t.begin(), t.end(), linear) - t.begin());
+}
+
+// Converts `count` linear RGBA pixels of type double or float into `out`, bytesPerPixel(format) each.
+template <class Real>
+void convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
+{
+    switch (format) {
+    case OutputFormat::None: return;
+    case OutputFormat::RGBA32F: {
+        for (int i = 0; i < 4 * count; ++i) {
+            const float value = static_cast<float>(rgba[i]);
+            std::memcpy(out + sizeof(float) * static_cast<std::size_t>(i), &value, sizeof value);
+        }
+        return;
+    }
+    case OutputFormat::RGBA8: {
+        auto* bytes = reinterpret_cast<std::uint8_t*>(out);
+        for (int i = 0; i < 4 * count; ++i)
+            bytes[i] = toUnorm8(rgba[i]);
+        return;
+    }
+    case OutputFormat::SRGBA8: {
+        auto* bytes = reinterpret_cast<std::uint8_t*>(out);
+        for (int i = 0; i < count; ++i) {
+            for (int c = 0; c < 3; ++c)
+                bytes[4 * i + c] = toSrgb8(rgba[4 * i + c]);
+            bytes[4 * i + 3] = toUnorm8(rgba[4 * i + 3]);
+        }
+        return;
+    }
+    }
+}
+
+} // namespace detail
+
+// A whole image, row-major, row 0 on top, no padding. Empty on ranks other than the display rank and with
+// OutputFormat::None.
+class Image {
+public:
+    Image() = default;
+    Image(MemoryPool& pool, int width, int height, OutputFormat format, bool withDepth)
+        : width_(width), height_(height), format_(format)
+    {
+        if (format != OutputFormat::None)
+            color_ = pool.acquire(pixelCount() * bytesPerPixel(format));
+        if (withDepth && format != OutputFormat::None)
+            depth_ = pool.acquire(pixelCount() * sizeof(float));
+    }
+
+    int width() const noexcept { return width_; }
+    int height() const noexcept { return height_; }
+    OutputFormat format() const noexcept { return format_; }
+    std::size_t pixelCount() const noexcept
+    {
+        return static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
+    }
+    bool empty() const noexcept { return color_.empty(); }
+    bool hasDepth() const noexcept { return !depth_.empty(); }
+
+    std::byte* bytes() noexcept { return color_.data(); }
+    const std::byte* bytes() const noexcept { return color_.data(); }
+
+    // 4 bytes a pixel. Throws InvalidArgument unless the format is RGBA8 or SRGBA8.
+    const std::uint8_t* rgba8() const
+    {
+        require(format_ == OutputFormat::RGBA8 || format_ == OutputFormat::SRGBA8, "8-bit pixels");
+        return reinterpret_cast<const std::uint8_t*>(color_.data());
+    }
+    // 4 floats a pixel. Throws InvalidArgument unless the format is RGBA32F.
+    const float* rgba32f() const
+    {
+        require(format_ == OutputFormat::RGBA32F, "float pixels");
+        return reinterpret_cast<const float*>(color_.data());
+    }
+    // One float a pixel, +infinity where nothing was hit. Throws InvalidArgument if depth was not asked for.
+    const float* depth() const
+    {
+        require(hasDepth(), "depth");
+        return reinterpret_cast<const float*>(depth_.data());
+    }
+    float* depth()
+    {
+        require(hasDepth(), "depth");
+        return reinterpret_cast<float*>(depth_.data());
+    }
+
+private:
+    void require(bool condition, const char* what) const
+    {
+        if (!condition || empty())
+            throw InvalidArgument(std::string("this image has no ") + what
+                                  + " (only the display rank has an image, in the format it was configured for)");
+    }
+
+    int width_ = 0, height_ = 0;
+    OutputFormat format_ = OutputFormat::None;
+    Buffer color_;
+    Buffer depth_;
+};
+
+} // namespace dfb

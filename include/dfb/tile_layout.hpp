@@ -1,0 +1,94 @@
+// TileLayout: how an image is divided into tiles; and OwnerMap: which rank owns which tile.
+#pragma once
+
+#include <dfb/error.hpp>
+#include <dfb/tile.hpp>
+
+#include <algorithm>
+#include <cstdint>
+#include <functional>
+#include <numeric>
+#include <string>
+
+namespace dfb {
+
+// Tiles are numbered row by row from the top left. All members are pure and may be called from any thread.
+class TileLayout {
+public:
+    static constexpr int maxImageSize = 1 << 16; // pixels a side
+
+    TileLayout() = default;
+    // Throws InvalidArgument for a size outside [1, 65536].
+    TileLayout(int width, int height, int tileSize) : width_(width), height_(height), tileSize_(tileSize)
+    {
+        if (width < 1 || height < 1 || width > maxImageSize || height > maxImageSize)
+            throw InvalidArgument("the image size is " + std::to_string(width) + "x" + std::to_string(height)
+                                  + ", it must be 1 to 65536 pixels a side");
+        tilesX_ = (width + tileSize - 1) / tileSize;
+        tilesY_ = (height + tileSize - 1) / tileSize;
+    }
+
+    int width() const noexcept { return width_; }
+    int height() const noexcept { return height_; }
+    int tileSize() const noexcept { return tileSize_; }
+    int tilesX() const noexcept { return tilesX_; }
+    int tilesY() const noexcept { return tilesY_; }
+    int tileCount() const noexcept { return tilesX_ * tilesY_; }
+
+    int column(int tile) const noexcept { return tile % tilesX_; }
+    int row(int tile) const noexcept { return tile / tilesX_; }
+    int tileAt(int column, int row) const noexcept { return row * tilesX_ + column; }
+
+    // The pixels of a tile, cut at the image's border.
+    Region region(int tile) const noexcept
+    {
+        const int x0 = column(tile) * tileSize_, y0 = row(tile) * tileSize_;
+        return {x0, y0, std::min(x0 + tileSize_, width_), std::min(y0 + tileSize_, height_)};
+    }
+
+    // The columns and rows of tiles that meet a region of pixels, half-open; empty if they miss the image.
+    Region tilesIn(const Region& pixels) const noexcept
+    {
+        const Region r = intersection(pixels, {0, 0, width_, height_});
+        if (r.empty())
+            return {};
+        return {r.x0 / tileSize_, r.y0 / tileSize_, (r.x1 - 1) / tileSize_ + 1, (r.y1 - 1) / tileSize_ + 1};
+    }
+
+private:
+    int width_ = 0, height_ = 0, tileSize_ = 1;
+    int tilesX_ = 0, tilesY_ = 0;
+};
+
+// Names the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks; it is asked once per
+// tile when the framebuffer is made.
+using OwnerMap = std::function<int(int tile, const TileLayout& layout, int rankCount)>;
+
+// The default: each tile row is the one above it shifted by about 0.62 of the rank count, so that neighbours in
+// both directions belong to different ranks (tile mod ranks gives vertical stripes where the two divide).
+inline int latticeOwner(int tile, const TileLayout& layout, int rankCount)
+{
+    int shift = std::max(1, static_cast<int>(0.618 * rankCount));
+    while (std::gcd(shift, rankCount) != 1)
+        --shift;
+    const std::int64_t diagonal = layout.column(tile) + static_cast<std::int64_t>(layout.row(tile)) * shift;
+    return static_cast<int>(diagonal % rankCount);
+}
+
+// Equal contiguous shares in tile order.
+inline int linearOwner(int tile, const TileLayout& layout, int rankCount)
+{
+    return static_cast<int>(static_cast<std::int64_t>(tile) * rankCount / layout.tileCount());
+}
+
+// A fixed pseudo-random scatter (the finaliser of SplitMix64).
+inline int hashOwner(int tile, const TileLayout&, int rankCount)
+{
+    std::uint64_t h = static_cast<std::uint64_t>(tile) + 0x9e3779b97f4a7c15u;
+    h = (h ^ (h >> 30)) * 0xbf58476d1ce4e5b9u;
+    h = (h ^ (h >> 27)) * 0x94d049bb133111ebu;
+    h ^= h >> 31;
+    return static_cast<int>(h % static_cast<std::uint64_t>(rankCount));
+}
+
+} // namespace dfb

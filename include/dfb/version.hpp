@@ -1,0 +1,10 @@
+// The version of dfb, and what it requires of the compiler.
+#pragma once
+
+#define DFB_VERSION_MAJOR 0
+#define DFB_VERSION_MINOR 1
+#define DFB_VERSION_PATCH 0
+
+#if defined(__FAST_MATH__)
+#error "dfb: -ffast-math removes the infinities, NaNs and rounding that compositing relies on; compile without it"
+#endif
