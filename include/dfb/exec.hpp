@@ -1,0 +1,200 @@
+// Executor: runs the tasks of a framebuffer and the loops of a renderer. ThreadExecutor: on std::threads of
+// its own. (TbbExecutor, in tbb_executor.hpp: in a oneTBB arena of its own.)
+#pragma once
+
+#include <dfb/version.hpp>
+
+#include <atomic>
+#include <condition_variable>
+#include <cstddef>
+#include <deque>
+#include <exception>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// The contract: submit() runs a task some time, on some worker, and never blocks; parallelFor() spreads a loop
+// over the workers and returns when all of it is done. Between two iterations of a loop a worker runs the tasks
+// that wait, so that compositing goes on beside rendering. Tasks must not wait for other tasks and must not throw.
+class Executor {
+public:
+    using Task = std::function<void()>;
+
+    virtual ~Executor() = default;
+    Executor() = default;
+    Executor(const Executor&) = delete;
+    Executor& operator=(const Executor&) = delete;
+
+    // Number of workers, at least 1.
+    virtual int concurrency() const noexcept = 0;
+
+    // From any thread.
+    void submit(Task task)
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            tasks_.push_back(std::move(task));
+        }
+        wake();
+    }
+
+    // Calls body(i) for i in [0, count), in no particular order, from several workers at once. The calling thread
+    // waits; called from inside a task the loop runs right there. Rethrows the first exception of a body, after
+    // which bodies not yet begun are not run.
+    void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
+    {
+        if (count == 0)
+            return;
+        std::exception_ptr error;
+        std::mutex errorMutex;
+        std::atomic<bool> stop{false};
+        run(count, [&](std::size_t i) {
+            if (stop.load(std::memory_order_relaxed))
+                return;
+            try {
+                body(i);
+            } catch (...) {
+                std::lock_guard<std::mutex> lock(errorMutex);
+                if (!error)
+                    error = std::current_exception();
+                stop.store(true, std::memory_order_relaxed);
+            }
+            while (runOne()) {
+            }
+        });
+        if (error)
+            std::rethrow_exception(error);
+    }
+
+protected:
+    // Sees to it that a worker calls runOne() soon.
+    virtual void wake() = 0;
+    // Calls body(i) for all i on the workers, and waits. The body does not throw.
+    virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
+
+    // Runs the oldest waiting task, if there is one.
+    bool runOne()
+    {
+        Task task;
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            if (tasks_.empty())
+                return false;
+            task = std::move(tasks_.front());
+            tasks_.pop_front();
+        }
+        task();
+        return true;
+    }
+
+private:
+    std::mutex mutex_;
+    std::deque<Task> tasks_;
+};
+
+// A fixed number of threads. The destructor runs what was submitted, then joins.
+class ThreadExecutor final : public Executor {
+public:
+    // `threadCount` workers; 0: one per hardware thread.
+    explicit ThreadExecutor(int threadCount = 0)
+    {
+        if (threadCount <= 0)
+            threadCount = static_cast<int>(std::thread::hardware_concurrency());
+        if (threadCount <= 0)
+            threadCount = 1;
+        threads_.reserve(static_cast<std::size_t>(threadCount));
+        for (int i = 0; i < threadCount; ++i)
+            threads_.emplace_back([this] { work(); });
+    }
+
+    ~ThreadExecutor() override
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            stop_ = true;
+        }
+        wakeUp_.notify_all();
+        for (std::thread& thread : threads_)
+            thread.join();
+    }
+
+    int concurrency() const noexcept override { return static_cast<int>(threads_.size()); }
+
+private:
+    struct Loop {
+        std::size_t count;
+        const std::function<void(std::size_t)>* body;
+        std::size_t next = 0; // under mutex_
+        std::size_t done = 0; // under mutex_
+    };
+
+    void wake() override
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            ++signals_;
+        }
+        wakeUp_.notify_one();
+    }
+
+    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    {
+        if (current() == this) {
+            for (std::size_t i = 0; i < count; ++i)
+                body(i);
+            return;
+        }
+        Loop loop{count, &body};
+        std::unique_lock<std::mutex> lock(mutex_);
+        loops_.push_back(&loop);
+        wakeUp_.notify_all();
+        loopDone_.wait(lock, [&] { return loop.done == loop.count; });
+    }
+
+    void work()
+    {
+        current() = this;
+        std::unique_lock<std::mutex> lock(mutex_);
+        for (;;) {
+            wakeUp_.wait(lock, [this] { return stop_ || signals_ > 0 || !loops_.empty(); });
+            if (signals_ > 0) {
+                --signals_;
+                lock.unlock();
+                runOne();
+                lock.lock();
+            } else if (!loops_.empty()) {
+                Loop* loop = loops_.front();
+                const std::size_t i = loop->next++;
+                if (loop->next == loop->count)
+                    loops_.pop_front();
+                lock.unlock();
+                (*loop->body)(i);
+                lock.lock();
+                if (++loop->done == loop->count)
+                    loopDone_.notify_all();
+            } else {
+                return;
+            }
+        }
+    }
+
+    // The executor whose worker this thread is.
+    static ThreadExecutor*& current()
+    {
+        static thread_local ThreadExecutor* executor = nullptr;
+        return executor;
+    }
+
+    std::mutex mutex_;
+    std::condition_variable wakeUp_, loopDone_;
+    std::deque<Loop*> loops_;
+    std::size_t signals_ = 0;
+    bool stop_ = false;
+    std::vector<std::thread> threads_;
+};
+
+} // namespace dfb

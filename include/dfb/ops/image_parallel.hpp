@@ -1,0 +1,39 @@
+// ImageParallel: each tile is rendered once per pass, by some rank (Listing 2 of the paper).
+#pragma once
+
+#include <dfb/ops/sort_last.hpp>
+
+#include <utility>
+
+namespace dfb {
+
+// Expects one input of generation 0 without children per pass. The tile is laid over the background, passes are
+// averaged. Depth travels only if the output has it.
+template <int TileSize = 64>
+class BasicImageParallel {
+public:
+    static constexpr int tileSize = TileSize;
+    static constexpr ChannelMask channels = colorChannel | depthChannel;
+    static constexpr ChannelMask neededChannels = colorChannel;
+
+    void newFrame(const TileInfo& info) { store_.newFrame(info); }
+
+    void add(Fragment&& fragment)
+    {
+        if (fragment.header().generation != 0 || fragment.header().children != 0)
+            throw InvalidArgument("an image-parallel tile is of generation 0 and has no children, this one is of "
+                                  "generation " + std::to_string(fragment.header().generation) + " and has "
+                                  + std::to_string(fragment.header().children));
+        store_.add(std::move(fragment));
+    }
+
+    void finish(FinishedTile& out) { store_.finish(out); }
+
+private:
+    detail::FragmentStore store_;
+};
+
+using ImageParallel = BasicImageParallel<>;
+static_assert(is_tile_op_v<ImageParallel>);
+
+} // namespace dfb

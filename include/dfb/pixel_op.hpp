@@ -1,0 +1,75 @@
+// The contract of a pixel operation (PixelOp): what happens to a finished tile on its owner, before it is
+// converted to the output format (section 3.1.2 of the paper).
+//
+// A PixelOp is a copyable type; the framebuffer keeps one object per rank and calls process() for several tiles
+// at once.
+//
+//   void process(PixelTile&) const;              changes the pixels, sends them elsewhere, ...
+//
+// Optional:
+//   static constexpr bool pointwise = true;      a pixel's result depends on that pixel's colour alone and there
+//                                                are no side effects: then background tiles need not be processed
+//                                                one by one nor travel. Default false.
+//   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
+//   void newFrame(const FrameData&);             called once a frame on every rank, if there is a FrameData
+#pragma once
+
+#include <dfb/tile_op.hpp>
+
+#include <cstddef>
+#include <type_traits>
+#include <utility>
+
+namespace dfb {
+
+// A finished tile in float, row-major, region.width() pixels a row without padding.
+struct PixelTile {
+    int tile = 0;
+    Region region;
+    float* color = nullptr;       // 4 a pixel, premultiplied linear RGBA
+    const float* depth = nullptr; // 1 a pixel; null unless the output has depth
+
+    std::size_t pixelCount() const noexcept
+    {
+        return static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
+    }
+};
+
+namespace detail {
+
+template <class T, class = void>
+struct HasProcess : std::false_type {};
+template <class T>
+struct HasProcess<T, std::void_t<decltype(std::declval<const T&>().process(std::declval<PixelTile&>()))>>
+    : std::true_type {};
+
+template <class T, class = void>
+struct IsPointwise : std::false_type {};
+template <class T>
+struct IsPointwise<T, std::void_t<decltype(T::pointwise)>> : std::bool_constant<T::pointwise> {};
+
+template <class T, class = void>
+struct HasPixelNewFrame : std::false_type {};
+template <class T>
+struct HasPixelNewFrame<
+    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()))>>
+    : std::true_type {};
+
+} // namespace detail
+
+template <class T>
+inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T> && detail::HasProcess<T>::value;
+
+namespace detail {
+
+template <class T>
+constexpr bool checkPixelOp()
+{
+    static_assert(std::is_copy_constructible_v<T>, "dfb: PixelOp must provide a copy constructor");
+    static_assert(HasProcess<T>::value, "dfb: PixelOp must provide void process(PixelTile&) const");
+    return is_pixel_op_v<T>;
+}
+
+} // namespace detail
+
+} // namespace dfb

@@ -1,0 +1,67 @@
+// TbbExecutor: an Executor in a oneTBB arena of its own. The only header that includes oneTBB.
+#pragma once
+
+#include <dfb/exec.hpp>
+
+#include <tbb/parallel_for.h>
+#include <tbb/task_arena.h>
+
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+
+namespace dfb {
+
+// The arena has room for `threadCount` threads. oneTBB itself limits the workers of a process to one less than
+// its cores; the thread that calls parallelFor() takes part.
+class TbbExecutor final : public Executor {
+public:
+    // 0: one per core.
+    explicit TbbExecutor(int threadCount = 0)
+        : arena_(threadCount > 0 ? threadCount : tbb::task_arena::automatic, 1)
+    {
+        arena_.initialize();
+    }
+
+    ~TbbExecutor() override
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        idle_.wait(lock, [this] { return enqueued_ == 0; });
+    }
+
+    int concurrency() const noexcept override { return arena_.max_concurrency(); }
+
+private:
+    void wake() override
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            ++enqueued_;
+        }
+        arena_.enqueue([this] {
+            runOne();
+            std::lock_guard<std::mutex> lock(mutex_);
+            if (--enqueued_ == 0)
+                idle_.notify_all();
+        });
+    }
+
+    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    {
+        arena_.execute([&] {
+            tbb::parallel_for(tbb::blocked_range<std::size_t>(0, count, 1),
+                              [&](const tbb::blocked_range<std::size_t>& range) {
+                                  for (std::size_t i = range.begin(); i != range.end(); ++i)
+                                      body(i);
+                              },
+                              tbb::simple_partitioner());
+        });
+    }
+
+    tbb::task_arena arena_;
+    std::mutex mutex_;
+    std::condition_variable idle_;
+    std::size_t enqueued_ = 0;
+};
+
+} // namespace dfb
