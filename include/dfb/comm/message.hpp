@@ -1,0 +1,87 @@
+// MessageHeader: what every message starts with, so that it is recognised before it is used.
+#pragma once
+
+#include <dfb/buffer.hpp>
+#include <dfb/error.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <string>
+#include <type_traits>
+#include <utility>
+
+namespace dfb::detail {
+
+enum class MessageKind : std::uint8_t {
+    ReduceUp,      // a partial result of a reduction
+    ReduceDown,    // its result
+    Fragment,      // an input of a tile, to its owner
+    Manifest,      // what a rank will send to this owner
+    ManifestAck,   // the owner has it
+    FinishedTiles, // a batch, to the display rank
+    TilesDone,     // how many finished tiles a rank has sent to the display rank
+    Abort          // the frame has failed on the sender
+};
+
+struct MessageHeader {
+    static constexpr std::uint16_t magicNumber = 0x0dfb;
+    static constexpr std::uint8_t formatVersion = 1;
+
+    std::uint16_t magic = magicNumber; // in the sender's byte order
+    std::uint8_t version = formatVersion;
+    MessageKind kind = MessageKind::Fragment;
+    std::uint32_t framebuffer = 0;     // id of the receiving object
+    std::int64_t number = 0;           // of the frame; of the reduction
+};
+static_assert(sizeof(MessageHeader) == 16 && std::is_trivially_copyable_v<MessageHeader>);
+
+template <class T>
+T loadAs(const std::byte* bytes)
+{
+    static_assert(std::is_trivially_copyable_v<T>);
+    T value;
+    std::memcpy(&value, bytes, sizeof value);
+    return value;
+}
+
+[[noreturn]] inline void failMalformed(std::string message, std::int64_t expected = -1, std::int64_t got = -1)
+{
+    ErrorInfo info;
+    info.kind = ErrorKind::MalformedMessage;
+    info.expected = expected;
+    info.got = got;
+    info.message = std::move(message);
+    throw Error(std::move(info));
+}
+
+// Checks and returns the header of a message. Throws Error (MalformedMessage).
+inline MessageHeader readMessageHeader(const Buffer& message, std::uint32_t framebuffer)
+{
+    if (message.size() < sizeof(MessageHeader))
+        failMalformed("shorter than a header", sizeof(MessageHeader), static_cast<std::int64_t>(message.size()));
+    const auto header = loadAs<MessageHeader>(message.data());
+    if (header.magic == 0xfb0d)
+        failMalformed("the sender has another byte order");
+    if (header.magic != MessageHeader::magicNumber)
+        failMalformed("not a message of dfb");
+    if (header.version != MessageHeader::formatVersion)
+        failMalformed("wire format version", MessageHeader::formatVersion, header.version);
+    if (header.kind > MessageKind::Abort)
+        failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
+    if (header.framebuffer != framebuffer)
+        failMalformed("for another framebuffer", framebuffer, header.framebuffer);
+    return header;
+}
+
+// A message of `byteCount` bytes after the header.
+inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const std::byte* body, std::size_t byteCount)
+{
+    Buffer message = pool.acquire(sizeof header + byteCount);
+    std::memcpy(message.data(), &header, sizeof header);
+    if (byteCount > 0)
+        std::memcpy(message.data() + sizeof header, body, byteCount);
+    return message;
+}
+
+} // namespace dfb::detail

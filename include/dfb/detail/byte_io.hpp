@@ -1,0 +1,101 @@
+// ByteWriter and ByteReader: the small control messages (manifests, verdicts), field by field; a reader never
+// reads beyond its end.
+#pragma once
+
+#include <dfb/error.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <string>
+#include <type_traits>
+#include <vector>
+
+namespace dfb::detail {
+
+class ByteWriter {
+public:
+    template <class T>
+    void put(const T& value)
+    {
+        static_assert(std::is_trivially_copyable_v<T>);
+        const auto* first = reinterpret_cast<const std::byte*>(&value);
+        bytes_.insert(bytes_.end(), first, first + sizeof value);
+    }
+    void putText(const std::string& text)
+    {
+        put(static_cast<std::uint32_t>(text.size()));
+        const auto* first = reinterpret_cast<const std::byte*>(text.data());
+        bytes_.insert(bytes_.end(), first, first + text.size());
+    }
+    const std::vector<std::byte>& bytes() const noexcept { return bytes_; }
+    std::vector<std::byte> take() { return std::move(bytes_); }
+
+private:
+    std::vector<std::byte> bytes_;
+};
+
+class ByteReader {
+public:
+    ByteReader(const std::byte* data, std::size_t size) : next_(data), left_(size) {}
+    explicit ByteReader(const std::vector<std::byte>& bytes) : ByteReader(bytes.data(), bytes.size()) {}
+
+    // Throws Error (MalformedMessage) when fewer bytes are left.
+    template <class T>
+    T get()
+    {
+        static_assert(std::is_trivially_copyable_v<T>);
+        T value;
+        std::memcpy(&value, take(sizeof value), sizeof value);
+        return value;
+    }
+    std::string getText()
+    {
+        const auto length = get<std::uint32_t>();
+        const auto* first = reinterpret_cast<const char*>(take(length));
+        return std::string(first, length);
+    }
+    std::size_t left() const noexcept { return left_; }
+
+private:
+    const std::byte* take(std::size_t count)
+    {
+        if (count > left_) {
+            ErrorInfo info;
+            info.kind = ErrorKind::MalformedMessage;
+            info.expected = static_cast<std::int64_t>(count);
+            info.got = static_cast<std::int64_t>(left_);
+            info.message = "a control message is too short";
+            throw Error(std::move(info));
+        }
+        const std::byte* first = next_;
+        next_ += count;
+        left_ -= count;
+        return first;
+    }
+
+    const std::byte* next_;
+    std::size_t left_;
+};
+
+inline void put(ByteWriter& out, const ErrorInfo& e)
+{
+    out.put(e.kind);
+    out.put(static_cast<std::int32_t>(e.rank));
+    for (std::int64_t v : {e.frame, e.tile, e.pass, e.generation, e.source, e.expected, e.got})
+        out.put(v);
+    out.putText(e.message);
+}
+
+inline ErrorInfo getErrorInfo(ByteReader& in)
+{
+    ErrorInfo e;
+    e.kind = in.get<ErrorKind>();
+    e.rank = in.get<std::int32_t>();
+    for (std::int64_t* v : {&e.frame, &e.tile, &e.pass, &e.generation, &e.source, &e.expected, &e.got})
+        *v = in.get<std::int64_t>();
+    e.message = in.getText();
+    return e;
+}
+
+} // namespace dfb::detail

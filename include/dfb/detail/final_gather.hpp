@@ -1,0 +1,363 @@
+// FinalGather: finished tiles to the display rank. The owner writes them straight into a message of several
+// tiles (on the display rank: into the image); background tiles do not travel.
+#pragma once
+
+#include <dfb/comm/compression.hpp>
+#include <dfb/detail/wire.hpp>
+#include <dfb/image.hpp>
+#include <dfb/tile_layout.hpp>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// What the messages to the display rank need to know.
+struct GatherSettings {
+    OutputFormat format = OutputFormat::None;
+    bool depth = false;
+    std::uint32_t framebuffer = 0;
+    std::shared_ptr<const Codec> codec;
+};
+
+// One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
+class FinalGather {
+public:
+    using Settings = GatherSettings;
+    using Send = std::function<void(Buffer&&)>; // to the display rank
+
+    struct Batch {
+        Buffer message;
+        std::size_t used = 0;
+        int writers = 0;
+        bool closed = false;
+    };
+    // Where a finished tile goes.
+    struct Place {
+        std::byte* color = nullptr;
+        std::size_t colorStride = 0; // bytes
+        float* depth = nullptr;
+        std::size_t depthStride = 0; // floats
+        std::shared_ptr<Batch> batch;
+    };
+
+    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay,
+                int otherRanks, Send send)
+        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay),
+          otherRanks_(otherRanks), send_(std::move(send))
+    {
+        if (isDisplay_ && settings_.format != OutputFormat::None) {
+            image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.depth);
+            state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
+            for (auto& s : state_)
+                s = TileState::Undefined;
+        }
+    }
+
+    const Image& image() const noexcept { return image_; }
+    bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
+
+    void newFrame(std::int64_t frame)
+    {
+        frame_ = frame;
+        batch_.reset();
+        tilesSent_ = 0;
+        tilesReceived_ = 0;
+        tilesAnnounced_ = 0;
+        ranksDone_ = 0;
+        for (auto& s : state_)
+            if (s == TileState::Received)
+                s = TileState::Old;
+    }
+
+    // Room for a finished tile. write() it, then commit().
+    Place reserve(int tile)
+    {
+        Place place;
+        if (!enabled())
+            return place;
+        const Region region = layout_.region(tile);
+        if (isDisplay_)
+            return inImage(region);
+        const auto width = static_cast<std::size_t>(region.width());
+        const std::size_t bytes = recordBytes(region);
+        std::shared_ptr<Batch> full;
+        std::size_t offset = 0;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (batch_ && batch_->used + bytes > batch_->message.size()) {
+                batch_->closed = true;
+                if (batch_->writers == 0)
+                    full = batch_;
+                batch_.reset();
+            }
+            if (!batch_) {
+                batch_ = std::make_shared<Batch>();
+                batch_->message = pool_->acquire(std::max(batchBytes, prefix + bytes));
+                batch_->used = prefix;
+            }
+            place.batch = batch_;
+            offset = batch_->used;
+            batch_->used += bytes;
+            ++batch_->writers;
+        }
+        if (full)
+            sendBatch(*full);
+        std::byte* record = place.batch->message.data() + offset;
+        const auto tileIndex = static_cast<std::int32_t>(tile);
+        std::memset(record, 0, recordPrefix);
+        std::memcpy(record, &tileIndex, sizeof tileIndex);
+        place.color = record + recordPrefix;
+        place.colorStride = width * bytesPerPixel(settings_.format);
+        if (settings_.depth) {
+            place.depth = reinterpret_cast<float*>(place.color + alignedTo16(place.colorStride * static_cast<std::size_t>(region.height())));
+            place.depthStride = width;
+        }
+        return place;
+    }
+
+    void commit(int tile, Place&& place)
+    {
+        if (!enabled())
+            return;
+        if (isDisplay_) {
+            state_[static_cast<std::size_t>(tile)] = TileState::Received;
+            return;
+        }
+        bool send = false;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            ++tilesSent_;
+            send = --place.batch->writers == 0 && place.batch->closed;
+        }
+        if (send)
+            sendBatch(*place.batch);
+    }
+
+    // All tiles of this rank are committed: sends the rest, and how many there were.
+    void flush()
+    {
+        if (!enabled() || isDisplay_)
+            return;
+        std::shared_ptr<Batch> last;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            last = std::move(batch_);
+            batch_.reset();
+        }
+        if (last)
+            sendBatch(*last);
+        const MessageHeader header = messageHeader(MessageKind::TilesDone);
+        send_(makeMessage(*pool_, header, reinterpret_cast<const std::byte*>(&tilesSent_), sizeof tilesSent_));
+    }
+
+    // The display rank's side of a FinishedTiles message. Throws Error (MalformedMessage).
+    void receiveTiles(Buffer&& message)
+    {
+        requireDisplay();
+        if (message.size() < prefix)
+            failMalformed("a batch of tiles is too short");
+        const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
+        const std::byte* in = message.data() + prefix;
+        std::size_t left = message.size() - prefix;
+        Buffer raw;
+        if (h.codec != 0) {
+            if (!settings_.codec || settings_.codec->id() != h.codec)
+                failMalformed("compressed by a codec that this rank does not have");
+            if (h.rawBytes > maxBatchBytes())
+                failMalformed("a batch of tiles is too large");
+            raw = pool_->acquire(h.rawBytes);
+            if (!settings_.codec->decompress(in, left, raw.data(), h.rawBytes))
+                failMalformed("a batch of tiles does not decompress to its size");
+            in = raw.data();
+            left = h.rawBytes;
+        }
+        while (left > 0) {
+            if (left < recordPrefix)
+                failMalformed("a finished tile is too short");
+            const auto tile = loadAs<std::int32_t>(in);
+            if (tile < 0 || tile >= layout_.tileCount())
+                failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
+            const Region region = layout_.region(tile);
+            const std::size_t bytes = recordBytes(region);
+            if (left < bytes)
+                failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes), static_cast<std::int64_t>(left));
+            store(tile, region, in + recordPrefix);
+            in += bytes;
+            left -= bytes;
+            ++tilesReceived_;
+        }
+    }
+
+    void receiveDone(const Buffer& message)
+    {
+        requireDisplay();
+        if (message.size() != sizeof(MessageHeader) + sizeof(std::int64_t))
+            failMalformed("a count of tiles has the wrong size");
+        tilesAnnounced_ += loadAs<std::int64_t>(message.data() + sizeof(MessageHeader));
+        ++ranksDone_; // after the count: who sees all ranks done sees all counts
+    }
+
+    // All tiles of the other ranks are in the image.
+    bool complete() const
+    {
+        return !isDisplay_ || !enabled() || (ranksDone_ == otherRanks_ && tilesReceived_ == tilesAnnounced_);
+    }
+
+    // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
+    // background before and is of the same colour is left alone.
+    void fillBackground(const std::array<float, 4>& rgba)
+    {
+        if (image_.empty())
+            return;
+        const bool same = std::memcmp(&rgba, &background_, sizeof rgba) == 0;
+        background_ = rgba;
+        std::byte pixel[16];
+        convertPixels(rgba.data(), 1, settings_.format, pixel);
+        const std::size_t pixelBytes = bytesPerPixel(settings_.format);
+        for (int tile = 0; tile < layout_.tileCount(); ++tile) {
+            auto& s = state_[static_cast<std::size_t>(tile)];
+            if (s == TileState::Received || (s == TileState::Background && same))
+                continue;
+            const Region region = layout_.region(tile);
+            const Place place = inImage(region);
+            for (int y = 0; y < region.height(); ++y) {
+                std::byte* row = place.color + static_cast<std::size_t>(y) * place.colorStride;
+                for (int x = 0; x < region.width(); ++x)
+                    std::memcpy(row + static_cast<std::size_t>(x) * pixelBytes, pixel, pixelBytes);
+                if (place.depth)
+                    std::fill_n(place.depth + static_cast<std::size_t>(y) * place.depthStride, region.width(),
+                                std::numeric_limits<float>::infinity());
+            }
+            s = TileState::Background;
+        }
+    }
+
+    // The frame has failed: nothing in the image can be relied on.
+    void invalidate()
+    {
+        for (auto& s : state_)
+            s = TileState::Undefined;
+    }
+
+private:
+    enum class TileState : std::uint8_t { Undefined, Background, Old, Received };
+    struct BatchHeader {
+        std::uint64_t rawBytes = 0;
+        std::uint32_t codec = 0;
+        std::uint32_t reserved = 0;
+    };
+    static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
+    static constexpr std::size_t recordPrefix = 16;
+    static constexpr std::size_t batchBytes = std::size_t{256} << 10;
+
+    std::size_t recordBytes(const Region& region) const
+    {
+        const auto pixels = static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
+        return recordPrefix + alignedTo16(pixels * bytesPerPixel(settings_.format))
+               + (settings_.depth ? alignedTo16(pixels * sizeof(float)) : 0);
+    }
+    std::size_t maxBatchBytes() const
+    {
+        return std::max(batchBytes, recordBytes({0, 0, layout_.tileSize(), layout_.tileSize()}));
+    }
+
+    Place inImage(const Region& region)
+    {
+        Place place;
+        const auto width = static_cast<std::size_t>(layout_.width());
+        const std::size_t first = static_cast<std::size_t>(region.y0) * width + static_cast<std::size_t>(region.x0);
+        place.colorStride = width * bytesPerPixel(settings_.format);
+        place.color = image_.bytes() + first * bytesPerPixel(settings_.format);
+        if (settings_.depth) {
+            place.depth = image_.depth() + first;
+            place.depthStride = width;
+        }
+        return place;
+    }
+
+    void store(int tile, const Region& region, const std::byte* pixels)
+    {
+        if (state_[static_cast<std::size_t>(tile)].exchange(TileState::Received) == TileState::Received) {
+            ErrorInfo info;
+            info.kind = ErrorKind::DuplicateInput;
+            info.tile = tile;
+            info.message = "a finished tile came twice";
+            throw Error(std::move(info));
+        }
+        const Place place = inImage(region);
+        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+        const std::size_t rowBytes = width * bytesPerPixel(settings_.format);
+        for (std::size_t y = 0; y < height; ++y)
+            std::memcpy(place.color + y * place.colorStride, pixels + y * rowBytes, rowBytes);
+        if (place.depth) {
+            const std::byte* depth = pixels + alignedTo16(rowBytes * height);
+            for (std::size_t y = 0; y < height; ++y)
+                std::memcpy(place.depth + y * place.depthStride, depth + y * width * sizeof(float), width * sizeof(float));
+        }
+    }
+
+    void sendBatch(Batch& batch)
+    {
+        BatchHeader h;
+        h.rawBytes = batch.used - prefix;
+        Buffer message = std::move(batch.message);
+        message.shrink(batch.used);
+        if (settings_.codec) {
+            Buffer packed = pool_->acquire(prefix + settings_.codec->bound(h.rawBytes));
+            const std::size_t bytes = settings_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
+            if (bytes < h.rawBytes) {
+                packed.shrink(prefix + bytes);
+                message = std::move(packed);
+                h.codec = settings_.codec->id();
+            }
+        }
+        const MessageHeader m = messageHeader(MessageKind::FinishedTiles);
+        std::memcpy(message.data(), &m, sizeof m);
+        std::memcpy(message.data() + sizeof m, &h, sizeof h);
+        send_(std::move(message));
+    }
+
+    MessageHeader messageHeader(MessageKind kind) const
+    {
+        MessageHeader header;
+        header.kind = kind;
+        header.framebuffer = settings_.framebuffer;
+        header.number = frame_;
+        return header;
+    }
+
+    void requireDisplay() const
+    {
+        if (!isDisplay_ || !enabled())
+            failMalformed("a finished tile was sent to a rank that displays nothing");
+    }
+
+    std::shared_ptr<MemoryPool> pool_;
+    TileLayout layout_;
+    Settings settings_;
+    bool isDisplay_;
+    int otherRanks_;
+    Send send_;
+    std::int64_t frame_ = 0;
+
+    std::mutex mutex_;
+    std::shared_ptr<Batch> batch_; // under mutex_
+    std::int64_t tilesSent_ = 0;   // under mutex_
+
+    Image image_;
+    std::array<float, 4> background_{};
+    std::vector<std::atomic<TileState>> state_; // on the display rank
+    std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};
+    std::atomic<int> ranksDone_{0};
+};
+
+} // namespace dfb::detail

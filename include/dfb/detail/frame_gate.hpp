@@ -1,0 +1,89 @@
+// FrameGate: which messages belong to the frame that is open. Those of a frame to come are kept, those of a
+// frame that is over are counted and dropped, and closing waits for what is being worked on.
+#pragma once
+
+#include <dfb/comm/message.hpp>
+
+#include <atomic>
+#include <condition_variable>
+#include <cstdint>
+#include <mutex>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// All members may be called from any thread.
+class FrameGate {
+public:
+    struct Message {
+        int source;
+        MessageHeader header;
+        Buffer bytes;
+    };
+
+    // The last frame that was opened; 0 before the first.
+    std::int64_t frame() const noexcept { return frame_; }
+    bool isOpen() const noexcept { return open_; }
+    std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
+
+    // Opens the next frame and returns the messages that came too early for it.
+    std::vector<Message> open()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ++frame_;
+        open_ = true;
+        return std::move(early_);
+    }
+
+    // Whether the message may be worked on now: then leave() must follow. If not, it has been taken care of.
+    bool enter(int source, const MessageHeader& header, Buffer& message)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (header.number > frame_) {
+            early_.push_back({source, header, std::move(message)});
+            return false;
+        }
+        if (header.number < frame_ || !open_) {
+            ++late_;
+            return false;
+        }
+        ++inside_;
+        return true;
+    }
+
+    // The same for work that is no message.
+    bool enter(std::int64_t frame)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (frame != frame_ || !open_)
+            return false;
+        ++inside_;
+        return true;
+    }
+
+    void leave()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (--inside_ == 0)
+            empty_.notify_all();
+    }
+
+    // Lets nothing more in, and waits until all have left.
+    void close()
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        open_ = false;
+        empty_.wait(lock, [this] { return inside_ == 0; });
+    }
+
+private:
+    std::mutex mutex_;
+    std::condition_variable empty_;
+    std::atomic<std::int64_t> frame_{0}, late_{0};
+    std::atomic<bool> open_{false};
+    int inside_ = 0;
+    std::vector<Message> early_;
+};
+
+} // namespace dfb::detail

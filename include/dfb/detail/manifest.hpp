@@ -1,0 +1,111 @@
+// ManifestExchange: every rank tells the owners which inputs it will send, and all learn when all owners
+// know. Counts come from the senders only, so owner and contributor can not disagree about visibility.
+//
+// Each rank sends one manifest to each owner that it touches; the owner acknowledges; a rank whose manifests are all
+// acknowledged enters a reduction, and when that is done every manifest has arrived everywhere.
+#pragma once
+
+#include <dfb/detail/byte_io.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <map>
+#include <mutex>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// One input that a rank will send for a tile (for each pass of the frame): generation 1, without children.
+struct TileInput {
+    int tile = 0;
+    std::uint32_t source = 0;
+    std::uint16_t part = 0;
+};
+
+} // namespace dfb
+
+namespace dfb::detail {
+
+class ManifestExchange {
+public:
+    using Inputs = std::vector<std::pair<std::uint32_t, std::uint16_t>>;
+
+    void reset()
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        expected_.clear();
+        acksMissing_ = 0;
+        declared_ = false;
+    }
+
+    // What to send to whom, for the inputs of this rank. `ownerOf(tile)` gives the owner.
+    template <class OwnerOf>
+    std::map<int, std::vector<std::byte>> split(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf)
+    {
+        std::map<int, ByteWriter> writers;
+        std::lock_guard<std::mutex> lock(mutex_);
+        declared_ = true;
+        for (const TileInput& input : inputs) {
+            const int owner = ownerOf(input.tile);
+            if (owner == rank) {
+                expected_[input.tile].emplace_back(input.source, input.part);
+                continue;
+            }
+            ByteWriter& out = writers[owner];
+            out.put(static_cast<std::int32_t>(input.tile));
+            out.put(input.source);
+            out.put(input.part);
+        }
+        std::map<int, std::vector<std::byte>> result;
+        for (auto& [owner, writer] : writers)
+            result.emplace(owner, writer.take());
+        acksMissing_ = result.size();
+        return result;
+    }
+
+    // The owner's side. Throws Error (MalformedMessage); `isMine(tile)` tells which tiles can be meant.
+    template <class IsMine>
+    void receive(ByteReader in, const IsMine& isMine)
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        while (in.left() > 0) {
+            const int tile = in.get<std::int32_t>();
+            const auto source = in.get<std::uint32_t>();
+            const auto part = in.get<std::uint16_t>();
+            if (!isMine(tile)) {
+                ErrorInfo info;
+                info.kind = ErrorKind::MalformedMessage;
+                info.tile = tile;
+                info.source = source;
+                info.message = "a manifest names a tile of another owner";
+                throw Error(std::move(info));
+            }
+            expected_[tile].emplace_back(source, part);
+        }
+    }
+
+    // True if this was the last acknowledgement that was missing.
+    bool acknowledged()
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        return acksMissing_ > 0 && --acksMissing_ == 0;
+    }
+
+    bool declared() const
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        return declared_;
+    }
+
+    // Per owned tile what will come. To be read when the exchange is complete.
+    const std::map<int, Inputs>& expected() const { return expected_; }
+
+private:
+    mutable std::mutex mutex_;
+    std::map<int, Inputs> expected_;
+    std::size_t acksMissing_ = 0;
+    bool declared_ = false;
+};
+
+} // namespace dfb::detail

@@ -1,0 +1,97 @@
+// FrameOutcome: how a frame ends: the first failure on this rank, the abort that tells the others, and the one
+// reduction in which all ranks learn the same verdict.
+#pragma once
+
+#include <dfb/comm/messaging.hpp>
+#include <dfb/detail/frame_gate.hpp>
+#include <dfb/detail/verdict.hpp>
+
+#include <atomic>
+#include <cstdint>
+#include <exception>
+#include <mutex>
+#include <optional>
+#include <utility>
+
+namespace dfb::detail {
+
+template <class Transport>
+class FrameOutcome {
+public:
+    FrameOutcome(Messaging<Transport>& messaging, const FrameGate& gate, std::uint32_t scope)
+        : messaging_(messaging), gate_(gate), scope_(scope)
+    {
+    }
+
+    // No other member may be running.
+    void newFrame()
+    {
+        error_.reset();
+        verdict_.reset();
+        hasVerdict_ = failed_ = voted_ = false;
+    }
+
+    // The frame has failed on some rank. From any thread, as the rest.
+    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed); }
+
+    // Another rank says so, or the transport has.
+    void setFailed() noexcept { failed_ = true; }
+
+    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow.
+    void fail(const std::exception_ptr& reason, const ErrorInfo& where)
+    {
+        ErrorInfo info = errorInfoOf(reason, where);
+        info.rank = messaging_.rank();
+        info.frame = gate_.frame();
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (error_ || voted_)
+                return;
+            error_ = std::move(info);
+        }
+        failed_ = true;
+        for (int other = 0; other < messaging_.size(); ++other)
+            if (other != messaging_.rank())
+                messaging_.send(other, MessageKind::Abort, gate_.frame());
+    }
+
+    // Enters the verdict, once: when `done()`, or when the frame has failed. `figures()` gives this rank's Verdict.
+    template <class IsDone, class Figures>
+    void vote(const IsDone& done, const Figures& figures)
+    {
+        Verdict mine;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (voted_ || messaging_.failed() || !(failed_ || done()))
+                return;
+            voted_ = true;
+            mine = figures();
+            mine.error = error_;
+        }
+        messaging_.reductions().enter({scope_, gate_.frame()}, mine.bytes(), Verdict::combine,
+                                      [this](const ReductionTable::Bytes& result) {
+                                          verdict_ = Verdict::from(result);
+                                          hasVerdict_ = true;
+                                          messaging_.notify();
+                                      });
+    }
+
+    // Waits for the verdict of all ranks. Throws TransportError.
+    const Verdict& wait()
+    {
+        messaging_.wait([this] { return hasVerdict_.load(); });
+        return *verdict_;
+    }
+
+private:
+    Messaging<Transport>& messaging_;
+    const FrameGate& gate_;
+    std::uint32_t scope_;
+    std::atomic<bool> failed_{false}, hasVerdict_{false};
+    std::optional<Verdict> verdict_; // set once, before hasVerdict_
+    std::mutex mutex_;
+    bool voted_ = false;             // under mutex_
+    std::optional<ErrorInfo> error_; // under mutex_
+};
+
+} // namespace dfb::detail

@@ -1,0 +1,198 @@
+// TileTable: the tiles that this rank owns: per tile a tile operation, and per pass a dependency tracker.
+// Nothing is made for a tile before its first input.
+#pragma once
+
+#include <dfb/dependency_tracker.hpp>
+#include <dfb/tile_layout.hpp>
+#include <dfb/tile_op.hpp>
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// Throws InvalidArgument for a tile that a renderer can not have meant for this frame.
+inline void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo& frame)
+{
+    std::string wrong;
+    if (tile.frame != frame.frame)
+        wrong = "a tile of frame " + std::to_string(tile.frame) + " (prepare tiles with Frame::start)";
+    else if (tile.tile < 0 || tile.tile >= layout.tileCount())
+        wrong = "outside the image, which has " + std::to_string(layout.tileCount()) + " tiles";
+    else if (tile.region != layout.region(tile.tile))
+        wrong = "its region is not that of the tile";
+    else if (tile.pass < 0 || tile.pass >= frame.passes)
+        wrong = "the frame has " + std::to_string(frame.passes) + " passes";
+    else if (tile.generation < 0 || tile.generation >= DependencyTracker::maxGenerations)
+        wrong = "the generation must be in [0, " + std::to_string(DependencyTracker::maxGenerations) + ")";
+    else if (tile.children < 0)
+        wrong = "it announces " + std::to_string(tile.children) + " children";
+    else
+        return;
+    ErrorInfo info;
+    info.rank = frame.rank;
+    info.frame = frame.frame;
+    info.tile = tile.tile;
+    info.pass = tile.pass;
+    info.generation = tile.generation;
+    info.source = tile.source;
+    info.message = std::move(wrong);
+    throw InvalidArgument(std::move(info));
+}
+
+// arrive() and declare() may be called from any thread, for one frame at a time.
+template <class TileOp>
+class TileTable {
+public:
+    using FrameData = typename FrameDataOf<TileOp>::type;
+
+    TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount)
+        : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
+          slotOf_(static_cast<std::size_t>(layout.tileCount()), -1)
+    {
+        for (int tile = 0; tile < layout.tileCount(); ++tile) {
+            const int owner = ownerMap(tile, layout, rankCount);
+            if (owner < 0 || owner >= rankCount)
+                throw InvalidArgument("the owner map gives tile " + std::to_string(tile) + " to rank "
+                                      + std::to_string(owner) + " of " + std::to_string(rankCount));
+            owners_[static_cast<std::size_t>(tile)] = owner;
+            if (owner == rank) {
+                slotOf_[static_cast<std::size_t>(tile)] = static_cast<int>(owned_.size());
+                owned_.push_back(tile);
+            }
+        }
+        slots_.resize(owned_.size());
+    }
+
+    const TileLayout& layout() const noexcept { return layout_; }
+    int owner(int tile) const noexcept { return owners_[static_cast<std::size_t>(tile)]; }
+    bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
+    const std::vector<int>& owned() const noexcept { return owned_; }
+    const TileInfo& frameInfo() const noexcept { return info_; }
+
+    // `info` is what all tiles have in common. No other member may be running.
+    void newFrame(const TileInfo& info, const FrameData& data)
+    {
+        info_ = info;
+        data_ = data;
+    }
+
+    // Hands an input to its tile. True if the tile's inputs are now complete: call finish() once.
+    // Throws what the tracker and the op throw.
+    bool arrive(Fragment&& fragment)
+    {
+        const TileHeader h = fragment.header();
+        const std::lock_guard<std::mutex> lock(mutexOf(h.tile));
+        Slot& slot = slotFor(h.tile);
+        DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
+        tree.arrive(h.generation, h.source, h.part, h.children);
+        slot.touched = true;
+        if (slot.ready)
+            return false; // the op had enough
+        slot.op.add(std::move(fragment));
+        bool enough = false;
+        if constexpr (HasIsComplete<TileOp>::value)
+            enough = slot.op.isComplete();
+        return becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
+    }
+
+    // What will come for a tile, in each pass; none is possible. True if that is already all there.
+    bool declare(int tile, const std::vector<std::pair<std::uint32_t, std::uint16_t>>& inputs)
+    {
+        const std::lock_guard<std::mutex> lock(mutexOf(tile));
+        Slot& slot = slotFor(tile);
+        for (DependencyTracker& tree : slot.trees)
+            tree.declare(inputs);
+        return becomesReady(slot, allComplete(slot));
+    }
+
+    // The tile must be complete. Nothing else touches its op any more.
+    void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
+
+    // Tiles that have had an input in this frame, or the first that has had one without being expected.
+    // To be called when arrivals are over, or under a lock that keeps them out.
+    int touchedCount() const
+    {
+        int count = 0;
+        for (const auto& slot : slots_)
+            count += slot && slot->frame == info_.frame && slot->touched;
+        return count;
+    }
+
+    // The tiles of this frame that have had inputs though none was declared for them.
+    template <class Expected>
+    int firstUndeclared(const Expected& expected)
+    {
+        for (std::size_t i = 0; i < slots_.size(); ++i) {
+            const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
+            if (slots_[i] && slots_[i]->frame == info_.frame && slots_[i]->touched && !expected.count(owned_[i]))
+                return owned_[i];
+        }
+        return -1;
+    }
+
+private:
+    struct Slot {
+        std::int64_t frame = -1;
+        bool ready = false, touched = false;
+        std::vector<DependencyTracker> trees; // one per pass
+        TileOp op;
+    };
+
+    std::mutex& mutexOf(int tile) { return mutexes_[static_cast<std::size_t>(tile) % mutexes_.size()]; }
+
+    Slot& slotFor(int tile)
+    {
+        auto& slot = slots_[static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)])];
+        if (!slot)
+            slot = std::make_unique<Slot>();
+        if (slot->frame != info_.frame) {
+            slot->frame = info_.frame;
+            slot->ready = slot->touched = false;
+            slot->trees.resize(static_cast<std::size_t>(info_.passes));
+            for (DependencyTracker& tree : slot->trees)
+                tree.reset();
+            TileInfo info = info_;
+            info.tile = tile;
+            info.region = layout_.region(tile);
+            if constexpr (HasNewFrameWithData<TileOp>::value)
+                slot->op.newFrame(info, data_);
+            else
+                slot->op.newFrame(info);
+        }
+        return *slot;
+    }
+
+    static bool allComplete(const Slot& slot)
+    {
+        for (const DependencyTracker& tree : slot.trees)
+            if (!tree.complete())
+                return false;
+        return true;
+    }
+
+    static bool becomesReady(Slot& slot, bool now)
+    {
+        if (slot.ready || !now)
+            return false;
+        slot.ready = true;
+        return true;
+    }
+
+    TileLayout layout_;
+    int rank_;
+    std::vector<std::int32_t> owners_, slotOf_;
+    std::vector<int> owned_;
+    std::vector<std::unique_ptr<Slot>> slots_;
+    std::array<std::mutex, 64> mutexes_;
+    TileInfo info_;
+    FrameData data_{};
+};
+
+} // namespace dfb::detail

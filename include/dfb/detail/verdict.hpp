@@ -1,0 +1,178 @@
+// Verdict: what the one reduction per frame carries: whether any rank failed, and which error all ranks report;
+// and the figures of the frame that are sums or maxima over the ranks. Agreement: the same for what a framebuffer is
+// made with.
+#pragma once
+
+#include <dfb/detail/byte_io.hpp>
+#include <dfb/frame.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// An exception as a record; `where` fills in what the exception does not say.
+inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& where)
+{
+    ErrorInfo info;
+    try {
+        std::rethrow_exception(reason);
+    } catch (const Error& e) {
+        info = e.info();
+    } catch (const std::exception& e) {
+        info.kind = ErrorKind::UserCode;
+        info.message = e.what();
+    } catch (...) {
+        info.kind = ErrorKind::UserCode;
+        info.message = "an exception that is not a std::exception";
+    }
+    if (info.kind == ErrorKind::InvalidArgument)
+        info.kind = ErrorKind::UserCode; // of a call within a renderer or an op
+    const auto fill = [](std::int64_t& to, std::int64_t from) { to = to < 0 ? from : to; };
+    fill(info.tile, where.tile);
+    fill(info.pass, where.pass);
+    fill(info.generation, where.generation);
+    fill(info.source, where.source);
+    if (!where.message.empty())
+        info.message += (info.message.empty() ? "" : ", ") + where.message;
+    return info;
+}
+
+// FNV-1a over 64-bit words.
+class Fingerprint {
+public:
+    void add(std::uint64_t v) noexcept { value_ = (value_ ^ v) * 1099511628211u; }
+    std::uint64_t value() const noexcept { return value_; }
+
+private:
+    std::uint64_t value_ = 1469598103934665603u;
+};
+
+inline std::uint64_t fingerprintOf(const FrameParams& p)
+{
+    Fingerprint f;
+    for (float channel : p.background) {
+        std::uint32_t bits = 0;
+        std::memcpy(&bits, &channel, sizeof bits);
+        f.add(bits);
+    }
+    f.add(static_cast<std::uint64_t>(p.passes));
+    f.add(p.declared);
+    f.add(p.declarationKey);
+    return f.value();
+}
+
+struct Verdict {
+    std::optional<ErrorInfo> error;
+    std::uint64_t paramsHash = 0;           // of what begin() was given; the same on all ranks
+    std::array<std::int64_t, 5> sums{};     // bytes, messages, tiles touched, non-finite pixels, late messages
+    std::array<std::int64_t, 2> maxima{};   // peak memory in bytes, rendering in ns
+
+    std::vector<std::byte> bytes() const
+    {
+        ByteWriter out;
+        out.put(static_cast<std::uint8_t>(error.has_value()));
+        if (error)
+            put(out, *error);
+        out.put(paramsHash);
+        out.put(sums);
+        out.put(maxima);
+        return out.take();
+    }
+
+    static Verdict from(const std::vector<std::byte>& bytes)
+    {
+        ByteReader in(bytes);
+        Verdict v;
+        if (in.get<std::uint8_t>() != 0)
+            v.error = getErrorInfo(in);
+        v.paramsHash = in.get<std::uint64_t>();
+        v.sums = in.get<decltype(v.sums)>();
+        v.maxima = in.get<decltype(v.maxima)>();
+        return v;
+    }
+
+    // Of several errors, the one of the lowest rank; one that says why before one that only says "cancelled".
+    static bool outranks(const ErrorInfo& a, const ErrorInfo& b)
+    {
+        const bool cancelledA = a.kind == ErrorKind::Cancelled, cancelledB = b.kind == ErrorKind::Cancelled;
+        return cancelledA != cancelledB ? cancelledB : a.rank < b.rank;
+    }
+
+    static std::vector<std::byte> combine(const std::vector<std::byte>& first, const std::vector<std::byte>& second)
+    {
+        Verdict a = from(first);
+        const Verdict b = from(second);
+        if (b.error && (!a.error || outranks(*b.error, *a.error)))
+            a.error = b.error;
+        if (!a.error && a.paramsHash != b.paramsHash) {
+            ErrorInfo info;
+            info.kind = ErrorKind::Disagreement;
+            info.message = "the ranks began the frame with different parameters (background, passes, declared)";
+            a.error = info;
+        }
+        for (std::size_t i = 0; i < a.sums.size(); ++i)
+            a.sums[i] += b.sums[i];
+        for (std::size_t i = 0; i < a.maxima.size(); ++i)
+            a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
+        return a.bytes();
+    }
+};
+
+// What one rank was made with, or what was wrong with it; combined, whether all are fine and alike.
+struct Agreement {
+    bool fine = true;
+    std::string text;
+
+    // `tileSize`, `channels`: of the tile operation; `ownerOf(tile)`: the owner map's answers.
+    template <class OwnerOf>
+    static Agreement of(const FrameBufferConfig& c, int tileSize, ChannelMask channels, int tileCount, const OwnerOf& ownerOf)
+    {
+        Fingerprint owners;
+        for (int tile = 0; tile < tileCount; ++tile)
+            owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
+        const auto text = [](auto value) { return std::to_string(value); };
+        return {true, "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width)
+                          + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
+                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth)
+                          + ", display rank " + text(c.displayRank) + ", id " + text(c.id) + ", codec "
+                          + text(c.codec ? c.codec->id() : 0) + ", owner map " + text(owners.value())};
+    }
+
+    std::vector<std::byte> bytes() const
+    {
+        ByteWriter out;
+        out.put(static_cast<std::uint8_t>(fine));
+        out.putText(text);
+        return out.take();
+    }
+
+    static Agreement from(const std::vector<std::byte>& bytes)
+    {
+        ByteReader in(bytes);
+        Agreement a;
+        a.fine = in.get<std::uint8_t>() != 0;
+        a.text = in.getText();
+        return a;
+    }
+
+    static std::vector<std::byte> combine(const std::vector<std::byte>& first, const std::vector<std::byte>& second)
+    {
+        const Agreement a = from(first), b = from(second);
+        if (!a.fine || (b.fine && a.text == b.text))
+            return first;
+        if (!b.fine)
+            return second;
+        return Agreement{false, "ranks were configured differently: [" + a.text + "] and [" + b.text + "]"}.bytes();
+    }
+};
+
+} // namespace dfb::detail

@@ -1,0 +1,333 @@
+// Wire: the format of messages; a tile to bytes, and bytes to a fragment that is read in place.
+//
+// After the MessageHeader a fragment message goes on with a FragmentHeader and the payload:
+//   Sparse:    uint16 span counts of the rows [rowBegin, rowEnd) | spans | padding to 16 | colour | depth
+//   Dense:     colour | depth, all pixels of the region row by row
+//   Constant:  colour | depth of one pixel
+//   Empty:     nothing
+#pragma once
+
+#include <dfb/comm/compression.hpp>
+#include <dfb/comm/message.hpp>
+#include <dfb/fragment.hpp>
+#include <dfb/tile_layout.hpp>
+
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <string>
+#include <type_traits>
+#include <vector>
+
+namespace dfb::detail {
+
+struct FragmentHeader {
+    std::int32_t tile = 0;
+    std::int32_t pass = 0;
+    std::int32_t generation = 0;
+    std::int32_t children = 0;
+    std::uint32_t source = 0;
+    std::uint16_t part = 0;
+    ChannelMask channels = 0;
+    std::uint32_t activePixels = 0;
+    std::uint32_t spanCount = 0;
+    std::uint16_t rowBegin = 0, rowEnd = 0;
+    FragmentEncoding encoding = FragmentEncoding::Empty;
+    std::uint8_t codec = 0;            // 0: the payload is raw
+    std::uint16_t reserved = 0;
+    std::uint32_t rawPayloadBytes = 0; // before compression
+    std::uint32_t reserved2 = 0;
+};
+static_assert(sizeof(FragmentHeader) == 48 && std::is_trivially_copyable_v<FragmentHeader>);
+
+inline constexpr std::size_t fragmentPrefix = sizeof(MessageHeader) + sizeof(FragmentHeader);
+
+inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
+
+// The active pixels of a tile: those with any colour channel that is not 0. A pixel of colour 0 and alpha 0
+// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does.
+struct ActiveSpans {
+    std::vector<std::uint16_t> rowCounts; // of rows [rowBegin, rowEnd)
+    std::vector<Span> spans;
+    int rowBegin = 0, rowEnd = 0;
+    std::uint32_t pixels = 0;
+
+    template <class TileType>
+    void find(const TileType& tile)
+    {
+        rowCounts.clear();
+        spans.clear();
+        rowBegin = rowEnd = 0;
+        pixels = 0;
+        const int width = tile.region.width(), height = tile.region.height();
+        for (int y = 0; y < height; ++y) {
+            const std::size_t before = spans.size();
+            const float* row = tile.pixel(0, y);
+            const auto active = [row](int x) {
+                const float* p = row + 4 * x;
+                return p[0] != 0.0f || p[1] != 0.0f || p[2] != 0.0f || p[3] != 0.0f;
+            };
+            for (int x = 0; x < width;) {
+                while (x < width && !active(x))
+                    ++x;
+                const int begin = x;
+                while (x < width && active(x))
+                    ++x;
+                if (x > begin) {
+                    spans.push_back({static_cast<std::uint16_t>(begin), static_cast<std::uint16_t>(x - begin)});
+                    pixels += static_cast<std::uint32_t>(x - begin);
+                }
+            }
+            const auto count = static_cast<std::uint16_t>(spans.size() - before);
+            if (count > 0 && rowEnd == 0)
+                rowBegin = y;
+            if (count > 0)
+                rowEnd = y + 1;
+            if (rowEnd > 0)
+                rowCounts.push_back(count);
+        }
+        rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin));
+    }
+};
+
+template <class TileType>
+bool isConstant(const TileType& tile, bool withDepth)
+{
+    for (int y = 0; y < tile.region.height(); ++y)
+        for (int x = 0; x < tile.region.width(); ++x) {
+            if (std::memcmp(tile.pixel(x, y), tile.color, 4 * sizeof(float)) != 0)
+                return false;
+            if constexpr (TileType::hasDepth)
+                if (withDepth
+                    && std::memcmp(tile.depth + y * TileType::size + x, tile.depth, sizeof(float)) != 0)
+                    return false;
+        }
+    return true;
+}
+
+// Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
+inline float canonicalDepth(float depth) { return depth == depth ? depth + 0.0f : std::numeric_limits<float>::infinity(); }
+
+// Makes the message for a tile, with the channels of `wanted` that the tile has. Adds to `nonFinite` the number of
+// pixels that have an infinity or a NaN in the colour, or a NaN for a depth. `codec` may be null.
+template <class TileType>
+Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t framebuffer,
+                      const Codec* codec, std::uint64_t& nonFinite)
+{
+    static thread_local ActiveSpans active;
+    active.find(tile);
+    const bool withDepth = (wanted & TileType::channels & depthChannel) != 0;
+    const int width = tile.region.width(), height = tile.region.height();
+
+    FragmentHeader h;
+    h.tile = tile.tile;
+    h.pass = tile.pass;
+    h.generation = tile.generation;
+    h.children = tile.children;
+    h.source = tile.source;
+    h.part = tile.part;
+    h.channels = static_cast<ChannelMask>(colorChannel | (withDepth ? depthChannel : 0));
+    h.activePixels = active.pixels;
+    h.rowBegin = static_cast<std::uint16_t>(active.rowBegin);
+    h.rowEnd = static_cast<std::uint16_t>(active.rowEnd);
+    std::size_t stored = active.pixels, tableBytes = 0;
+    if (active.pixels == 0) {
+        h.encoding = FragmentEncoding::Empty;
+    } else if (active.pixels == static_cast<std::uint32_t>(width * height)) {
+        h.encoding = isConstant(tile, withDepth) ? FragmentEncoding::Constant : FragmentEncoding::Dense;
+        if (h.encoding == FragmentEncoding::Constant)
+            stored = 1;
+    } else {
+        h.encoding = FragmentEncoding::Sparse;
+        h.spanCount = static_cast<std::uint32_t>(active.spans.size());
+        tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
+    }
+    const std::size_t payload = tableBytes + stored * sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
+    h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
+
+    Buffer message = pool.acquire(fragmentPrefix + payload);
+    MessageHeader m;
+    m.kind = MessageKind::Fragment;
+    m.framebuffer = framebuffer;
+    m.number = tile.frame;
+    std::byte* out = message.data() + fragmentPrefix;
+    if (h.encoding == FragmentEncoding::Sparse) {
+        const std::size_t countBytes = sizeof(std::uint16_t) * active.rowCounts.size();
+        const std::size_t spanBytes = sizeof(Span) * active.spans.size();
+        std::memcpy(out, active.rowCounts.data(), countBytes);
+        std::memcpy(out + countBytes, active.spans.data(), spanBytes);
+        std::memset(out + countBytes + spanBytes, 0, tableBytes - countBytes - spanBytes);
+    }
+    auto* color = reinterpret_cast<float*>(out + tableBytes);
+    auto* depth = color + 4 * stored;
+    const auto copyPixels = [&](int x, int y, int count) {
+        const float* from = tile.pixel(x, y);
+        std::memcpy(color, from, 4 * sizeof(float) * static_cast<std::size_t>(count));
+        color += 4 * count;
+        for (int i = 0; i < count; ++i) {
+            bool finite = (from[4 * i] - from[4 * i]) + (from[4 * i + 1] - from[4 * i + 1])
+                              + (from[4 * i + 2] - from[4 * i + 2]) + (from[4 * i + 3] - from[4 * i + 3])
+                          == 0.0f;
+            if constexpr (TileType::hasDepth)
+                if (withDepth) {
+                    const float d = tile.depth[y * TileType::size + x + i];
+                    finite = finite && d == d;
+                    *depth++ = canonicalDepth(d);
+                }
+            nonFinite += finite ? 0 : 1;
+        }
+    };
+    if (h.encoding == FragmentEncoding::Sparse) {
+        const Span* span = active.spans.data();
+        for (int y = active.rowBegin; y < active.rowEnd; ++y)
+            for (int i = 0; i < active.rowCounts[static_cast<std::size_t>(y - active.rowBegin)]; ++i, ++span)
+                copyPixels(span->x, y, span->count);
+    } else if (h.encoding == FragmentEncoding::Dense) {
+        for (int y = 0; y < height; ++y)
+            copyPixels(0, y, width);
+    } else if (h.encoding == FragmentEncoding::Constant) {
+        copyPixels(0, 0, 1);
+    }
+
+    if (codec && payload > 0) {
+        Buffer packed = pool.acquire(fragmentPrefix + codec->bound(payload));
+        const std::size_t packedBytes = codec->compress(out, payload, packed.data() + fragmentPrefix);
+        if (packedBytes < payload) {
+            packed.shrink(fragmentPrefix + packedBytes);
+            message = std::move(packed);
+            h.codec = codec->id();
+        }
+    }
+    std::memcpy(message.data(), &m, sizeof m);
+    std::memcpy(message.data() + sizeof m, &h, sizeof h);
+    return message;
+}
+
+// Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
+// decompressed form). Throws Error (MalformedMessage).
+inline Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, int passes,
+                               const Codec* codec)
+{
+    if (message.size() < fragmentPrefix)
+        failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
+    const auto m = loadAs<MessageHeader>(message.data());
+    const auto h = loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader));
+    if (h.tile < 0 || h.tile >= layout.tileCount())
+        failMalformed("tile index outside the image", layout.tileCount() - 1, h.tile);
+    if (h.pass < 0 || h.pass >= passes)
+        failMalformed("pass outside the frame's", passes - 1, h.pass);
+    if (!(h.channels & colorChannel) || (h.channels & ~(colorChannel | depthChannel)))
+        failMalformed("unknown set of channels", colorChannel, h.channels);
+
+    TileHeader header;
+    header.frame = m.number;
+    header.tile = h.tile;
+    header.region = layout.region(h.tile);
+    header.pass = h.pass;
+    header.generation = h.generation;
+    header.children = h.children;
+    header.source = h.source;
+    header.part = h.part;
+
+    const int width = header.region.width(), height = header.region.height();
+    const auto pixelCount = static_cast<std::uint32_t>(width * height);
+    const std::size_t pixelBytes = sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
+    std::size_t stored = h.activePixels, tableBytes = 0;
+    switch (h.encoding) {
+    case FragmentEncoding::Empty:
+        if (h.activePixels != 0)
+            failMalformed("an empty fragment with pixels", 0, h.activePixels);
+        break;
+    case FragmentEncoding::Sparse:
+        if (h.rowBegin >= h.rowEnd || h.rowEnd > height)
+            failMalformed("rows outside the tile", height, h.rowEnd);
+        if (h.spanCount > pixelCount)
+            failMalformed("more spans than pixels", pixelCount, h.spanCount);
+        tableBytes = alignedTo16(sizeof(std::uint16_t) * static_cast<std::size_t>(h.rowEnd - h.rowBegin)
+                                 + sizeof(Span) * h.spanCount);
+        break;
+    case FragmentEncoding::Dense:
+    case FragmentEncoding::Constant:
+        if (h.activePixels != pixelCount)
+            failMalformed("wrong number of pixels", pixelCount, h.activePixels);
+        if (h.encoding == FragmentEncoding::Constant)
+            stored = 1;
+        break;
+    default: failMalformed("unknown encoding", -1, static_cast<std::int64_t>(h.encoding));
+    }
+    if (stored > pixelCount)
+        failMalformed("more pixels than the tile has", pixelCount, static_cast<std::int64_t>(stored));
+    const std::size_t payload = tableBytes + stored * pixelBytes;
+    if (h.rawPayloadBytes != payload)
+        failMalformed("wrong payload size", static_cast<std::int64_t>(payload), h.rawPayloadBytes);
+
+    std::size_t offset = fragmentPrefix;
+    if (h.codec != 0) {
+        if (!codec || codec->id() != h.codec)
+            failMalformed("compressed by a codec that this rank does not have", codec ? codec->id() : 0, h.codec);
+        Buffer raw = pool.acquire(payload);
+        if (!codec->decompress(message.data() + fragmentPrefix, message.size() - fragmentPrefix, raw.data(), payload))
+            failMalformed("the payload does not decompress to its size", static_cast<std::int64_t>(payload), -1);
+        message = std::move(raw);
+        offset = 0;
+    } else if (message.size() - fragmentPrefix != payload) {
+        failMalformed("wrong message size", static_cast<std::int64_t>(fragmentPrefix + payload),
+                      static_cast<std::int64_t>(message.size()));
+    }
+
+    Fragment::Parts parts;
+    parts.encoding = h.encoding;
+    parts.activePixels = h.activePixels;
+    parts.rowEnd = height;
+    parts.fullRow = {0, static_cast<std::uint16_t>(width)};
+    const std::byte* body = message.data() + offset;
+    if (h.encoding == FragmentEncoding::Sparse) {
+        parts.rowBegin = h.rowBegin;
+        parts.rowEnd = h.rowEnd;
+        parts.rowSpanCounts = reinterpret_cast<const std::uint16_t*>(body);
+        parts.spans = reinterpret_cast<const Span*>(parts.rowSpanCounts + (h.rowEnd - h.rowBegin));
+        const Span* span = parts.spans;
+        std::uint32_t spans = 0, pixels = 0;
+        for (int row = 0; row < h.rowEnd - h.rowBegin; ++row) {
+            int x = 0;
+            if ((spans += parts.rowSpanCounts[row]) > h.spanCount)
+                failMalformed("more spans in the rows than in all", h.spanCount, spans);
+            for (int i = 0; i < parts.rowSpanCounts[row]; ++i, ++span) {
+                if (span->x < x || span->count == 0 || span->x + span->count > width)
+                    failMalformed("a span outside its row", width, span->x + span->count);
+                x = span->x + span->count;
+                pixels += span->count;
+            }
+        }
+        if (spans != h.spanCount || pixels != h.activePixels)
+            failMalformed("the spans do not add up to the active pixels", h.activePixels, pixels);
+    }
+    const auto* color = reinterpret_cast<const float*>(body + tableBytes);
+    parts.color = color;
+    parts.depth = h.channels & depthChannel ? color + 4 * stored : nullptr;
+    if (h.encoding == FragmentEncoding::Constant) {
+        // One row that every row reads.
+        const auto count = static_cast<std::size_t>(width);
+        Buffer row = pool.acquire(count * pixelBytes);
+        auto* rowColor = reinterpret_cast<float*>(row.data());
+        for (std::size_t x = 0; x < count; ++x)
+            std::memcpy(rowColor + 4 * x, color, 4 * sizeof(float));
+        if (parts.depth) {
+            std::fill(rowColor + 4 * count, rowColor + 5 * count, parts.depth[0]);
+            parts.depth = rowColor + 4 * count;
+        }
+        parts.color = rowColor;
+        message = std::move(row);
+    }
+    if (parts.depth && h.encoding != FragmentEncoding::Empty) {
+        const std::size_t count = h.encoding == FragmentEncoding::Constant ? static_cast<std::size_t>(width) : stored;
+        for (std::size_t i = 0; i < count; ++i)
+            if (parts.depth[i] != parts.depth[i])
+                failMalformed("a depth is NaN");
+    }
+    return Fragment(header, std::move(message), parts);
+}
+
+} // namespace dfb::detail

@@ -1,0 +1,21 @@
+// All of dfb. MPI, oneTBB and Snappy come in where the targets dfb::mpi, dfb::tbb and dfb::snappy are linked, which
+// define DFB_HAS_MPI, DFB_HAS_TBB and DFB_HAS_SNAPPY.
+#pragma once
+
+#include <dfb/comm/inproc_transport.hpp>
+#include <dfb/distributed_framebuffer.hpp>
+#include <dfb/ops/image_parallel.hpp>
+#include <dfb/ops/pixel_ops.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/render/data_parallel.hpp>
+#include <dfb/render/image_parallel.hpp>
+
+#if defined(DFB_HAS_MPI)
+#include <dfb/comm/mpi_transport.hpp>
+#endif
+#if defined(DFB_HAS_TBB)
+#include <dfb/tbb_executor.hpp>
+#endif
+#if defined(DFB_HAS_SNAPPY)
+#include <dfb/comm/snappy_codec.hpp>
+#endif

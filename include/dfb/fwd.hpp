@@ -1,0 +1,15 @@
+// Declarations of the main types, and the default template arguments, which are stated here and nowhere else.
+#pragma once
+
+namespace dfb {
+
+struct NoPixelOp;        // ops/pixel_ops.hpp
+class MpiTransport;      // comm/mpi_transport.hpp
+class InprocTransport;   // comm/inproc_transport.hpp
+class Executor;          // exec.hpp
+class Image;             // image.hpp
+
+template <class TileOp, class PixelOp = NoPixelOp, class Transport = MpiTransport>
+class DistributedFrameBuffer; // distributed_framebuffer.hpp
+
+} // namespace dfb
