@@ -1,0 +1,41 @@
+// The data-parallel rendering loop (Listing 3 of the paper): each rank renders its bricks wherever they project.
+#pragma once
+
+#include <dfb/render/tile_loop.hpp>
+#include <dfb/render/visibility.hpp>
+#include <dfb/render/world.hpp>
+
+#include <cstddef>
+#include <vector>
+
+namespace dfb {
+
+// Collective. Renders all bricks of `world` into the tiles that they may project to, and ends the frame; every brick
+// must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once, for each
+// pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
+// brick.bounds into the cleared tile, depth growing away from the camera. Unlike in Listing 3 the owners do not count
+// the bricks that project to their tiles: each rank declares what it will send, so the two can not disagree. Throws what
+// Frame::end() throws; an exception of renderBrick becomes a FrameError on all ranks.
+template <class FrameBuffer, class Camera, class RenderBrick>
+FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera& camera, const RenderBrick& renderBrick,
+                               FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                               const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    params.declared = true;
+    auto frame = fb.begin(params, tileData, pixelData);
+    const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+    if (frame.wantsDeclaration())
+        frame.declare(inputsOf(world, pairs));
+    const auto passes = static_cast<std::size_t>(params.passes);
+    return detail::runTileJobs(fb, frame, pairs.size() * passes, [&](std::size_t i, auto& tile) {
+        const BrickInTile& pair = pairs[i / passes];
+        const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)];
+        frame.start(tile, pair.tile, static_cast<int>(i % passes));
+        tile.generation = 1;
+        tile.source = brick.id;
+        renderBrick(brick, tile);
+        frame.setTile(tile);
+    });
+}
+
+} // namespace dfb

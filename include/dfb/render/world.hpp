@@ -1,0 +1,72 @@
+// World: the bricks of data that this rank holds, each with an id and its bounds in space (section 5 of the
+// paper).
+#pragma once
+
+#include <dfb/error.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <string>
+#include <vector>
+
+namespace dfb {
+
+struct Vec3 {
+    float x = 0, y = 0, z = 0;
+};
+
+inline Vec3 operator+(const Vec3& a, const Vec3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vec3 operator-(const Vec3& a, const Vec3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec3 operator*(float s, const Vec3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
+inline float dot(const Vec3& a, const Vec3& b) noexcept { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Vec3 cross(const Vec3& a, const Vec3& b) noexcept
+{
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+inline Vec3 normalize(const Vec3& a) noexcept { return (1.0f / std::sqrt(dot(a, a))) * a; }
+
+// An axis-aligned box, in the user's unit of length. Renderers treat it as half-open, [lower, upper), so that two
+// bricks that share a face share no point.
+struct Box3 {
+    Vec3 lower, upper;
+};
+
+// A convex region of space that overlaps no other brick.
+struct Brick {
+    std::uint32_t id = 0; // the same number means the same data, on any rank
+    Box3 bounds;
+};
+
+// What this rank holds; ranks may hold none. Not for use by several threads while bricks are added.
+class World {
+public:
+    World() = default;
+    // Throws as add() does.
+    explicit World(const std::vector<Brick>& bricks)
+    {
+        for (const Brick& brick : bricks)
+            add(brick);
+    }
+
+    // Throws InvalidArgument for bounds that are not finite or have lower > upper, and for an id this rank has already.
+    void add(const Brick& brick)
+    {
+        const auto ordered = [](float lower, float upper) {
+            return std::isfinite(lower) && std::isfinite(upper) && lower <= upper;
+        };
+        const Box3& b = brick.bounds;
+        if (!ordered(b.lower.x, b.upper.x) || !ordered(b.lower.y, b.upper.y) || !ordered(b.lower.z, b.upper.z))
+            throw InvalidArgument("the bounds of brick " + std::to_string(brick.id) + " are not a box");
+        if (std::any_of(bricks_.begin(), bricks_.end(), [&](const Brick& other) { return other.id == brick.id; }))
+            throw InvalidArgument("brick " + std::to_string(brick.id) + " was added twice");
+        bricks_.push_back(brick);
+    }
+
+    const std::vector<Brick>& bricks() const noexcept { return bricks_; }
+
+private:
+    std::vector<Brick> bricks_;
+};
+
+} // namespace dfb
