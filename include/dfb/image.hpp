@@ -86,7 +86,10 @@ inline std::uint8_t toSrgb8(double linear) noexcept
     return static_cast<std::uint8_t>(std::upper_bound(t.begin(), t.end(), linear) - t.begin());
 }
 
-// Converts `count` linear RGBA pixels of type double or float into `out`, bytesPerPixel(format) each.
+} // namespace detail
+
+// Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
+// rounded to nearest.
 template <class Real>
 void convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
 {
@@ -102,22 +105,20 @@ void convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* 
     case OutputFormat::RGBA8: {
         auto* bytes = reinterpret_cast<std::uint8_t*>(out);
         for (int i = 0; i < 4 * count; ++i)
-            bytes[i] = toUnorm8(rgba[i]);
+            bytes[i] = detail::toUnorm8(rgba[i]);
         return;
     }
     case OutputFormat::SRGBA8: {
         auto* bytes = reinterpret_cast<std::uint8_t*>(out);
         for (int i = 0; i < count; ++i) {
             for (int c = 0; c < 3; ++c)
-                bytes[4 * i + c] = toSrgb8(rgba[4 * i + c]);
-            bytes[4 * i + 3] = toUnorm8(rgba[4 * i + 3]);
+                bytes[4 * i + c] = detail::toSrgb8(rgba[4 * i + c]);
+            bytes[4 * i + 3] = detail::toUnorm8(rgba[4 * i + 3]);
         }
         return;
     }
     }
 }
-
-} // namespace detail
 
 // A whole image, row-major, row 0 on top, no padding. Empty on ranks other than the display rank and with
 // OutputFormat::None.

@@ -61,7 +61,7 @@ public:
     void setRow(int y, const double* rgba, const float* depth)
     {
         if (color_)
-            detail::convertPixels(rgba, width(), format_, color_ + static_cast<std::size_t>(y) * colorStride_);
+            convertPixels(rgba, width(), format_, color_ + static_cast<std::size_t>(y) * colorStride_);
         if (!depth_)
             return;
         float* out = depth_ + static_cast<std::size_t>(y) * depthStride_;

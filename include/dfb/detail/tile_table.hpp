@@ -115,17 +115,18 @@ public:
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
 
-    // Tiles that have had an input in this frame, or the first that has had one without being expected.
-    // To be called when arrivals are over, or under a lock that keeps them out.
-    int touchedCount() const
+    // How many tiles have had an input in this frame.
+    int touchedCount()
     {
         int count = 0;
-        for (const auto& slot : slots_)
-            count += slot && slot->frame == info_.frame && slot->touched;
+        for (std::size_t i = 0; i < slots_.size(); ++i) {
+            const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
+            count += slots_[i] && slots_[i]->frame == info_.frame && slots_[i]->touched;
+        }
         return count;
     }
 
-    // The tiles of this frame that have had inputs though none was declared for them.
+    // The first tile of this frame that has had an input though none was declared for it; -1 if there is none.
     template <class Expected>
     int firstUndeclared(const Expected& expected)
     {

@@ -1,0 +1,461 @@
+// FrameEngine: what DistributedFrameBuffer does behind its interface: it joins the tile pipeline, the messaging
+// layer, the declarations and the verdict into frames.
+#pragma once
+
+#include <dfb/comm/messaging.hpp>
+#include <dfb/detail/frame_gate.hpp>
+#include <dfb/detail/manifest.hpp>
+#include <dfb/detail/outcome.hpp>
+#include <dfb/detail/tile_pipeline.hpp>
+#include <dfb/frame.hpp>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <exception>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// The members are those of DistributedFrameBuffer and its Frame; see there.
+template <class TileOp, class PixelOp, class Transport>
+class FrameEngine : private MessageReceiver {
+public:
+    using Pipeline = TilePipeline<TileOp, PixelOp>;
+    using Tile = typename Pipeline::Tile;
+    using TileFrameData = typename FrameDataOf<TileOp>::type;
+    using PixelFrameData = typename FrameDataOf<PixelOp>::type;
+    using Bytes = ReductionTable::Bytes;
+
+    FrameEngine(const typename Transport::Communicator& communicator, FrameBufferConfig config, PixelOp pixelOp)
+        : pool_(MemoryPool::create()), config_(std::move(config))
+    {
+        if (!config_.executor)
+            config_.executor = std::make_shared<ThreadExecutor>();
+        MessageReceiver& self = *this;
+        messaging_ = std::make_unique<Messaging<Transport>>(communicator, pool_, config_.progress,
+                                                                    config_.executor, config_.id, self);
+        outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
+        Agreement mine;
+        try {
+            if (config_.displayRank < 0 || config_.displayRank >= size())
+                throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
+                                      + std::to_string(size()));
+            pipeline_ = std::make_unique<Pipeline>(
+                pool_, config_, std::move(pixelOp), rank(), size(),
+                [this](Buffer&& message) { messaging_->send(config_.displayRank, std::move(message)); });
+            mine = Agreement::of(config_, Tile::size, Tile::channels, layout().tileCount(),
+                                         [this](int tile) { return tileOwner(tile); });
+        } catch (const InvalidArgument& e) {
+            mine = {false, e.info().message};
+        }
+        const auto all = Agreement::from(
+            messaging_->reduce(OutsideFrames, reductionCount_++, mine.bytes(), Agreement::combine));
+        if (!all.fine)
+            throw InvalidArgument(all.text);
+    }
+
+    FrameEngine(const FrameEngine&) = delete;
+    FrameEngine& operator=(const FrameEngine&) = delete;
+    ~FrameEngine() = default;
+
+    int rank() const noexcept { return messaging_->rank(); }
+    int size() const noexcept { return messaging_->size(); }
+    const FrameBufferConfig& config() const noexcept { return config_; }
+    const TileLayout& layout() const noexcept { return pipeline_->table().layout(); }
+    int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
+    const std::vector<int>& ownedTiles() const noexcept { return pipeline_->table().owned(); }
+    const Image& image() const noexcept { return pipeline_->gather().image(); }
+    std::int64_t frame() const noexcept { return gate_.frame(); }
+    bool wantsDeclaration() const noexcept { return wantsDeclaration_; }
+    bool failed() const noexcept { return outcome_->failed(); }
+
+    void begin(const FrameParams& params, const TileFrameData& tileData, const PixelFrameData& pixelData)
+    {
+        if (frameOpen_)
+            throw InvalidArgument("begin() while a frame is open: end() it first");
+        if (params.passes < 1)
+            throw InvalidArgument("a frame has at least 1 pass, not " + std::to_string(params.passes));
+        if (params.declarationKey != 0 && !params.declared)
+            throw InvalidArgument("a declarationKey without declared inputs");
+        messaging_->throwIfFailed();
+        const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
+        params_ = params;
+        lastKey_ = 0;
+        wantsDeclaration_ = params.declared && !reuse;
+        if (!reuse)
+            manifests_.reset();
+
+        TileInfo info;
+        info.rank = rank();
+        info.frame = gate_.frame() + 1;
+        info.passes = params.passes;
+        info.wantsDepth = config_.depth;
+        info.background = params.background;
+        pipeline_->newFrame(info, tileData, pixelData);
+        outcome_->newFrame();
+        ownTilesDone_ = endCalled_ = false;
+        bytesBefore_ = messaging_->bytesSent();
+        messagesBefore_ = messaging_->messagesSent();
+        renderNs_ = 0;
+        declarationsApplied_ = false;
+        tilesLeft_ = countUnknown + (params.declared ? 0 : static_cast<std::int64_t>(ownedTiles().size()));
+        beginTime_ = Clock::now();
+        frameOpen_ = true;
+        messaging_->expectMessages(true);
+        for (auto& early : gate_.open())
+            incoming(early.source, early.header, std::move(early.bytes));
+        if (!params.declared)
+            tilesLess(countUnknown);
+        else if (reuse)
+            applyDeclarations();
+    }
+
+    void start(Tile& tile, int index, int pass) const { pipeline_->start(tile, index, pass); }
+
+    void setTile(const Tile& tile)
+    {
+        checkTile(tile, layout(), pipeline_->table().frameInfo());
+        if (outcome_->failed())
+            return;
+        Buffer message = pipeline_->encode(tile);
+        const int owner = tileOwner(tile.tile);
+        if (owner != rank()) {
+            messaging_->send(owner, std::move(message));
+        } else if (gate_.enter(tile.frame)) {
+            arrive(std::move(message));
+            gate_.leave();
+        }
+    }
+
+    void declare(const std::vector<TileInput>& inputs)
+    {
+        if (!wantsDeclaration_ || manifests_.declared())
+            throw InvalidArgument(!params_.declared ? "declare() in a frame that was not begun with declared inputs"
+                                                    : "declare() a second time, or where the last frame's holds");
+        for (const TileInput& input : inputs)
+            if (input.tile < 0 || input.tile >= layout().tileCount())
+                throw InvalidArgument("declare() of tile " + std::to_string(input.tile) + " of an image of "
+                                      + std::to_string(layout().tileCount()) + " tiles");
+        if (outcome_->failed())
+            return;
+        const auto manifests = manifests_.split(inputs, rank(), [this](int tile) { return tileOwner(tile); });
+        for (const auto& [owner, bytes] : manifests)
+            messaging_->send(owner, MessageKind::Manifest, gate_.frame(), bytes);
+        if (manifests.empty())
+            enterAllDeclared();
+    }
+
+    void abort(const std::exception_ptr& reason) { failWith(reason); }
+
+    FrameReport end()
+    {
+        if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
+            guarded([] { throw InvalidArgument("end() of a frame with declared inputs without declare()"); });
+        const Verdict verdict = conclude();
+        if (verdict.error)
+            throw FrameError(*verdict.error);
+        pipeline_->fillBackground();
+        lastKey_ = params_.declarationKey;
+
+        const double nsPerMs = 1e6;
+        FrameReport report;
+        report.frame = gate_.frame();
+        report.totalMs = static_cast<double>(std::chrono::nanoseconds(Clock::now() - beginTime_).count()) / nsPerMs;
+        report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
+        report.compositingOverheadMs = report.totalMs - report.renderMs;
+        report.renderMsMax = static_cast<double>(verdict.maxima[1]) / nsPerMs;
+        report.bytesSent = verdict.sums[0];
+        report.messagesSent = verdict.sums[1];
+        report.tilesTotal = layout().tileCount();
+        report.tilesTouched = verdict.sums[2];
+        report.nonFinitePixels = verdict.sums[3];
+        report.lateMessages = verdict.sums[4];
+        report.peakMemoryBytes = verdict.maxima[0];
+        return report;
+    }
+
+    // A frame that is left without end(), mostly while an exception passes.
+    void cancel() noexcept
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Cancelled;
+        info.message = "the frame was left without end()";
+        try {
+            failWith(std::make_exception_ptr(Error(std::move(info))));
+            conclude();
+        } catch (const TransportError&) {
+            // begin() will say so.
+        }
+    }
+
+    // Element by element.
+    template <class Operation>
+    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
+    {
+        ByteWriter out;
+        for (std::int64_t v : values)
+            out.put(v);
+        const Bytes result = messaging_->reduce(OutsideFrames, reductionCount_++, out.take(),
+                                                [operation](const Bytes& a, const Bytes& b) {
+                                                    return ReductionTable::combineElements(a, b, operation);
+                                                });
+        if (result.size() != values.size() * sizeof(std::int64_t))
+            throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
+        std::vector<std::int64_t> reduced(values.size());
+        ByteReader in(result);
+        for (std::int64_t& v : reduced)
+            v = in.get<std::int64_t>();
+        return reduced;
+    }
+
+private:
+    using Clock = std::chrono::steady_clock;
+    enum Scope : std::uint32_t { OutsideFrames, AllDeclared, FrameVerdict };
+
+    // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
+    static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
+
+    // ---- messages
+
+    void incoming(int source, const MessageHeader& header, Buffer&& message) override
+    {
+        if (!gate_.enter(source, header, message))
+            return;
+        guarded([&] { handle(source, header.kind, std::move(message)); }, messageFrom(source));
+        gate_.leave();
+    }
+
+    void malformed(int source, const std::exception_ptr& error) override { failWith(error, messageFrom(source)); }
+
+    static ErrorInfo messageFrom(int source)
+    {
+        ErrorInfo where;
+        where.message = "in a message from rank " + std::to_string(source);
+        return where;
+    }
+
+    void transportFailed() override { outcome_->setFailed(); }
+
+    void handle(int source, MessageKind kind, Buffer&& message)
+    {
+        if (kind == MessageKind::Abort) {
+            outcome_->setFailed();
+            tryVote();
+            return;
+        }
+        if (outcome_->failed())
+            return;
+        switch (kind) {
+        case MessageKind::Fragment: arrive(std::move(message)); break;
+        case MessageKind::Manifest:
+            if (!wantsDeclaration_) {
+                ErrorInfo info;
+                info.kind = ErrorKind::Disagreement;
+                info.message = "the sender declares its inputs, this rank expects no declaration";
+                throw Error(std::move(info));
+            }
+            manifests_.receive(ByteReader(message.data() + sizeof(MessageHeader),
+                                                  message.size() - sizeof(MessageHeader)),
+                               [this](int tile) { return pipeline_->table().isMine(tile); });
+            messaging_->send(source, MessageKind::ManifestAck, gate_.frame());
+            break;
+        case MessageKind::ManifestAck:
+            if (manifests_.acknowledged())
+                enterAllDeclared();
+            break;
+        case MessageKind::FinishedTiles:
+            pipeline_->gather().receiveTiles(std::move(message));
+            tryVote();
+            break;
+        case MessageKind::TilesDone:
+            pipeline_->gather().receiveDone(message);
+            tryVote();
+            break;
+        default: break;
+        }
+    }
+
+    // ---- tiles
+
+    void arrive(Buffer&& message)
+    {
+        ErrorInfo where;
+        guarded(
+            [&] {
+                const int ready = pipeline_->arrive(std::move(message), where);
+                if (declarationsApplied_ && !manifests_.expected().count(static_cast<int>(where.tile)))
+                    failUndeclared();
+                if (ready >= 0)
+                    submitFinish(ready);
+            },
+            where);
+    }
+
+    void submitFinish(int tile)
+    {
+        gate_.enter(gate_.frame()); // we are inside, so it is open
+        messaging_->submit([this, tile] {
+            ErrorInfo where;
+            where.tile = tile;
+            guarded(
+                [&] {
+                    if (outcome_->failed())
+                        return;
+                    pipeline_->finish(tile);
+                    tilesLess(1);
+                },
+                where);
+            gate_.leave();
+        });
+    }
+
+    // So many tiles less to wait for.
+    void tilesLess(std::int64_t count)
+    {
+        if ((tilesLeft_ -= count) != 0)
+            return;
+        pipeline_->gather().flush();
+        ownTilesDone_ = true;
+        tryVote();
+    }
+
+    // ---- what is expected, by manifest
+
+    void enterAllDeclared()
+    {
+        messaging_->reductions().enter({AllDeclared, gate_.frame()}, {}, [](const Bytes& a, const Bytes&) { return a; },
+                                       [this, frame = gate_.frame()](const Bytes&) {
+                                           if (!gate_.enter(frame))
+                                               return;
+                                           applyDeclarations();
+                                           gate_.leave();
+                                       });
+    }
+
+    // Every manifest is here: now it is known what each owned tile waits for.
+    void applyDeclarations()
+    {
+        if (outcome_->failed())
+            return;
+        const auto& expected = manifests_.expected();
+        declarationsApplied_ = true; // from now on arrive() looks
+        const int stranger = pipeline_->table().firstUndeclared(expected);
+        ErrorInfo where;
+        const auto declareTile = [&](int tile, const ManifestExchange::Inputs& inputs) {
+            where.tile = tile;
+            ++tilesLeft_;
+            if (pipeline_->table().declare(tile, inputs))
+                submitFinish(tile);
+        };
+        guarded(
+            [&] {
+                if (stranger >= 0) {
+                    where.tile = stranger;
+                    failUndeclared();
+                }
+                for (const auto& [tile, inputs] : expected)
+                    declareTile(tile, inputs);
+                // A pixel operation that is not pointwise sees background tiles too.
+                if constexpr (!IsPointwise<PixelOp>::value)
+                    for (int tile : ownedTiles())
+                        if (!expected.count(tile))
+                            declareTile(tile, {});
+                tilesLess(countUnknown);
+            },
+            where);
+    }
+
+    [[noreturn]] static void failUndeclared()
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::UnannouncedInput;
+        info.message = "no rank declared an input for this tile";
+        throw Error(std::move(info));
+    }
+
+    // ---- failure, verdict, end
+
+    // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then.
+    template <class Body>
+    void guarded(const Body& body, const ErrorInfo& where = {})
+    {
+        try {
+            body();
+        } catch (...) {
+            failWith(std::current_exception(), where);
+        }
+    }
+
+    void failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
+    {
+        outcome_->fail(reason, where);
+        tryVote();
+    }
+
+    // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
+    void tryVote()
+    {
+        outcome_->vote([this] { return endCalled_ && ownTilesDone_ && pipeline_->gather().complete(); },
+                       [this] {
+                           Verdict v;
+                           v.paramsHash = fingerprintOf(params_);
+                           v.sums = {messaging_->bytesSent() - bytesBefore_, messaging_->messagesSent() - messagesBefore_,
+                                     ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
+                                     pipeline_->nonFinitePixels(), gate_.takeLateCount()};
+                           v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_};
+                           return v;
+                       });
+    }
+
+    // Waits for the verdict and closes the frame, also when it throws TransportError.
+    Verdict conclude()
+    {
+        renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+        endCalled_ = true;
+        std::exception_ptr transportError;
+        Verdict verdict;
+        try {
+            tryVote();
+            verdict = outcome_->wait();
+        } catch (const TransportError&) {
+            transportError = std::current_exception();
+        }
+        gate_.close();
+        messaging_->reductions().forget(AllDeclared, gate_.frame());
+        messaging_->expectMessages(false);
+        frameOpen_ = false;
+        if (transportError || verdict.error)
+            pipeline_->gather().invalidate();
+        if (transportError)
+            std::rethrow_exception(transportError);
+        return verdict;
+    }
+
+    std::shared_ptr<MemoryPool> pool_;
+    FrameBufferConfig config_;
+    std::unique_ptr<Pipeline> pipeline_;
+    ManifestExchange manifests_;
+    std::int64_t reductionCount_ = 0;
+
+    // The frame.
+    FrameGate gate_;
+    std::unique_ptr<FrameOutcome<Transport>> outcome_;
+    FrameParams params_;
+    std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
+    bool frameOpen_ = false;
+    std::atomic<bool> wantsDeclaration_{false}, declarationsApplied_{false};
+    std::atomic<std::int64_t> tilesLeft_{0};
+    std::atomic<bool> ownTilesDone_{false}, endCalled_{false};
+    std::atomic<std::int64_t> renderNs_{0};
+    std::int64_t bytesBefore_ = 0, messagesBefore_ = 0;
+    Clock::time_point beginTime_;
+
+    std::unique_ptr<Messaging<Transport>> messaging_; // last: its tasks use the others
+};
+
+} // namespace dfb::detail
