@@ -12,7 +12,8 @@ int main(int argc, char** argv)
     {
         const int width = 640, height = 320;
         dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(MPI_COMM_WORLD, {width, height, dfb::OutputFormat::SRGBA8});
-        const float angle = 6.2832f * fb.rank() / fb.size(), ring = std::fmax(2.0f, 0.4f * fb.size());
+        const auto rank = static_cast<float>(fb.rank()), ranks = static_cast<float>(fb.size());
+        const float angle = 6.2832f * rank / ranks, ring = std::fmax(2.0f, 0.4f * ranks);
         const dfb::Vec3 center{ring * std::cos(angle), 0, ring * std::sin(angle)}, half{1, 1, 1};
         const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {center - half, center + half}}});
         const dfb::PerspectiveCamera camera({0, 1.5f * ring, 4 * ring}, {0, 0, 0}, {0, 1, 0}, 30);
@@ -20,7 +21,7 @@ int main(int argc, char** argv)
         dfb::renderDataParallel(fb, world, camera, [&](const dfb::Brick&, auto& tile) {
             for (int y = 0; y < tile.region.height(); ++y)
                 for (int x = 0; x < tile.region.width(); ++x) {
-                    const auto ray = camera.direction(tile.region.x0 + x + 0.5f, tile.region.y0 + y + 0.5f, width, height);
+                    const auto ray = camera.direction(tile.region.x0 + x + 0.5, tile.region.y0 + y + 0.5, width, height);
                     const dfb::Vec3 way = center - camera.eye();
                     const float middle = dot(ray, way), inside = 1 - dot(way, way) + middle * middle;
                     if (inside <= 0)

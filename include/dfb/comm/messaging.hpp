@@ -35,7 +35,7 @@ protected:
 };
 
 template <class Transport>
-class Messaging : private TransportHandler {
+class Messaging final : private TransportHandler {
 public:
     using Bytes = ReductionTable::Bytes;
 

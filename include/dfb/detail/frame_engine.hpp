@@ -23,7 +23,7 @@ namespace dfb::detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
 template <class TileOp, class PixelOp, class Transport>
-class FrameEngine : private MessageReceiver {
+class FrameEngine final : private MessageReceiver {
 public:
     using Pipeline = TilePipeline<TileOp, PixelOp>;
     using Tile = typename Pipeline::Tile;

@@ -35,11 +35,10 @@ public:
     const Vec3& eye() const noexcept { return eye_; }
 
     // The unit direction from the eye through point (x, y) of the image, in pixels; pixel centres are at .5.
-    Vec3 direction(float x, float y, int width, int height) const
+    Vec3 direction(double x, double y, int width, int height) const
     {
-        const float scale = 2.0f * tanHalfFov_ / static_cast<float>(height);
-        const float u = (x - 0.5f * static_cast<float>(width)) * scale;
-        const float v = (0.5f * static_cast<float>(height) - y) * scale;
+        const double scale = 2.0 * static_cast<double>(tanHalfFov_) / height;
+        const auto u = static_cast<float>((x - 0.5 * width) * scale), v = static_cast<float>((0.5 * height - y) * scale);
         return normalize(forward_ + u * right_ + v * up_);
     }
 
