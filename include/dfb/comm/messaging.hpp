@@ -48,13 +48,13 @@ public:
     {
         transport_.start(*this);
         if (transport_.needsPolling() && mode == Progress::Thread)
-            progress_.emplace([this] { return transport_.poll(); }, [this] { return transport_.quiet(); });
+            progress_.start();
     }
 
     // Collective where the transport's stop() is.
     ~Messaging()
     {
-        progress_.reset();
+        progress_.stop();
         if (!failed_)
             transport_.stop();
         std::unique_lock<std::mutex> lock(mutex_);
@@ -110,11 +110,7 @@ public:
     ReductionTable& reductions() noexcept { return reductions_; }
 
     // Between ranks that may have messages for each other: as long as this is so, they are looked for.
-    void expectMessages(bool expect)
-    {
-        if (progress_)
-            progress_->expectMessages(expect);
-    }
+    void expectMessages(bool expect) { progress_.expectMessages(expect); }
 
     // Wakes those in wait(), to ask again.
     void notify()
@@ -130,7 +126,7 @@ public:
     {
         std::unique_lock<std::mutex> lock(mutex_);
         const auto over = [&] { return failed_ || ready(); };
-        if (progress_ || !transport_.needsPolling()) {
+        if (progress_.running() || !transport_.needsPolling()) {
             changed_.wait(lock, over);
         } else {
             // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
@@ -233,11 +229,7 @@ private:
         receiver_.transportFailed();
     }
 
-    void wake() override
-    {
-        if (progress_)
-            progress_->wake();
-    }
+    void wake() override { progress_.wake(); }
 
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
@@ -254,7 +246,7 @@ private:
     std::optional<ErrorInfo> failure_;
     std::atomic<bool> failed_{false};
 
-    std::optional<ProgressThread> progress_; // last: it uses the others
+    ProgressThread progress_{[this] { return transport_.poll(); }, [this] { return transport_.quiet(); }};
 };
 
 } // namespace dfb::detail

@@ -19,23 +19,33 @@ namespace dfb {
 
 class ProgressThread {
 public:
-    // `poll`: true if something moved. `quiet`: nothing waits to be sent. Neither may throw or block.
+    // `poll`: true if something moved. `quiet`: nothing waits to be sent. Neither may throw or block. Does not start yet.
     ProgressThread(std::function<bool()> poll, std::function<bool()> quiet)
-        : poll_(std::move(poll)), quiet_(std::move(quiet)), thread_([this] { run(); })
+        : poll_(std::move(poll)), quiet_(std::move(quiet))
     {
     }
     ProgressThread(const ProgressThread&) = delete;
     ProgressThread& operator=(const ProgressThread&) = delete;
+    ~ProgressThread() { stop(); }
 
-    ~ProgressThread()
+    void start()
+    {
+        thread_ = std::thread([this] { run(); });
+    }
+
+    // After this poll() is not called any more; the other members may be.
+    void stop()
     {
         {
             std::lock_guard<std::mutex> lock(mutex_);
             stop_ = true;
         }
         changed_.notify_one();
-        thread_.join();
+        if (thread_.joinable())
+            thread_.join();
     }
+
+    bool running() const noexcept { return thread_.joinable(); }
 
     // There is something to send. From any thread.
     void wake()
@@ -92,7 +102,7 @@ private:
     std::mutex mutex_;
     std::condition_variable changed_;
     bool awake_ = false, expecting_ = false, stop_ = false;
-    std::thread thread_; // last: it uses the others
+    std::thread thread_;
 };
 
 } // namespace dfb
