@@ -12,32 +12,29 @@ int main(int argc, char** argv)
     {
         const int width = 640, height = 320;
         dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(MPI_COMM_WORLD, {width, height, dfb::OutputFormat::SRGBA8});
+
         const auto rank = static_cast<float>(fb.rank()), ranks = static_cast<float>(fb.size());
-        const float angle = 6.2832f * rank / ranks, ring = std::fmax(2.0f, 0.4f * ranks);
-        const dfb::Vec3 center{ring * std::cos(angle), 0, ring * std::sin(angle)}, half{1, 1, 1};
+        const dfb::Vec3 center{rank - 0.5f * ranks + 0.5f, 0.3f * (rank - 0.5f * ranks), -rank}, half{1, 1, 1};
         const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {center - half, center + half}}});
-        const dfb::PerspectiveCamera camera({0, 1.5f * ring, 4 * ring}, {0, 0, 0}, {0, 1, 0}, 30);
+        const dfb::PerspectiveCamera camera({0, 1, 8}, {0, 0, 0}, {0, 1, 0}, 30);
 
         dfb::renderDataParallel(fb, world, camera, [&](const dfb::Brick&, auto& tile) {
-            for (int y = 0; y < tile.region.height(); ++y)
-                for (int x = 0; x < tile.region.width(); ++x) {
-                    const auto ray = camera.direction(tile.region.x0 + x + 0.5, tile.region.y0 + y + 0.5, width, height);
-                    const dfb::Vec3 way = center - camera.eye();
-                    const float middle = dot(ray, way), inside = 1 - dot(way, way) + middle * middle;
-                    if (inside <= 0)
-                        continue; // the ray misses the ball
-                    const float halfChord = std::sqrt(inside), alpha = 1 - std::exp(-halfChord);
-                    float* pixel = tile.pixel(x, y); // premultiplied RGBA
-                    pixel[0] = pixel[3] = alpha;
-                    pixel[1] = alpha * (0.5f + 0.5f * std::cos(angle));
-                    pixel[2] = alpha * (0.5f + 0.5f * std::sin(angle));
-                    tile.depth[y * tile.size + x] = middle - halfChord;
-                }
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                const dfb::Vec3 way = center - camera.eye();
+                const float middle = dot(camera.direction(x + 0.5, y + 0.5, width, height), way);
+                const float inside = 1 - dot(way, way) + middle * middle; // half the chord through the ball, squared
+                if (inside <= 0)
+                    return;
+                rgba[0] = rgba[3] = 1 - std::exp(-std::sqrt(inside)); // premultiplied RGBA
+                rgba[1] = rgba[3] * (rank + 1) / ranks;
+                rgba[2] = rgba[3] - rgba[1];
+                depth = middle - std::sqrt(inside);
+            });
         });
 
         if (fb.isDisplayRank()) {
             std::ofstream file("minimal.ppm", std::ios::binary);
-            file << "P6\n" << width << ' ' << height << "\n255\n";
+            file << "P6 " << width << ' ' << height << " 255\n";
             for (std::size_t i = 0; i < fb.image().pixelCount(); ++i)
                 file.write(reinterpret_cast<const char*>(fb.image().rgba8() + 4 * i), 3);
         }

@@ -73,6 +73,20 @@ struct Tile : TileHeader, detail::DepthPlane<(Channels & depthChannel) != 0, Siz
         (void)depthValue;
     }
 
+    // Calls f(x, y, rgba, depth), or f(x, y, rgba) without a depth channel, for each pixel of the region, row by row:
+    // x and y are its place in the image, `rgba` points to its 4 floats, `depth` is a reference to its depth.
+    template <class PixelFunction>
+    void forEachPixel(const PixelFunction& f)
+    {
+        for (int y = 0; y < region.height(); ++y)
+            for (int x = 0; x < region.width(); ++x) {
+                if constexpr (hasDepth)
+                    f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[y * Size + x]);
+                else
+                    f(region.x0 + x, region.y0 + y, pixel(x, y));
+            }
+    }
+
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
 };

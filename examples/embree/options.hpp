@@ -1,0 +1,298 @@
+// Options: the command line of dfb_render. Parsing prints nothing, so that of many ranks one can do it.
+#pragma once
+
+#include "camera.hpp"
+
+#include <CLI/CLI.hpp>
+
+#include <array>
+#include <cstdint>
+#include <cstdlib>
+#include <optional>
+#include <sstream>
+#include <string>
+#include <vector>
+
+namespace example {
+
+enum class Mode { Data, Image };
+enum class Compression { None, Snappy };
+enum class OwnerMap { Lattice, Linear, Hash };
+
+struct Options {
+    std::vector<std::string> scene; // `synthetic`, `demo`, or files
+    bool fit = true;
+    Mode mode = Mode::Data;
+    int ranks = 0;   // threads as ranks, without MPI; 0: MPI's ranks
+    int bricks = 0;  // 0: one per rank
+    int threads = 0; // per rank; 0: as many as the machine has
+    Compression compression = Compression::None;
+    OwnerMap ownerMap = OwnerMap::Lattice;
+
+    int width = 1024, height = 1024;
+    int frames = 1;
+    int spp = 1;
+    std::uint64_t seed = 1;
+    View view;
+
+    float opacity = 0.6f;
+    float earlyTermination = 0;                     // 0: off
+    float exposure = 0;                             // 0: off
+    std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
+
+    std::string output, alpha, depth, stats; // empty: not written
+};
+
+// Either options to run with, or a message to print (on one rank) and a code to exit with: the help and 0, or one
+// line on what is wrong and something else.
+struct ParsedOptions {
+    std::optional<Options> options;
+    int exitCode = 0;
+    std::string message;
+};
+
+namespace detail {
+
+inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
+
+// An empty string if the path ends in one of `endings`, else what is wrong with it: the form CLI11 wants.
+inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
+{
+    std::string all;
+    for (const std::string& ending : endings) {
+        if (endingOf(path) == ending && path.size() > ending.size())
+            return {};
+        all += (all.empty() ? "" : ", ") + ending;
+    }
+    return "'" + path + "' has an unknown ending, expected " + all;
+}
+
+inline CLI::Validator ending(std::vector<std::string> endings)
+{
+    return CLI::Validator([endings](std::string& path) { return checkEnding(path, endings); }, "");
+}
+
+// A number within [lo, hi] and nothing else; CLI11's own range lets NaN pass.
+inline CLI::Validator number(double lo, double hi)
+{
+    return CLI::Validator(
+        [lo, hi](std::string& text) {
+            char* end = nullptr;
+            const double value = std::strtod(text.c_str(), &end);
+            if (!text.empty() && *end == '\0' && value >= lo && value <= hi)
+                return std::string();
+            std::ostringstream message;
+            message.precision(16);
+            message << "'" << text << "' is no number from " << lo << " to " << hi;
+            return message.str();
+        },
+        "");
+}
+
+// One of the words, which becomes its index: the value of an enumerator.
+inline CLI::Validator choice(std::vector<std::string> words)
+{
+    return CLI::Validator(
+        [words](std::string& text) {
+            std::string all;
+            for (std::size_t i = 0; i < words.size(); ++i) {
+                if (text == words[i]) {
+                    text = std::to_string(i);
+                    return std::string();
+                }
+                all += (i == 0 ? "" : i + 1 == words.size() ? " or " : ", ") + words[i];
+            }
+            return "'" + text + "' is not " + all;
+        },
+        "");
+}
+
+// Breaks lines for the help's second column.
+inline std::string wrapped(std::string text)
+{
+    const std::size_t width = 74;
+    for (std::size_t begin = 0; text.size() - begin > width;) {
+        const std::size_t space = text.rfind(' ', begin + width);
+        if (space == std::string::npos || space < begin)
+            break;
+        text[space] = '\n';
+        begin = space + 1;
+    }
+    return text;
+}
+
+inline void parseSize(const std::string& text, Options& options)
+{
+    const std::size_t x = text.find('x');
+    const auto side = [&text](std::size_t from, std::size_t to) {
+        int value = 0;
+        bool ok = from < to;
+        for (; from < to && ok; ++from) {
+            ok = text[from] >= '0' && text[from] <= '9' && value <= 65536;
+            value = ok ? 10 * value + (text[from] - '0') : 0;
+        }
+        return ok && value >= 1 && value <= 65536 ? value : 0;
+    };
+    options.width = x == std::string::npos ? 0 : side(0, x);
+    options.height = x == std::string::npos ? 0 : side(x + 1, text.size());
+    if (options.width == 0 || options.height == 0)
+        throw CLI::ValidationError("--size", "'" + text + "' is no WIDTHxHEIGHT with sides from 1 to 65536");
+}
+
+} // namespace detail
+
+inline ParsedOptions parseOptions(int argc, const char* const* argv)
+{
+    Options options;
+    std::string size;
+    std::vector<float> background;
+    CLI::App app("Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render");
+    app.set_help_flag("-h,--help", "Print this and exit");
+    app.get_formatter()->column_width(36);
+    const int most = 1 << 20;
+
+    app.add_option("scene", options.scene,
+                   "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
+                   "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz")
+        ->required()
+        ->option_text("SCENE...");
+    bool noFit = false;
+    app.add_flag("--no-fit", noFit,
+                 "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
+
+    const char* how = "Distribution";
+    app.add_option("--mode", options.mode,
+                   "data: each rank holds some bricks of the scene; image: each rank holds all and renders some "
+                   "tiles; default data")
+        ->transform(detail::choice({"data", "image"}))
+        ->option_text("data|image")
+        ->group(how);
+    app.add_option("--ranks", options.ranks, "Run N ranks as threads of one process; default: the ranks of MPI")
+        ->check(detail::number(1, 4096))
+        ->option_text("N")
+        ->group(how);
+    app.add_option("--bricks", options.bricks, "Bricks in all; default 0: one per rank")
+        ->check(detail::number(0, most))
+        ->option_text("N")
+        ->group(how);
+    app.add_option("--threads", options.threads, "Threads per rank; default 0: one per hardware thread")
+        ->check(detail::number(0, 4096))
+        ->option_text("N")
+        ->group(how);
+    app.add_option("--compression", options.compression, "Of messages between ranks; default none")
+        ->transform(detail::choice({"none", "snappy"}))
+        ->option_text("none|snappy")
+        ->group(how);
+    app.add_option("--owner-map", options.ownerMap, "Which rank owns which tile; default lattice")
+        ->transform(detail::choice({"lattice", "linear", "hash"}))
+        ->option_text("lattice|linear|hash")
+        ->group(how);
+
+    const char* picture = "Picture";
+    app.add_option("--size", size, "Of the image in pixels, each side 1 to 65536; default 1024x1024")
+        ->option_text("WxH")
+        ->group(picture);
+    app.add_option("--frames", options.frames, "Frames of one turn around the scene; default 1")
+        ->check(detail::number(1, most))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--spp", options.spp, "Samples per pixel, one pass each; default 1, in the pixel's centre")
+        ->check(detail::number(1, 65536))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--seed", options.seed, "Of generated scenes and sample positions; default 1")
+        ->check(detail::number(0, 9007199254740992.0))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--azimuth", options.view.azimuth, "Of the camera around the vertical axis in degrees; default 30")
+        ->check(detail::number(-36000, 36000))
+        ->option_text("DEG")
+        ->group(picture);
+    app.add_option("--elevation", options.view.elevation, "Of the camera in degrees, -90 to 90; default 20")
+        ->check(detail::number(-90, 90))
+        ->option_text("DEG")
+        ->group(picture);
+    app.add_option("--fov", options.view.fieldOfView, "Vertical field of view in degrees, 1 to 170; default 35")
+        ->check(detail::number(1, 170))
+        ->option_text("DEG")
+        ->group(picture);
+    app.add_option("--camera-distance", options.view.distance,
+                   "From the centre of what there is to see, in units of its largest extent; default 2.3")
+        ->check(detail::number(0, 1000))
+        ->option_text("D")
+        ->group(picture);
+    app.add_option("--opacity", options.opacity, "Of surfaces and spheres, 0 to 1; default 0.6")
+        ->check(detail::number(0, 1))
+        ->option_text("A")
+        ->group(picture);
+    app.add_option("--early-termination", options.earlyTermination,
+                   "End a ray within a brick when less than this part of the light gets through, 0 to 1; default 0: "
+                   "never. The image then depends on the bricks")
+        ->check(detail::number(0, 1))
+        ->option_text("T")
+        ->group(picture);
+    app.add_option("--background", background, "Opaque colour behind the scene, linear, each 0 to 1; default: none, "
+                                               "the image stays transparent")
+        ->delimiter(',')
+        ->expected(3)
+        ->check(detail::number(0, 1))
+        ->option_text("R,G,B")
+        ->group(picture);
+    app.add_option("--exposure", options.exposure, "Tone-map with this factor, above 0; default 0: off")
+        ->check(detail::number(0, 1e6))
+        ->option_text("E")
+        ->group(picture);
+
+    const char* files = "Files to write";
+    app.add_option("--output", options.output, "The last frame: sRGB in a .png, linear colour in a .pfm; default none")
+        ->check(detail::ending({".png", ".pfm"}))
+        ->option_text("FILE")
+        ->group(files);
+    app.add_option("--alpha", options.alpha, "Its opacity, as a greyscale .pfm; default none")
+        ->check(detail::ending({".pfm"}))
+        ->option_text("FILE")
+        ->group(files);
+    app.add_option("--depth", options.depth,
+                   "Its distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
+                   "nothing; default none")
+        ->check(detail::ending({".pfm"}))
+        ->option_text("FILE")
+        ->group(files);
+    app.add_option("--stats", options.stats, "Times in ms, bytes, messages and a hash of the image; default none")
+        ->check(detail::ending({".json"}))
+        ->option_text("FILE")
+        ->group(files);
+
+    for (CLI::Option* option : app.get_options())
+        option->description(detail::wrapped(option->get_description()));
+    app.footer("Examples:\n"
+               "  dfb_render demo --ranks 4 --output demo.png\n"
+               "  mpiexec -n 8 dfb_render synthetic --size 2048x2048 --frames 8 --stats stats.json\n"
+               "  mpiexec -n 4 dfb_render bunny.ply neghip_64x64x64_uint8.raw --spp 4 --output both.png");
+    try {
+        app.parse(argc, argv);
+        options.fit = !noFit;
+        if (!size.empty())
+            detail::parseSize(size, options);
+        if (background.size() == 3)
+            options.background = {{background[0], background[1], background[2]}};
+        for (const std::string& word : options.scene) {
+            const bool generated = word == "synthetic" || word == "demo";
+            if (generated && options.scene.size() > 1)
+                throw CLI::ValidationError("scene", "'" + word + "' stands alone, not beside other scenes");
+            if (const std::string wrong = detail::checkEnding(word, {".raw", ".ply", ".obj", ".xyz"});
+                !generated && !wrong.empty())
+                throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
+        }
+    } catch (const CLI::CallForHelp&) {
+        return {std::nullopt, 0, app.help()};
+    } catch (const CLI::ParseError& error) {
+        std::string message = error.what();
+        std::replace(message.begin(), message.end(), '\n', ' ');
+        return {std::nullopt, error.get_exit_code() != 0 ? error.get_exit_code() : 1,
+                "dfb_render: " + message + " (see --help)"};
+    }
+    return {options, 0, {}};
+}
+
+} // namespace example

@@ -1,0 +1,176 @@
+// Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <png.h>
+#define XXH_INLINE_ALL
+#include <xxhash.h>
+
+#include <cerrno>
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <filesystem>
+#include <fstream>
+#include <stdexcept>
+#include <string>
+#include <system_error>
+#include <vector>
+
+namespace example {
+
+namespace detail {
+
+[[noreturn]] inline void failToWrite(const std::string& path, const std::string& why)
+{
+    throw std::runtime_error(path + ": cannot be written: " + why);
+}
+
+// The rows of an image as a PFM: from the lowest to the highest, little-endian. `planes` floats of each pixel,
+// `stride` floats apart.
+inline void writeFloats(const std::string& path, int width, int height, const float* values, int stride, int planes)
+{
+    errno = 0;
+    std::ofstream stream(path, std::ios::binary | std::ios::trunc);
+    stream << (planes == 3 ? "PF\n" : "Pf\n") << width << ' ' << height << "\n-1.0\n";
+    std::vector<float> row(static_cast<std::size_t>(width) * static_cast<std::size_t>(planes));
+    for (int y = height - 1; y >= 0; --y) {
+        std::size_t at = 0;
+        for (int x = 0; x < width; ++x) {
+            const float* pixel = values
+                + (static_cast<std::ptrdiff_t>(y) * width + x) * static_cast<std::ptrdiff_t>(stride);
+            for (int c = 0; c < planes; ++c)
+                row[at++] = pixel[c];
+        }
+        stream.write(reinterpret_cast<const char*>(row.data()), static_cast<std::streamsize>(4 * row.size()));
+    }
+    stream.close();
+    if (!stream)
+        failToWrite(path, std::strerror(errno));
+}
+
+} // namespace detail
+
+// Throws if the file can not be opened for writing. What it holds stays; if there is none, none is left behind.
+inline void requireWritable(const std::string& path)
+{
+    std::error_code ignored;
+    const bool existed = std::filesystem::exists(path, ignored);
+    errno = 0;
+    if (!std::ofstream(path, std::ios::binary | std::ios::app))
+        detail::failToWrite(path, std::strerror(errno));
+    if (!existed && !ignored)
+        std::filesystem::remove(path, ignored);
+}
+
+// An 8-bit RGB PNG of RGBA pixels that are sRGB-encoded, row 0 on top. Alpha is left out: premultiplied colour is
+// the image over black.
+inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba)
+{
+    const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
+    std::vector<std::uint8_t> rgb(3 * pixels);
+    for (std::size_t i = 0; i < pixels; ++i)
+        std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
+    png_image image{};
+    image.version = PNG_IMAGE_VERSION;
+    image.width = static_cast<png_uint_32>(width);
+    image.height = static_cast<png_uint_32>(height);
+    image.format = PNG_FORMAT_RGB;
+    // Not png_image_write_to_file: when that fails it deletes what was at the path, be it a device.
+    errno = 0;
+    std::FILE* file = std::fopen(path.c_str(), "wb");
+    if (file == nullptr)
+        detail::failToWrite(path, std::strerror(errno));
+    const bool written = png_image_write_to_stdio(&image, file, 0, rgb.data(), 0, nullptr) != 0;
+    const bool closed = std::fclose(file) == 0;
+    if (!written || !closed)
+        detail::failToWrite(path, written ? std::strerror(errno) : image.message);
+}
+
+// Linear RGB as a colour PFM, from RGBA pixels, row 0 on top.
+inline void writePfm(const std::string& path, int width, int height, const float* rgba)
+{
+    detail::writeFloats(path, width, height, rgba, 4, 3);
+}
+
+// One value per pixel as a greyscale PFM; the values are `stride` floats apart (4 and rgba + 3: the alpha of RGBA).
+inline void writeGreyPfm(const std::string& path, int width, int height, const float* values, int stride)
+{
+    detail::writeFloats(path, width, height, values, stride, 1);
+}
+
+// XXH3 of the pixels as they are in memory, 16 hexadecimal digits.
+inline std::string hashPixels(const float* rgba, std::size_t pixelCount)
+{
+    char text[17];
+    std::snprintf(text, sizeof text, "%016llx",
+                  static_cast<unsigned long long>(XXH3_64bits(rgba, pixelCount * 4 * sizeof(float))));
+    return text;
+}
+
+inline double meanAlpha(const float* rgba, std::size_t pixelCount)
+{
+    double sum = 0;
+    for (std::size_t i = 0; i < pixelCount; ++i)
+        sum += static_cast<double>(rgba[4 * i + 3]);
+    return pixelCount > 0 ? sum / static_cast<double>(pixelCount) : 0;
+}
+
+struct FrameStats {
+    double totalMs = 0;               // from the start of rendering to the finished image
+    double renderMsMax = 0;           // of the slowest rank
+    double compositingOverheadMs = 0; // from the end of the slowest rendering to the finished image
+    std::uint64_t bytesSent = 0;      // by all ranks
+    std::uint64_t messagesSent = 0;
+    std::uint64_t tilesTotal = 0;
+    std::uint64_t tilesTouched = 0;
+    std::uint64_t peakMemoryBytes = 0; // of the rank with the most
+};
+
+struct RunStats {
+    int ranks = 1;
+    std::string transport, mode;
+    int width = 0, height = 0;
+    std::string imageHash; // of the last frame
+    double meanAlpha = 0;
+    std::vector<FrameStats> frames;
+};
+
+inline nlohmann::ordered_json toJson(const RunStats& run)
+{
+    nlohmann::ordered_json json;
+    json["ranks"] = run.ranks;
+    json["transport"] = run.transport;
+    json["mode"] = run.mode;
+    json["width"] = run.width;
+    json["height"] = run.height;
+    json["image_hash"] = run.imageHash;
+    json["mean_alpha"] = run.meanAlpha;
+    json["frames"] = nlohmann::ordered_json::array();
+    for (const FrameStats& frame : run.frames) {
+        nlohmann::ordered_json entry;
+        entry["total_ms"] = frame.totalMs;
+        entry["render_ms_max"] = frame.renderMsMax;
+        entry["compositing_overhead_ms"] = frame.compositingOverheadMs;
+        entry["bytes_sent"] = frame.bytesSent;
+        entry["messages_sent"] = frame.messagesSent;
+        entry["tiles_total"] = frame.tilesTotal;
+        entry["tiles_touched"] = frame.tilesTouched;
+        entry["peak_memory_bytes"] = frame.peakMemoryBytes;
+        json["frames"].push_back(entry);
+    }
+    return json;
+}
+
+inline void writeStats(const std::string& path, const RunStats& run)
+{
+    errno = 0;
+    std::ofstream stream(path, std::ios::trunc);
+    stream << toJson(run).dump(2) << '\n';
+    stream.close();
+    if (!stream)
+        detail::failToWrite(path, std::strerror(errno));
+}
+
+} // namespace example

@@ -1,0 +1,251 @@
+// PLY: the reader that makes a mesh from a PLY file.
+//
+// It is our own, because the one packaged library that reads PLY (Assimp 5.2) crashes on a binary file cut short, fills
+// up a short ASCII file with zeros, and takes trailing bytes and indices beyond the last vertex without a word.
+#pragma once
+
+#include "mesh.hpp"
+
+#include <charconv>
+#include <cstring>
+#include <sstream>
+#include <string_view>
+
+namespace example {
+
+namespace detail {
+
+enum class PlyType { Int8, UInt8, Int16, UInt16, Int32, UInt32, Float32, Float64 };
+
+struct PlyProperty {
+    std::string name;
+    PlyType type = PlyType::Float32;
+    bool isList = false;
+    PlyType countType = PlyType::UInt8;
+};
+
+struct PlyElement {
+    std::string name;
+    std::uint64_t count = 0;
+    std::vector<PlyProperty> properties;
+};
+
+// A cursor over the bytes of a PLY file: the header line by line, then numbers.
+class PlyReader {
+public:
+    PlyReader(std::string_view bytes, const std::string& name) : bytes_(bytes), name_(name) {}
+
+    Mesh read()
+    {
+        readHeader();
+        Mesh mesh;
+        for (const PlyElement& element : elements_) {
+            // A row takes at least a byte, so that a false count can not ask for more memory than the file has.
+            if (!element.properties.empty() && element.count > bytes_.size() - at_)
+                fail("it ends early: expected " + std::to_string(element.count) + " of element " + element.name
+                     + ", got " + std::to_string(bytes_.size() - at_) + " bytes");
+            const bool isVertex = element.name == "vertex", isFace = element.name == "face";
+            for (std::uint64_t row = 0; row < element.count && !element.properties.empty(); ++row)
+                readRow(element, row, mesh, isVertex, isFace);
+        }
+        if (format_ == Format::Ascii)
+            skipSpace();
+        if (at_ != bytes_.size())
+            fail("expected its end after " + std::to_string(at_) + " bytes, got " + std::to_string(bytes_.size())
+                 + " bytes");
+        if (mesh.triangles.empty())
+            fail("it has no faces");
+        return mesh;
+    }
+
+private:
+    enum class Format { Ascii, LittleEndian, BigEndian };
+
+    [[noreturn]] void fail(const std::string& why) const { throw std::runtime_error(name_ + ": " + why); }
+
+    std::vector<std::string> headerLine()
+    {
+        const std::size_t end = bytes_.find('\n', at_);
+        if (end == std::string_view::npos)
+            fail("the header ends without end_header");
+        std::istringstream line{std::string(bytes_.substr(at_, end - at_))};
+        at_ = end + 1;
+        std::vector<std::string> words;
+        for (std::string word; line >> word;)
+            words.push_back(word);
+        return words;
+    }
+
+    void readHeader()
+    {
+        if (bytes_.substr(0, 4) != "ply\n" && bytes_.substr(0, 5) != "ply\r\n")
+            fail("expected a PLY file, got no line 'ply' at its start");
+        headerLine();
+        bool hasFormat = false;
+        for (;;) {
+            const std::vector<std::string> words = headerLine();
+            if (words.empty() || words[0] == "comment" || words[0] == "obj_info")
+                continue;
+            if (words[0] == "end_header")
+                break;
+            if (words[0] == "format" && words.size() == 3 && !hasFormat && words[2] == "1.0") {
+                hasFormat = true;
+                if (words[1] == "ascii")
+                    format_ = Format::Ascii;
+                else if (words[1] == "binary_little_endian")
+                    format_ = Format::LittleEndian;
+                else if (words[1] == "binary_big_endian")
+                    format_ = Format::BigEndian;
+                else
+                    fail("unknown format '" + words[1] + "'");
+            } else if (words[0] == "element" && words.size() == 3) {
+                PlyElement element;
+                element.name = words[1];
+                const char* end = words[2].data() + words[2].size();
+                const auto result = std::from_chars(words[2].data(), end, element.count);
+                if (result.ec != std::errc() || result.ptr != end)
+                    fail("bad element count '" + words[2] + "'");
+                elements_.push_back(element);
+            } else if (words[0] == "property" && !elements_.empty() && (words.size() == 3
+                       || (words.size() == 5 && words[1] == "list"))) {
+                PlyProperty property;
+                property.name = words.back();
+                property.isList = words.size() == 5;
+                property.type = typeOf(words[words.size() - 2]);
+                if (property.isList)
+                    property.countType = typeOf(words[2]);
+                elements_.back().properties.push_back(property);
+            } else {
+                fail("unexpected header line that begins with '" + words[0] + "'");
+            }
+        }
+        if (!hasFormat)
+            fail("the header names no format");
+        checkElements();
+    }
+
+    void checkElements() const
+    {
+        bool seenVertex = false;
+        for (const PlyElement& element : elements_) {
+            int coordinates = 0, indexLists = 0;
+            for (const PlyProperty& p : element.properties) {
+                coordinates += !p.isList && (p.name == "x" || p.name == "y" || p.name == "z");
+                indexLists += p.isList && isIndexList(p);
+            }
+            if (element.name == "vertex" && (coordinates != 3 || seenVertex))
+                fail("expected one element vertex with x, y and z");
+            if (element.name == "face" && (indexLists != 1 || !seenVertex))
+                fail("expected an element face after the vertices with one list of vertex indices");
+            seenVertex = seenVertex || element.name == "vertex";
+        }
+        if (!seenVertex)
+            fail("it has no element vertex");
+    }
+
+    static bool isIndexList(const PlyProperty& p) { return p.name == "vertex_indices" || p.name == "vertex_index"; }
+
+    PlyType typeOf(const std::string& word) const
+    {
+        static const std::array<std::array<const char*, 2>, 8> names{{{"char", "int8"}, {"uchar", "uint8"},
+            {"short", "int16"}, {"ushort", "uint16"}, {"int", "int32"}, {"uint", "uint32"}, {"float", "float32"},
+            {"double", "float64"}}};
+        for (std::size_t i = 0; i < names.size(); ++i)
+            if (word == names[i][0] || word == names[i][1])
+                return static_cast<PlyType>(i);
+        fail("unknown type '" + word + "'");
+    }
+
+    void readRow(const PlyElement& element, std::uint64_t row, Mesh& mesh, bool isVertex, bool isFace)
+    {
+        Vec3 p;
+        for (const PlyProperty& property : element.properties) {
+            if (!property.isList) {
+                const double value = number(property.type, element, row);
+                if (isVertex && property.name.size() == 1 && property.name[0] >= 'x' && property.name[0] <= 'z')
+                    p[property.name[0] - 'x'] = static_cast<float>(value);
+                continue;
+            }
+            const double count = number(property.countType, element, row);
+            if (!(count >= 0 && count <= static_cast<double>(bytes_.size() - at_)))
+                fail("it ends early, or has a bad list, in " + element.name + ' ' + std::to_string(row));
+            polygon_.clear();
+            for (std::int64_t i = 0; i < static_cast<std::int64_t>(count); ++i) {
+                const double index = number(property.type, element, row);
+                polygon_.push_back(index >= 0 && index < 4294967296.0 ? static_cast<std::int64_t>(index) : -1);
+            }
+            if (isFace && isIndexList(property))
+                addPolygon(mesh, polygon_, name_ + ": face " + std::to_string(row));
+        }
+        if (isVertex)
+            addVertex(mesh, p, name_);
+    }
+
+    void skipSpace()
+    {
+        while (at_ < bytes_.size() && (bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r')))
+            ++at_;
+    }
+
+    double number(PlyType type, const PlyElement& element, std::uint64_t row)
+    {
+        const auto where = [&] { return " in " + element.name + ' ' + std::to_string(row) + " of "
+                                     + std::to_string(element.count); };
+        if (format_ == Format::Ascii) {
+            skipSpace();
+            double value = 0;
+            const auto result = std::from_chars(bytes_.data() + at_, bytes_.data() + bytes_.size(), value);
+            if (at_ == bytes_.size())
+                fail("it ends early," + where());
+            at_ = static_cast<std::size_t>(result.ptr - bytes_.data());
+            const bool ended = at_ == bytes_.size() || bytes_[at_] == ' '
+                || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
+            if (result.ec != std::errc() || !ended)
+                fail("expected a number," + where());
+            return value;
+        }
+        static const std::array<std::size_t, 8> sizes{1, 1, 2, 2, 4, 4, 4, 8};
+        const std::size_t size = sizes[static_cast<std::size_t>(type)];
+        if (bytes_.size() - at_ < size)
+            fail("it ends early," + where());
+        std::uint64_t bits = 0;
+        for (std::size_t i = 0; i < size; ++i) {
+            const std::size_t shift = format_ == Format::LittleEndian ? i : size - 1 - i;
+            bits |= static_cast<std::uint64_t>(static_cast<unsigned char>(bytes_[at_ + i])) << (8 * shift);
+        }
+        at_ += size;
+        switch (type) {
+        case PlyType::Int8: return static_cast<std::int8_t>(bits);
+        case PlyType::Int16: return static_cast<std::int16_t>(bits);
+        case PlyType::Int32: return static_cast<std::int32_t>(bits);
+        case PlyType::Float32: {
+            const std::uint32_t low = static_cast<std::uint32_t>(bits);
+            float value;
+            std::memcpy(&value, &low, sizeof value);
+            return static_cast<double>(value);
+        }
+        case PlyType::Float64: {
+            double value;
+            std::memcpy(&value, &bits, sizeof value);
+            return value;
+        }
+        default: return static_cast<double>(bits);
+        }
+    }
+
+    std::string_view bytes_;
+    std::string name_;
+    std::size_t at_ = 0;
+    Format format_ = Format::Ascii;
+    std::vector<PlyElement> elements_;
+    std::vector<std::int64_t> polygon_;
+};
+
+} // namespace detail
+
+// ASCII or binary of either byte order; properties and elements that are not positions and faces are skipped,
+// polygons become fans. Throws std::runtime_error
+// with `name`, what was expected and what was found.
+inline Mesh parsePly(std::string_view bytes, const std::string& name) { return detail::PlyReader(bytes, name).read(); }
+
+} // namespace example

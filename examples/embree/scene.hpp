@@ -1,0 +1,362 @@
+// Scene: what there is to render, and the bricks that it is cut into.
+//
+// World space: each file is scaled and centred to fill the unit cube, unless told not to. A brick is a half-open
+// cell of the scene's bounds with all that can be seen in it: the voxels (with ghosts), and each primitive that
+// touches it, under its index in the whole scene. Cells are a pure function of the bounds and their number, so every
+// rank knows all of them, and two cells that share a face have the same number for it.
+#pragma once
+
+#include "obj.hpp"
+#include "ply.hpp"
+#include "spheres.hpp"
+#include "volume.hpp"
+
+#include <cstdint>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+// From the coordinates of a file to the world.
+struct Placement {
+    Vec3 scale{1, 1, 1}; // the same along all axes but for the sign
+    Vec3 offset;
+
+    float size() const { return std::fabs(scale.x); }
+    Vec3 toWorld(const Vec3& p) const
+    {
+        return {p.x * scale.x + offset.x, p.y * scale.y + offset.y, p.z * scale.z + offset.z};
+    }
+};
+
+// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false or the box has no extent.
+inline Placement fitToUnitCube(const Box& box, bool fit)
+{
+    Placement placement;
+    const float extent = box.largestExtent();
+    if (fit && extent > 0) {
+        const float scale = 1 / extent;
+        placement.scale = {scale, scale, scale};
+        placement.offset = Vec3(0.5f, 0.5f, 0.5f) - box.center() * scale;
+    }
+    return placement;
+}
+
+// Scanners store the rows of an image from the top, so a volume stands with y down and, to stay no mirror image of
+// itself, with z backwards.
+struct VolumeObject {
+    VolumeSource source;
+    Placement placement;
+
+    VolumeObject(VolumeSource volume, bool fit) : source(std::move(volume))
+    {
+        placement = fitToUnitCube(bounds(), fit);
+        const Vec3 sum = bounds().lo + bounds().hi;
+        placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
+        placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
+    }
+
+    // The domain, between the centres of the outer voxels.
+    Box bounds() const
+    {
+        const Index3& d = source.info.dims;
+        Box box;
+        box.grow(placement.toWorld({0, 0, 0}));
+        box.grow(placement.toWorld({static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1),
+                                    static_cast<float>(d[2] - 1)}));
+        return box;
+    }
+};
+
+struct MeshObject {
+    std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
+    Mesh mesh;                  // in world space
+    std::vector<Vec3> normals;
+    Vec3 color;
+};
+
+struct SphereObject {
+    std::uint32_t geometry = 0;
+    std::vector<Sphere> spheres; // in world space
+};
+
+struct Scene {
+    std::vector<VolumeObject> volumes;
+    std::vector<MeshObject> meshes;
+    std::vector<SphereObject> spheres;
+    Box bounds;
+    Box focus;            // of what there is to see, for the camera
+    Index3 grid{0, 0, 0}; // of the cells, x fastest; zero: by bisection
+
+    void add(VolumeSource source, bool fit)
+    {
+        VolumeObject object(std::move(source), fit);
+        grow(object.bounds());
+        const Box visible = visibleBounds(object.source);
+        focus.grow(object.placement.toWorld(visible.lo));
+        focus.grow(object.placement.toWorld(visible.hi));
+        volumes.push_back(std::move(object));
+    }
+    void add(Mesh mesh, bool fit)
+    {
+        Box box;
+        for (const Triangle& triangle : mesh.triangles) // a file may hold vertices that nothing uses
+            for (const std::uint32_t index : triangle)
+                box.grow(mesh.positions[index]);
+        const Placement placement = fitToUnitCube(box, fit);
+        for (Vec3& p : mesh.positions)
+            p = placement.toWorld(p);
+        static const Vec3 palette[] = {{0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f},
+                                       {0.62f, 0.20f, 0.18f}};
+        MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
+        object.normals = vertexNormals(object.mesh);
+        box = Box();
+        for (const Triangle& triangle : object.mesh.triangles)
+            for (const std::uint32_t index : triangle)
+                box.grow(object.mesh.positions[index]);
+        focus.grow(box);
+        grow(box);
+        meshes.push_back(std::move(object));
+    }
+    void add(std::vector<Sphere> set, bool fit)
+    {
+        Box box;
+        for (const Sphere& sphere : set)
+            box.grow(sphere.center, sphere.radius);
+        const Placement placement = fitToUnitCube(box, fit);
+        for (Sphere& sphere : set) {
+            sphere.center = placement.toWorld(sphere.center);
+            sphere.radius *= placement.size();
+        }
+        box = Box();
+        for (const Sphere& sphere : set)
+            box.grow(sphere.center, sphere.radius);
+        focus.grow(box);
+        grow(box);
+        spheres.push_back({nextGeometry_++, std::move(set)});
+    }
+
+private:
+    // The bounds are a little larger than what they hold, so that nothing lies on the outer faces, of which the
+    // upper ones belong to no cell.
+    void grow(const Box& box)
+    {
+        tight_.grow(box);
+        const float far = std::max({std::fabs(tight_.lo.x), std::fabs(tight_.lo.y), std::fabs(tight_.lo.z),
+                                    std::fabs(tight_.hi.x), std::fabs(tight_.hi.y), std::fabs(tight_.hi.z)});
+        bounds = tight_.padded(1e-5f * std::max({tight_.largestExtent(), far, 1e-6f}));
+    }
+
+    Box tight_;
+    std::uint32_t nextGeometry_ = 0;
+};
+
+// Reads a file by its ending. Throws std::runtime_error that names the file.
+inline void addFile(Scene& scene, const std::string& path, bool fit)
+{
+    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    if (ending == ".raw")
+        scene.add(openVolume(path), fit);
+    else if (ending == ".ply")
+        scene.add(parsePly(readFile(path), path), fit);
+    else if (ending == ".obj")
+        scene.add(parseObj(readFile(path), path), fit);
+    else if (ending == ".xyz")
+        scene.add(parseXyz(readFile(path), path), fit);
+    else
+        throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
+}
+
+// ---- cutting ---------------------------------------------------------------------------------------------------
+
+namespace detail {
+
+inline void bisect(const Box& box, int count, std::vector<Box>& cells)
+{
+    if (count == 1) {
+        cells.push_back(box);
+        return;
+    }
+    const Vec3 extent = box.extent();
+    const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
+    const int lower = count / 2;
+    const float plane = static_cast<float>(
+        static_cast<double>(box.lo[axis])
+        + static_cast<double>(extent[axis]) * static_cast<double>(lower) / static_cast<double>(count));
+    Box a = box, b = box;
+    a.hi[axis] = plane;
+    b.lo[axis] = plane;
+    bisect(a, lower, cells);
+    bisect(b, count - lower, cells);
+}
+
+} // namespace detail
+
+// `count` as a product of three near-equal factors, the largest first.
+inline Index3 nearCubicGrid(int count)
+{
+    Index3 best{count, 1, 1};
+    for (int z = 1; z * z <= count / z; ++z)
+        for (int y = z; y <= count / z / y; ++y)
+            if (count % (z * y) == 0 && count / (z * y) + y + z < best[0] + best[1] + best[2])
+                best = {count / (z * y), y, z};
+    return best;
+}
+
+// The cells of `count` bricks, by brick id: the scene's own grid, or bisection of the longest axis over and over
+// (in proportion where the number is odd).
+inline std::vector<Box> cutScene(const Scene& scene, int count)
+{
+    std::vector<Box> cells;
+    const Index3& grid = scene.grid;
+    if (count < 1)
+        throw std::invalid_argument("a scene is cut into 1 brick or more, not " + std::to_string(count));
+    if (grid[0] == 0 || grid[0] * grid[1] * grid[2] != count) {
+        detail::bisect(scene.bounds, count, cells);
+        return cells;
+    }
+    auto plane = [&](int axis, int i) {
+        const int n = grid[static_cast<std::size_t>(axis)];
+        const float lo = scene.bounds.lo[axis], hi = scene.bounds.hi[axis];
+        return i == n ? hi : lo + (hi - lo) * (static_cast<float>(i) / static_cast<float>(n));
+    };
+    for (int z = 0; z < grid[2]; ++z)
+        for (int y = 0; y < grid[1]; ++y)
+            for (int x = 0; x < grid[0]; ++x) {
+                Box cell;
+                cell.lo = {plane(0, x), plane(1, y), plane(2, z)};
+                cell.hi = {plane(0, x + 1), plane(1, y + 1), plane(2, z + 1)};
+                cells.push_back(cell);
+            }
+    return cells;
+}
+
+// Bricks are dealt out in runs of neighbours; with fewer bricks than ranks some ranks get none.
+inline int rankOfBrick(int brick, int brickCount, int rankCount)
+{
+    return static_cast<int>(static_cast<std::int64_t>(brick) * rankCount / brickCount);
+}
+
+// ---- bricks ----------------------------------------------------------------------------------------------------
+
+struct BrickVolume {
+    VoxelBlock block;
+    Placement placement;
+};
+
+struct BrickMesh {
+    std::uint32_t geometry = 0;
+    Mesh mesh;
+    std::vector<Vec3> normals;
+    std::vector<std::uint32_t> primitives; // index of each triangle in the whole mesh
+    Vec3 color;
+};
+
+struct BrickSpheres {
+    std::uint32_t geometry = 0;
+    std::vector<Sphere> spheres;
+    std::vector<std::uint32_t> primitives;
+};
+
+struct Brick {
+    std::uint32_t id = 0;
+    Box cell; // half-open
+    std::vector<BrickVolume> volumes;
+    std::vector<BrickMesh> meshes;
+    std::vector<BrickSpheres> spheres;
+};
+
+namespace detail {
+
+inline void addVolume(Brick& brick, const VolumeObject& object)
+{
+    const Box part = intersection(brick.cell, object.bounds().padded(1e-5f * object.bounds().largestExtent()));
+    if (part.empty())
+        return;
+    Index3 lo, hi;
+    for (int i = 0; i < 3; ++i) {
+        const float offset = object.placement.offset[i], scale = object.placement.scale[i];
+        const std::size_t axis = static_cast<std::size_t>(i);
+        const float first = scale > 0 ? part.lo[i] : part.hi[i], behind = scale > 0 ? part.hi[i] : part.lo[i];
+        const int last = object.source.info.dims[axis] - 1;
+        // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
+        const auto voxel = [&](float world, float slack) {
+            return static_cast<int>(std::floor(std::clamp((world - offset) / scale + slack, -1.0f,
+                                                          static_cast<float>(last) + 1.0f)));
+        };
+        lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
+        hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
+    }
+    brick.volumes.push_back({VoxelBlock(object.source, lo, hi), object.placement});
+}
+
+inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
+{
+    BrickMesh part;
+    const std::uint32_t none = ~std::uint32_t{0};
+    std::vector<std::uint32_t> newIndex(object.mesh.positions.size(), none);
+    for (std::size_t i = 0; i < object.mesh.triangles.size(); ++i) {
+        const Triangle& triangle = object.mesh.triangles[i];
+        Box box;
+        for (const std::uint32_t index : triangle)
+            box.grow(object.mesh.positions[index]);
+        if (!box.overlaps(reach))
+            continue;
+        Triangle renamed;
+        for (std::size_t k = 0; k < 3; ++k) {
+            std::uint32_t& index = newIndex[triangle[k]];
+            if (index == none) {
+                index = static_cast<std::uint32_t>(part.mesh.positions.size());
+                part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
+                part.normals.push_back(object.normals[triangle[k]]);
+            }
+            renamed[k] = index;
+        }
+        part.mesh.triangles.push_back(renamed);
+        part.primitives.push_back(static_cast<std::uint32_t>(i));
+    }
+    part.geometry = object.geometry;
+    part.color = object.color;
+    if (!part.primitives.empty())
+        brick.meshes.push_back(std::move(part));
+}
+
+inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reach)
+{
+    BrickSpheres part;
+    part.geometry = object.geometry;
+    for (std::size_t i = 0; i < object.spheres.size(); ++i) {
+        Box box;
+        box.grow(object.spheres[i].center, object.spheres[i].radius);
+        if (box.overlaps(reach)) {
+            part.spheres.push_back(object.spheres[i]);
+            part.primitives.push_back(static_cast<std::uint32_t>(i));
+        }
+    }
+    if (!part.primitives.empty())
+        brick.spheres.push_back(std::move(part));
+}
+
+} // namespace detail
+
+// What a rank keeps of the scene for one cell. Volumes are read from their source here, and only as far as needed;
+// the scene itself can go when all bricks are loaded.
+inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell)
+{
+    Brick brick;
+    brick.id = id;
+    brick.cell = cell;
+    // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
+    const Box reach = cell.padded(1e-5f * std::max(scene.bounds.largestExtent(),
+                                                   std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
+    for (const VolumeObject& object : scene.volumes)
+        detail::addVolume(brick, object);
+    for (const MeshObject& object : scene.meshes)
+        detail::addMesh(brick, object, reach);
+    for (const SphereObject& object : scene.spheres)
+        detail::addSpheres(brick, object, reach);
+    return brick;
+}
+
+} // namespace example

@@ -1,0 +1,234 @@
+// Surfaces: the meshes and spheres of a brick in an Embree scene, and all points where a ray meets them.
+//
+// Embree says which primitives a ray meets. Where on the ray that is we compute from the primitive alone, in double,
+// so that it does not depend on what else is in the brick.
+#pragma once
+
+#include "scene.hpp"
+#include "shading.hpp"
+
+#if __has_include(<embree4/rtcore.h>)
+#include <embree4/rtcore.h>
+#else
+#include <embree3/rtcore.h>
+#endif
+
+#include <memory>
+#include <stdexcept>
+#include <type_traits>
+
+namespace example {
+
+struct Hit {
+    float t = 0;
+    std::uint32_t geometry = 0, primitive = 0; // in the whole scene
+    Vec3 normal;                               // unit; which side it points to is open
+    Vec3 color;
+};
+
+class Surfaces {
+public:
+    Surfaces(const Box& cell, std::vector<BrickMesh> meshes, std::vector<BrickSpheres> spheres)
+        : cell_(cell), meshes_(std::move(meshes)), spheres_(std::move(spheres))
+    {
+        if (meshes_.empty() && spheres_.empty())
+            return;
+        device_.reset(rtcNewDevice(nullptr));
+        if (!device_)
+            throw std::runtime_error("Embree can not create a device, error "
+                                     + std::to_string(rtcGetDeviceError(nullptr)));
+        scene_.reset(rtcNewScene(device_.get()));
+        // Robust: a ray through a shared edge does not slip between the triangles.
+        rtcSetSceneFlags(scene_.get(), RTC_SCENE_FLAG_ROBUST);
+        for (BrickMesh& part : meshes_)
+            attach(part);
+        for (BrickSpheres& part : spheres_)
+            attach(part);
+        rtcCommitScene(scene_.get());
+        const RTCError error = rtcGetDeviceError(device_.get());
+        if (error != RTC_ERROR_NONE)
+            throw std::runtime_error("Embree can not build its scene, error " + std::to_string(error));
+    }
+
+    bool empty() const { return scene_ == nullptr; }
+
+    // All hits of the ray whose point is in the brick's cell, front to back. From any thread.
+    void intersect(const Vec3& origin, const Vec3& direction, std::vector<Hit>& hits) const
+    {
+        hits.clear();
+        if (empty())
+            return;
+        Query query;
+        query.origin = origin;
+        query.direction = direction;
+        query.cell = &cell_;
+        query.hits = &hits;
+        RTCRayHit ray{};
+        ray.ray.org_x = origin.x;
+        ray.ray.org_y = origin.y;
+        ray.ray.org_z = origin.z;
+        ray.ray.dir_x = direction.x;
+        ray.ray.dir_y = direction.y;
+        ray.ray.dir_z = direction.z;
+        ray.ray.tfar = std::numeric_limits<float>::infinity();
+        ray.ray.mask = ~0u;
+        ray.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+#if RTC_VERSION_MAJOR >= 4
+        rtcInitRayQueryContext(&query.context);
+        RTCIntersectArguments arguments;
+        rtcInitIntersectArguments(&arguments);
+        arguments.context = &query.context;
+        rtcIntersect1(scene_.get(), &ray, &arguments);
+#else
+        rtcInitIntersectContext(&query.context);
+        rtcIntersect1(scene_.get(), &query.context, &ray);
+#endif
+        std::sort(hits.begin(), hits.end(), [](const Hit& a, const Hit& b) {
+            return a.t != b.t ? a.t < b.t
+                : a.geometry != b.geometry ? a.geometry < b.geometry : a.primitive < b.primitive;
+        });
+        // A point on an edge belongs to two triangles but is seen once.
+        hits.erase(std::unique(hits.begin(), hits.end(),
+                               [](const Hit& a, const Hit& b) { return a.t == b.t && a.geometry == b.geometry; }),
+                   hits.end());
+    }
+
+private:
+#if RTC_VERSION_MAJOR >= 4
+    using Context = RTCRayQueryContext;
+#else
+    using Context = RTCIntersectContext;
+#endif
+    // What Embree hands to the callbacks; `context` is first, so that a pointer to it is one to all of this.
+    struct Query {
+        Context context;
+        Vec3 origin, direction;
+        const Box* cell = nullptr;
+        std::vector<Hit>* hits = nullptr;
+
+        void keep(double distance, const Hit& hit) const
+        {
+            Hit kept = hit;
+            kept.t = static_cast<float>(distance);
+            if (kept.t > 0 && cell->contains(pointAt(origin, direction, kept.t)))
+                hits->push_back(kept);
+        }
+    };
+
+    struct Release {
+        void operator()(RTCDevice device) const { rtcReleaseDevice(device); }
+        void operator()(RTCScene scene) const { rtcReleaseScene(scene); }
+    };
+    using Device = std::unique_ptr<std::remove_pointer_t<RTCDevice>, Release>;
+    using EmbreeScene = std::unique_ptr<std::remove_pointer_t<RTCScene>, Release>;
+
+    void attach(BrickMesh& part)
+    {
+        RTCGeometry geometry = rtcNewGeometry(device_.get(), RTC_GEOMETRY_TYPE_TRIANGLE);
+        auto& positions = part.mesh.positions;
+        const std::size_t count = positions.size();
+        positions.emplace_back(); // Embree loads 16 bytes per vertex, so there must be some behind the last one
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, positions.data(), 0,
+                                   sizeof(Vec3), count);
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, part.mesh.triangles.data(),
+                                   0, sizeof(Triangle), part.mesh.triangles.size());
+        rtcSetGeometryIntersectFilterFunction(geometry, onTriangle);
+        finish(geometry, &part);
+    }
+
+    void attach(BrickSpheres& part)
+    {
+        RTCGeometry geometry = rtcNewGeometry(device_.get(), RTC_GEOMETRY_TYPE_USER);
+        rtcSetGeometryUserPrimitiveCount(geometry, static_cast<unsigned>(part.spheres.size()));
+        rtcSetGeometryBoundsFunction(geometry, sphereBounds, nullptr);
+        rtcSetGeometryIntersectFunction(geometry, onSphere);
+        finish(geometry, &part);
+    }
+
+    void finish(RTCGeometry geometry, void* userData)
+    {
+        rtcSetGeometryUserData(geometry, userData);
+        rtcCommitGeometry(geometry);
+        rtcAttachGeometry(scene_.get(), geometry);
+        rtcReleaseGeometry(geometry);
+    }
+
+    // Notes the hit and rejects it, so that Embree goes on to the next one.
+    static void onTriangle(const RTCFilterFunctionNArguments* arguments)
+    {
+        if (arguments->valid[0] == 0)
+            return;
+        arguments->valid[0] = 0;
+        const Query& query = *reinterpret_cast<const Query*>(arguments->context);
+        const BrickMesh& part = *static_cast<const BrickMesh*>(arguments->geometryUserPtr);
+        const std::uint32_t index = RTCHitN_primID(arguments->hit, arguments->N, 0);
+        const Triangle& triangle = part.mesh.triangles[index];
+
+        const Vec3d a(part.mesh.positions[triangle[0]]);
+        const Vec3d ab = Vec3d(part.mesh.positions[triangle[1]]) - a, ac = Vec3d(part.mesh.positions[triangle[2]]) - a;
+        const Vec3d o(query.origin), d(query.direction);
+        const Vec3d p = cross(d, ac), q = cross(o - a, ab);
+        const double determinant = dot(ab, p);
+        double u = determinant != 0 ? dot(o - a, p) / determinant : 0;
+        double v = determinant != 0 ? dot(d, q) / determinant : 0;
+        // Seen edge-on the plane says little about where: the point stays in the triangle and so in its box.
+        u = std::clamp(u, 0.0, 1.0);
+        v = std::clamp(v, 0.0, 1.0 - u);
+        const Vec3d normal = Vec3d(part.normals[triangle[0]]) * (1 - u - v) + Vec3d(part.normals[triangle[1]]) * u
+            + Vec3d(part.normals[triangle[2]]) * v;
+        Hit hit;
+        hit.geometry = part.geometry;
+        hit.primitive = part.primitives[index];
+        hit.normal = Vec3(normalize(normal));
+        hit.color = part.color;
+        query.keep(dot(a + ab * u + ac * v - o, d) / dot(d, d), hit);
+    }
+
+    static void sphereBounds(const RTCBoundsFunctionArguments* arguments)
+    {
+        const auto& part = *static_cast<const BrickSpheres*>(arguments->geometryUserPtr);
+        const Sphere& sphere = part.spheres[arguments->primID];
+        // A little larger than the sphere, so that rounding in the box test never costs a hit.
+        const float radius = sphere.radius + 1e-6f * (sphere.radius + length(sphere.center));
+        RTCBounds& bounds = *arguments->bounds_o;
+        bounds.lower_x = sphere.center.x - radius;
+        bounds.lower_y = sphere.center.y - radius;
+        bounds.lower_z = sphere.center.z - radius;
+        bounds.upper_x = sphere.center.x + radius;
+        bounds.upper_y = sphere.center.y + radius;
+        bounds.upper_z = sphere.center.z + radius;
+    }
+
+    // Only where the ray enters; tells Embree nothing, so that it goes on.
+    static void onSphere(const RTCIntersectFunctionNArguments* arguments)
+    {
+        if (arguments->valid[0] == 0)
+            return;
+        const Query& query = *reinterpret_cast<const Query*>(arguments->context);
+        const auto& part = *static_cast<const BrickSpheres*>(arguments->geometryUserPtr);
+        const Sphere& sphere = part.spheres[arguments->primID];
+
+        const Vec3d toCenter = Vec3d(sphere.center) - Vec3d(query.origin), d(query.direction);
+        const double radius = static_cast<double>(sphere.radius), dd = dot(d, d), along = dot(toCenter, d) / dd;
+        const Vec3d off = toCenter - d * along; // from the point of closest approach to the centre
+        const double rest = radius * radius - dot(off, off);
+        if (!(rest > 0))
+            return;
+        const double t = along - std::sqrt(rest / dd);
+        Hit hit;
+        hit.geometry = part.geometry;
+        hit.primitive = part.primitives[arguments->primID];
+        hit.normal = Vec3(normalize(d * t - toCenter));
+        hit.color = sphere.color;
+        query.keep(t, hit);
+    }
+
+    Box cell_;
+    // Embree points into these two, and so they outlive its scene. Moving the vectors moves no element.
+    std::vector<BrickMesh> meshes_;
+    std::vector<BrickSpheres> spheres_;
+    Device device_;
+    EmbreeScene scene_;
+};
+
+} // namespace example

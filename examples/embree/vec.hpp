@@ -1,0 +1,157 @@
+// Vec3: vectors, boxes, and the few pure functions on them that every rank must compute to the same bit.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <limits>
+
+namespace example {
+
+template <class T>
+struct Vec3T {
+    T x = 0, y = 0, z = 0;
+
+    Vec3T() = default;
+    Vec3T(T xValue, T yValue, T zValue) : x(xValue), y(yValue), z(zValue) {}
+    template <class U>
+    explicit Vec3T(const Vec3T<U>& v) : x(static_cast<T>(v.x)), y(static_cast<T>(v.y)), z(static_cast<T>(v.z))
+    {
+    }
+
+    T& operator[](int axis) { return axis == 0 ? x : axis == 1 ? y : z; }
+    T operator[](int axis) const { return axis == 0 ? x : axis == 1 ? y : z; }
+};
+
+using Vec3 = Vec3T<float>;
+using Vec3d = Vec3T<double>;
+
+template <class T>
+Vec3T<T> operator+(const Vec3T<T>& a, const Vec3T<T>& b)
+{
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+template <class T>
+Vec3T<T> operator-(const Vec3T<T>& a, const Vec3T<T>& b)
+{
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+template <class T>
+Vec3T<T> operator*(const Vec3T<T>& a, T s)
+{
+    return {a.x * s, a.y * s, a.z * s};
+}
+template <class T>
+T dot(const Vec3T<T>& a, const Vec3T<T>& b)
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class T>
+Vec3T<T> cross(const Vec3T<T>& a, const Vec3T<T>& b)
+{
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+template <class T>
+T length(const Vec3T<T>& a)
+{
+    return std::sqrt(dot(a, a));
+}
+// The zero vector stays the zero vector.
+template <class T>
+Vec3T<T> normalize(const Vec3T<T>& a)
+{
+    const T l = length(a);
+    return l > 0 ? a * (1 / l) : a;
+}
+// Finite, and small enough for squares and sums of such.
+inline bool isUsable(const Vec3& a)
+{
+    return std::fabs(a.x) < 1e15f && std::fabs(a.y) < 1e15f && std::fabs(a.z) < 1e15f;
+}
+
+// a * b + c, rounded the same way wherever it is inlined: once where the target has the instruction (the compiler
+// might otherwise contract in one place and not in another), twice where it has not and so can not contract.
+inline float mulAdd(float a, float b, float c)
+{
+#if defined(__FMA__) || defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA)
+    return std::fma(a, b, c);
+#else
+    return a * b + c;
+#endif
+}
+
+// The point of a ray at distance t. Monotone in t along each axis, so that a ray is inside a cell for one unbroken
+// range of t: bricks that own points by this function never interleave along a ray.
+inline Vec3 pointAt(const Vec3& origin, const Vec3& direction, float t)
+{
+    return {mulAdd(t, direction.x, origin.x), mulAdd(t, direction.y, origin.y), mulAdd(t, direction.z, origin.z)};
+}
+
+struct Box {
+    Vec3 lo{std::numeric_limits<float>::infinity(), std::numeric_limits<float>::infinity(),
+            std::numeric_limits<float>::infinity()};
+    Vec3 hi{-std::numeric_limits<float>::infinity(), -std::numeric_limits<float>::infinity(),
+            -std::numeric_limits<float>::infinity()};
+
+    bool empty() const { return !(lo.x <= hi.x && lo.y <= hi.y && lo.z <= hi.z); }
+    Vec3 extent() const { return hi - lo; }
+    Vec3 center() const { return (lo + hi) * 0.5f; }
+    float largestExtent() const { return std::max({hi.x - lo.x, hi.y - lo.y, hi.z - lo.z}); }
+    void grow(const Vec3& p, float radius = 0)
+    {
+        for (int i = 0; i < 3; ++i) {
+            lo[i] = std::min(lo[i], p[i] - radius);
+            hi[i] = std::max(hi[i], p[i] + radius);
+        }
+    }
+    void grow(const Box& b)
+    {
+        if (!b.empty()) {
+            grow(b.lo);
+            grow(b.hi);
+        }
+    }
+    // Half-open: of two cells that share a face, exactly one contains a point of it.
+    bool contains(const Vec3& p) const
+    {
+        return p.x >= lo.x && p.x < hi.x && p.y >= lo.y && p.y < hi.y && p.z >= lo.z && p.z < hi.z;
+    }
+    bool overlaps(const Box& b) const
+    {
+        return lo.x <= b.hi.x && b.lo.x <= hi.x && lo.y <= b.hi.y && b.lo.y <= hi.y && lo.z <= b.hi.z
+            && b.lo.z <= hi.z;
+    }
+    Box padded(float amount) const
+    {
+        const Vec3 pad(amount, amount, amount);
+        Box box;
+        box.lo = lo - pad;
+        box.hi = hi + pad;
+        return box;
+    }
+};
+
+inline Box intersection(const Box& a, const Box& b)
+{
+    Box box;
+    for (int i = 0; i < 3; ++i) {
+        box.lo[i] = std::max(a.lo[i], b.lo[i]);
+        box.hi[i] = std::min(a.hi[i], b.hi[i]);
+    }
+    return box;
+}
+
+// splitmix64: a hash of 64 bits to 64 bits.
+inline std::uint64_t hash64(std::uint64_t x)
+{
+    x += 0x9e3779b97f4a7c15u;
+    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
+    x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
+    return x ^ (x >> 31);
+}
+inline std::uint64_t hash64(std::uint64_t a, std::uint64_t b) { return hash64(hash64(a) ^ b); }
+
+// Uniform in [0, 1).
+inline double unitReal(std::uint64_t hash) { return static_cast<double>(hash >> 11) * 0x1.0p-53; }
+
+} // namespace example

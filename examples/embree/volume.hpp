@@ -1,0 +1,279 @@
+// Volume: regular grids of scalars, and the part of one that a brick holds.
+//
+// Files are headerless, name_XxYxZ_type.raw (the Open SciVis convention): x fastest, little-endian, type one of
+// uint8, uint16, float32. Only the rows that are asked for are read.
+//
+// Values are normalised to [0, 1] over a range that is a function of the whole file, and so the same on all ranks:
+// 0..255 for uint8, the least and greatest value for uint16 and float32. A float32 file with values on both sides
+// of zero is taken for a density map: its range begins at zero, all below is background. Non-finite voxels count as
+// the least value and have no part in the range.
+#pragma once
+
+#include "vec.hpp"
+
+#include <array>
+#include <cstddef>
+#include <cstring>
+#include <fstream>
+#include <functional>
+#include <istream>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the volume reader copies little-endian voxels as they are: little-endian machines only"
+#endif
+
+namespace example {
+
+using Index3 = std::array<int, 3>;
+
+enum class VoxelType { UInt8, UInt16, Float32 };
+
+inline std::size_t voxelBytes(VoxelType type)
+{
+    return type == VoxelType::UInt8 ? 1 : type == VoxelType::UInt16 ? 2 : 4;
+}
+
+struct VolumeInfo {
+    Index3 dims{};
+    VoxelType type = VoxelType::UInt8;
+    float minimum = 0, maximum = 255; // mapped to 0 and 1
+};
+
+// Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
+using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* out)>;
+
+struct VolumeSource {
+    VolumeInfo info;
+    std::function<RowReader()> open; // each call gives a reader of its own
+};
+
+// ---- files -----------------------------------------------------------------------------------------------------
+
+// Dimensions and type as the file's name says. Throws std::runtime_error if it does not.
+inline VolumeInfo parseVolumeName(const std::string& path)
+{
+    auto fail = [&path](const std::string& why) -> VolumeInfo {
+        throw std::runtime_error(path + ": " + why
+                                 + "; expected a name like name_64x64x64_uint8.raw, with uint8, uint16 or float32");
+    };
+    std::string name = path.substr(path.find_last_of('/') + 1);
+    const std::string ending = ".raw";
+    if (name.size() <= ending.size() || name.compare(name.size() - ending.size(), ending.size(), ending) != 0)
+        return fail("not a .raw file");
+    name.resize(name.size() - ending.size());
+
+    const std::size_t typeAt = name.rfind('_');
+    const std::size_t dimsAt = typeAt == std::string::npos || typeAt == 0 ? typeAt : name.rfind('_', typeAt - 1);
+    if (typeAt == std::string::npos || typeAt == 0 || dimsAt == std::string::npos)
+        return fail("no dimensions and type in the name");
+    const std::string type = name.substr(typeAt + 1);
+    VolumeInfo info;
+    if (type == "uint8")
+        info.type = VoxelType::UInt8;
+    else if (type == "uint16")
+        info.type = VoxelType::UInt16;
+    else if (type == "float32")
+        info.type = VoxelType::Float32;
+    else
+        return fail("unknown voxel type '" + type + "'");
+
+    const std::string dims = name.substr(dimsAt + 1, typeAt - dimsAt - 1);
+    std::size_t at = 0;
+    for (int axis = 0; axis < 3; ++axis) {
+        int value = 0;
+        const std::size_t begin = at;
+        for (; at < dims.size() && dims[at] >= '0' && dims[at] <= '9' && value <= 65536; ++at)
+            value = 10 * value + (dims[at] - '0');
+        if (at == begin || value < 2 || value > 65536 || (axis < 2 && (at >= dims.size() || dims[at++] != 'x')))
+            return fail("bad dimensions '" + dims + "' (three numbers from 2 to 65536)");
+        info.dims[static_cast<std::size_t>(axis)] = value;
+    }
+    return at == dims.size() ? info : fail("bad dimensions '" + dims + "'");
+}
+
+namespace detail {
+
+// Widens [lo, hi] to the finite values of `count` voxels.
+template <class T>
+void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
+{
+    for (std::size_t i = 0; i < count; ++i) {
+        T value;
+        std::memcpy(&value, bytes + i * sizeof(T), sizeof(T));
+        const float f = static_cast<float>(value);
+        if (std::isfinite(f)) {
+            lo = std::min(lo, f);
+            hi = std::max(hi, f);
+        }
+    }
+}
+
+} // namespace detail
+
+// Dimensions and type from the name, the range from one pass over the stream where it is needed; checks that the
+// stream is as long as the name says. Throws std::runtime_error that names the file, the expected and the found.
+inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
+{
+    VolumeInfo info = parseVolumeName(path);
+    const std::uint64_t expected = static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
+        * static_cast<std::uint64_t>(info.dims[2]) * voxelBytes(info.type);
+    stream.seekg(0, std::ios::end);
+    const std::streamoff got = stream.tellg();
+    if (!stream || got < 0)
+        throw std::runtime_error(path + ": cannot be read");
+    if (static_cast<std::uint64_t>(got) != expected)
+        throw std::runtime_error(path + ": expected " + std::to_string(expected) + " bytes from the name, got "
+                                 + std::to_string(got));
+    if (info.type == VoxelType::UInt8)
+        return info;
+
+    float lo = std::numeric_limits<float>::infinity(), hi = -lo;
+    std::vector<std::byte> chunk(1 << 20);
+    stream.seekg(0);
+    for (std::uint64_t done = 0; done < expected;) {
+        const std::size_t bytes = static_cast<std::size_t>(std::min<std::uint64_t>(chunk.size(), expected - done));
+        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(bytes)))
+            throw std::runtime_error(path + ": reading failed after " + std::to_string(done) + " bytes");
+        if (info.type == VoxelType::UInt16)
+            detail::growRange<std::uint16_t>(chunk.data(), bytes / 2, lo, hi);
+        else
+            detail::growRange<float>(chunk.data(), bytes / 4, lo, hi);
+        done += bytes;
+    }
+    if (lo > hi)
+        throw std::runtime_error(path + ": not one of its voxels is finite");
+    info.minimum = lo < 0 && hi > 0 ? 0 : lo;
+    info.maximum = hi > info.minimum ? hi : info.minimum + 1;
+    return info;
+}
+
+// Reads rows of a stream that describeVolume has accepted.
+inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::string& path, const VolumeInfo& info)
+{
+    std::streamoff position = -1;
+    return [stream, path, info, position](int x0, int x1, int y, int z, std::byte* out) mutable {
+        const auto wide = [](int i) { return static_cast<std::streamoff>(i); };
+        const std::streamoff begin = ((wide(z) * info.dims[1] + y) * info.dims[0] + x0)
+            * static_cast<std::streamoff>(voxelBytes(info.type));
+        const std::streamsize bytes = (wide(x1) - x0) * static_cast<std::streamsize>(voxelBytes(info.type));
+        if (position != begin) // a seek throws the stream's buffer away
+            stream->seekg(begin);
+        if (!stream->read(reinterpret_cast<char*>(out), bytes))
+            throw std::runtime_error(path + ": reading row y=" + std::to_string(y) + " z=" + std::to_string(z)
+                                     + " failed");
+        position = begin + bytes;
+        if (info.type == VoxelType::Float32)
+            for (int i = 0; i < x1 - x0; ++i) {
+                float value;
+                std::memcpy(&value, out + 4 * i, sizeof value);
+                if (!std::isfinite(value))
+                    std::memcpy(out + 4 * i, &info.minimum, sizeof value);
+            }
+    };
+}
+
+inline VolumeSource openVolume(const std::string& path)
+{
+    auto open = [path] {
+        auto stream = std::make_shared<std::ifstream>(path, std::ios::binary);
+        if (!*stream)
+            throw std::runtime_error(path + ": cannot be opened");
+        return stream;
+    };
+    VolumeSource source;
+    source.info = describeVolume(*open(), path);
+    source.open = [open, path, info = source.info] { return rowReader(open(), path, info); };
+    return source;
+}
+
+// The box, in voxels, of what stands out from the background, as far as a lattice of about 64^3 of its voxels shows
+// it: to point a camera. The whole domain if nothing does.
+inline Box visibleBounds(const VolumeSource& source)
+{
+    const VolumeInfo& info = source.info;
+    const float threshold = 0.1f;
+    const RowReader read = source.open();
+    std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
+    const auto value = [&](int x) {
+        const auto as = [&](auto voxel) {
+            std::memcpy(&voxel, row.data() + static_cast<std::size_t>(x) * sizeof voxel, sizeof voxel);
+            return static_cast<float>(voxel);
+        };
+        return info.type == VoxelType::UInt8 ? as(std::uint8_t{}) : info.type == VoxelType::UInt16
+            ? as(std::uint16_t{}) : as(float{});
+    };
+    Box box;
+    const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
+    for (int z = 0; z < info.dims[2]; z += stride(2))
+        for (int y = 0; y < info.dims[1]; y += stride(1)) {
+            read(0, info.dims[0], y, z, row.data());
+            for (int x = 0; x < info.dims[0]; x += stride(0))
+                if ((value(x) - info.minimum) > threshold * (info.maximum - info.minimum))
+                    box.grow({static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)});
+        }
+    if (box.empty()) {
+        box.grow({0, 0, 0});
+        box.grow({static_cast<float>(info.dims[0] - 1), static_cast<float>(info.dims[1] - 1),
+                  static_cast<float>(info.dims[2] - 1)});
+    }
+    return box;
+}
+
+// ---- the part in memory ----------------------------------------------------------------------------------------
+
+// The voxels [lo, hi) of a volume. The box may reach beyond the volume by the ghosts that gradients need; there the
+// nearest voxel is repeated, so that sampling needs no clamping.
+class VoxelBlock {
+public:
+    VoxelBlock(const VolumeSource& source, const Index3& lo, const Index3& hi)
+        : info_(source.info), lo_(lo), nx_(static_cast<std::size_t>(hi[0] - lo[0])),
+          nxy_(nx_ * static_cast<std::size_t>(hi[1] - lo[1])), hi_(hi)
+    {
+        const std::size_t size = voxelBytes(info_.type);
+        bytes_.resize(nxy_ * static_cast<std::size_t>(hi[2] - lo[2]) * size);
+        const RowReader read = source.open();
+        const int x0 = std::max(lo[0], 0), x1 = std::min(hi[0], info_.dims[0]);
+        for (int z = lo[2]; z < hi[2]; ++z)
+            for (int y = lo[1]; y < hi[1]; ++y) {
+                std::byte* row = bytes_.data() + index(lo[0], y, z) * size;
+                std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
+                read(x0, x1, std::clamp(y, 0, info_.dims[1] - 1), std::clamp(z, 0, info_.dims[2] - 1), inside);
+                for (int x = lo[0]; x < x0; ++x)
+                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
+                for (int x = x1; x < hi[0]; ++x)
+                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
+                                inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
+            }
+    }
+
+    const VolumeInfo& info() const { return info_; }
+    const Index3& lo() const { return lo_; }
+    const Index3& hi() const { return hi_; }
+    std::size_t rowStride() const { return nx_; }
+    std::size_t sliceStride() const { return nxy_; }
+
+    // Of a voxel by its index in the whole volume.
+    std::size_t index(int x, int y, int z) const
+    {
+        return static_cast<std::size_t>(z - lo_[2]) * nxy_ + static_cast<std::size_t>(y - lo_[1]) * nx_
+            + static_cast<std::size_t>(x - lo_[0]);
+    }
+    template <class T>
+    const T* data() const
+    {
+        return reinterpret_cast<const T*>(bytes_.data());
+    }
+
+private:
+    VolumeInfo info_;
+    Index3 lo_;
+    std::size_t nx_, nxy_;
+    Index3 hi_;
+    std::vector<std::byte> bytes_;
+};
+
+} // namespace example

@@ -1,0 +1,213 @@
+// VolumeSampler: what a ray asks of a brick's part of a volume: value, gradient, opacity, and how far there is
+// nothing. All coordinates are voxel indices in the whole volume, so that neighbouring bricks compute the same bits.
+#pragma once
+
+#include "scene.hpp"
+#include "shading.hpp"
+
+namespace example {
+
+class VolumeSampler {
+    const VolumeInfo& info() const { return volume_.block.info(); }
+
+    // Calls the function with the voxels as a pointer to their type.
+    template <class Function>
+    auto dispatch(Function&& function) const
+    {
+        switch (info().type) {
+        case VoxelType::UInt8: return function(volume_.block.data<std::uint8_t>());
+        case VoxelType::UInt16: return function(volume_.block.data<std::uint16_t>());
+        default: return function(volume_.block.data<float>());
+        }
+    }
+
+public:
+    // `step`: distance between samples in world space.
+    VolumeSampler(BrickVolume volume, float step)
+        : volume_(std::move(volume)),
+          inverseScale_(1 / volume_.placement.scale.x, 1 / volume_.placement.scale.y, 1 / volume_.placement.scale.z),
+          shift_(-volume_.placement.offset.x * inverseScale_.x, -volume_.placement.offset.y * inverseScale_.y,
+                 -volume_.placement.offset.z * inverseScale_.z),
+          transferFunction_(256 * step / volume_.placement.size() / static_cast<float>(largestIndex())),
+          valueScale_(1 / (info().maximum - info().minimum))
+    {
+        for (int i = 0; i < 3; ++i)
+            slopeScale_[i] = std::copysign(0.5f * valueScale_, inverseScale_[i]);
+        dispatch([this](const auto* voxels) { buildSkipGrid(voxels); });
+    }
+
+    Vec3 toVoxel(const Vec3& world) const
+    {
+        return {mulAdd(world.x, inverseScale_.x, shift_.x), mulAdd(world.y, inverseScale_.y, shift_.y),
+                mulAdd(world.z, inverseScale_.z, shift_.z)};
+    }
+    // One over the voxels that a ray advances along each axis in one step.
+    Vec3 inverseAdvance(const Vec3& inverseDirection, float step) const
+    {
+        const Vec3& scale = volume_.placement.scale;
+        return {inverseDirection.x * scale.x / step, inverseDirection.y * scale.y / step,
+                inverseDirection.z * scale.z / step};
+    }
+
+    // The domain in world space, for clipping rays with some slack; who is inside is decided by inDomain().
+    Box bounds() const
+    {
+        Box box;
+        box.grow(volume_.placement.toWorld({0, 0, 0}));
+        box.grow(volume_.placement.toWorld({last(0), last(1), last(2)}));
+        return box;
+    }
+    bool inDomain(const Vec3& v) const
+    {
+        return v.x >= 0 && v.y >= 0 && v.z >= 0 && v.x <= last(0) && v.y <= last(1) && v.z <= last(2);
+    }
+
+    // How many steps ahead the next sample is that may have an opacity above 0; 0 if that may be this one.
+    // `inverseStep` is from inverseAdvance().
+    int emptySteps(const Vec3& v, const Vec3& inverseStep) const
+    {
+        const int cx = static_cast<int>(v.x) >> cellShift, cy = static_cast<int>(v.y) >> cellShift,
+                  cz = static_cast<int>(v.z) >> cellShift;
+        const int distance = distances_[cellIndex(cx - cells0_[0], cy - cells0_[1], cz - cells0_[2])];
+        if (distance == 0)
+            return 0;
+        float steps = 1e6f;
+        const int cell[3] = {cx, cy, cz};
+        for (int i = 0; i < 3; ++i) {
+            const int wall = (inverseStep[i] > 0 ? cell[i] + distance : cell[i] - distance + 1) * cellWidth;
+            const float s = (static_cast<float>(wall) - v[i]) * inverseStep[i];
+            steps = s < steps ? s : steps; // false for 0 * infinity, which is not a number
+        }
+        return static_cast<int>(std::max(0.0f, steps - 0.05f)) + 1; // 0.05 for rounding
+    }
+
+    // Adds the light and returns premultiplied colour and opacity; opacity 0 where there is nothing.
+    TransferFunction::Entry shade(const Vec3& v, const Vec3& view, const Light& light) const
+    {
+        return dispatch([&](const auto* voxels) { return shade(voxels, v, view, light); });
+    }
+
+private:
+    static constexpr int cellShift = 3, cellWidth = 1 << cellShift; // of the skip grid, in voxels
+
+    float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
+    int largestIndex() const { return std::max({info().dims[0], info().dims[1], info().dims[2]}) - 1; }
+
+    static float lerp(float a, float b, float f) { return mulAdd(f, b - a, a); }
+
+    template <class T>
+    TransferFunction::Entry shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
+    {
+        const int x = static_cast<int>(v.x), y = static_cast<int>(v.y), z = static_cast<int>(v.z);
+        const float fx = v.x - static_cast<float>(x), fy = v.y - static_cast<float>(y),
+                    fz = v.z - static_cast<float>(z);
+        const T* p = voxels + volume_.block.index(x, y, z);
+        const std::ptrdiff_t dx = 1, dy = static_cast<std::ptrdiff_t>(volume_.block.rowStride()),
+                             dz = static_cast<std::ptrdiff_t>(volume_.block.sliceStride());
+        // Interpolates in the plane through q that the axes a and b span.
+        const auto plane = [](const T* q, std::ptrdiff_t a, std::ptrdiff_t b, float fa, float fb) {
+            const auto at = [](T value) { return static_cast<float>(value); };
+            return lerp(lerp(at(q[0]), at(q[a]), fa), lerp(at(q[b]), at(q[a + b]), fa), fb);
+        };
+        const float z0 = plane(p, dx, dy, fx, fy), z1 = plane(p + dz, dx, dy, fx, fy);
+        TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, fz) - info().minimum) * valueScale_);
+        if (!(entry.alpha > 0))
+            return {};
+
+        // Central differences at distance one voxel.
+        const auto slope = [&](std::ptrdiff_t along, std::ptrdiff_t a, std::ptrdiff_t b, float f, float fa, float fb) {
+            const float before = plane(p - along, a, b, fa, fb), here = plane(p, a, b, fa, fb),
+                        next = plane(p + along, a, b, fa, fb), behind = plane(p + 2 * along, a, b, fa, fb);
+            return lerp(next - before, behind - here, f);
+        };
+        const Vec3 rise(slope(dx, dy, dz, fx, fy, fz), slope(dy, dx, dz, fy, fx, fz),
+                        lerp(z1 - plane(p - dz, dx, dy, fx, fy), plane(p + 2 * dz, dx, dy, fx, fy) - z0, fz));
+        const Vec3 gradient(rise.x * slopeScale_.x, rise.y * slopeScale_.y, rise.z * slopeScale_.z);
+        const float steepness = length(gradient);
+        if (steepness > 0) {
+            // Where the value hardly changes its direction is noise: there the colour is left as it is.
+            const Vec3 normal = gradient * (1 / steepness);
+            const float weight = std::min(1.0f, 25.0f * steepness);
+            const float lit = 1 + weight * (light.diffuse(normal) - 1);
+            const float highlight = weight * light.specular(normal, view);
+            entry.r = entry.r * lit + highlight;
+            entry.g = entry.g * lit + highlight;
+            entry.b = entry.b * lit + highlight;
+        }
+        entry.r *= entry.alpha;
+        entry.g *= entry.alpha;
+        entry.b *= entry.alpha;
+        return entry;
+    }
+
+    std::size_t cellIndex(int x, int y, int z) const
+    {
+        return (static_cast<std::size_t>(z) * static_cast<std::size_t>(cells_[1]) + static_cast<std::size_t>(y))
+            * static_cast<std::size_t>(cells_[0]) + static_cast<std::size_t>(x);
+    }
+
+    // distances_: number of cells to the nearest that has something to see, diagonals counting as one; all cells
+    // closer than that can be skipped at once.
+    template <class T>
+    void buildSkipGrid(const T* voxels)
+    {
+        const Index3 &lo = volume_.block.lo(), &hi = volume_.block.hi();
+        for (std::size_t i = 0; i < 3; ++i) {
+            cells0_[i] = std::max(lo[i], 0) >> cellShift;
+            cells_[i] = ((std::min(hi[i], info().dims[i]) - 1) >> cellShift) + 1 - cells0_[i];
+        }
+        distances_.resize(cellIndex(0, 0, cells_[2]));
+        forEachCell(1, [&](int x, int y, int z) {
+            Index3 from, to; // with the voxels of the upper neighbours' first layer, which interpolation uses
+            const Index3 cell{x, y, z};
+            for (std::size_t i = 0; i < 3; ++i) {
+                from[i] = std::max((cells0_[i] + cell[i]) << cellShift, lo[i]);
+                to[i] = std::min(((cells0_[i] + cell[i] + 1) << cellShift) + 1, hi[i]);
+            }
+            T least = voxels[volume_.block.index(from[0], from[1], from[2])], greatest = least;
+            for (int k = from[2]; k < to[2]; ++k)
+                for (int j = from[1]; j < to[1]; ++j) {
+                    const T* row = voxels + volume_.block.index(from[0], j, k);
+                    for (int i = 0; i < to[0] - from[0]; ++i) {
+                        least = std::min(least, row[i]);
+                        greatest = std::max(greatest, row[i]);
+                    }
+                }
+            const auto value = [this](T v) { return (static_cast<float>(v) - info().minimum) * valueScale_; };
+            distances_[cellIndex(x, y, z)] = transferFunction_.isTransparent(value(least), value(greatest)) ? 255 : 0;
+        });
+        // Two sweeps, each over the neighbours that it has already been to, give the exact distance.
+        for (const int direction : {1, -1})
+            forEachCell(direction, [&](int x, int y, int z) {
+                int distance = distances_[cellIndex(x, y, z)];
+                for (int n = 0; n < 13; ++n) {
+                    const int i = x + direction * (n % 3 - 1), j = y + direction * (n / 3 % 3 - 1),
+                              k = z + direction * (n / 9 - 1);
+                    if (i >= 0 && i < cells_[0] && j >= 0 && j < cells_[1] && k >= 0 && k < cells_[2])
+                        distance = std::min(distance, distances_[cellIndex(i, j, k)] + 1);
+                }
+                distances_[cellIndex(x, y, z)] = static_cast<std::uint8_t>(distance);
+            });
+    }
+
+    template <class Function>
+    void forEachCell(int direction, Function&& function) const
+    {
+        const auto at = [direction](int i, int n) { return direction > 0 ? i : n - 1 - i; };
+        for (int z = 0; z < cells_[2]; ++z)
+            for (int y = 0; y < cells_[1]; ++y)
+                for (int x = 0; x < cells_[0]; ++x)
+                    function(at(x, cells_[0]), at(y, cells_[1]), at(z, cells_[2]));
+    }
+
+    BrickVolume volume_;
+    Vec3 inverseScale_;
+    Vec3 shift_;
+    TransferFunction transferFunction_;
+    float valueScale_;
+    Vec3 slopeScale_; // from differences of voxels to a gradient along the world's axes, in values per voxel
+    Index3 cells0_{}, cells_{}; // first cell and number of cells
+    std::vector<std::uint8_t> distances_;
+};
+
+} // namespace example
