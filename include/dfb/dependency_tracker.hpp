@@ -48,7 +48,8 @@ public:
             if (input.generation == 1)
                 checkDeclared(input);
         Generation& root = generation(0);
-        ++root.arrived;
+        if (++root.arrived > root.expected)
+            failAt(0, ErrorKind::TooManyInputs, root.expected, root.arrived);
         root.children += static_cast<std::int64_t>(declared_.size());
         advance();
     }

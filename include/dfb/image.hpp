@@ -50,28 +50,45 @@ inline std::size_t bytesPerPixel(OutputFormat format) noexcept
 
 namespace detail {
 
-// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0.
+// Whether 255 * value rounds up from `floor`, its integer part: the sign of 255 * value - floor - 1/2 without rounding,
+// and to even where that is 0.
+inline bool aboveTie(double value, double floor) noexcept
+{
+    // value = high + low with at most 27 bits each, so that both products are exact.
+    const double split = value * 134217729.0, high = split - (split - value), low = value - high;
+    const double difference = (high * 255.0 - (floor + 0.5)) + low * 255.0;
+    return difference != 0.0 ? difference > 0.0 : std::fmod(floor, 2.0) != 0.0;
+}
+
+// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. Exact: where
+// the rounded product is too near to a tie to tell, the decision is made with all its bits.
 inline std::uint8_t toUnorm8(double value) noexcept
 {
     if (!(value > 0.0))
         return 0;
     if (value >= 1.0)
         return 255;
-    // 2^52 leaves no bit below one, so the addition rounds as the current (default) mode does: to even.
+    // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
     const double shift = 4503599627370496.0;
-    return static_cast<std::uint8_t>((value * 255.0 + shift) - shift);
+    const double product = value * 255.0, nearest = (product + shift) - shift;
+    if (std::fabs(product - nearest) > 0.4999999999)
+        return static_cast<std::uint8_t>(std::lrint(std::floor(product)) + (aboveTie(value, std::floor(product)) ? 1 : 0));
+    return static_cast<std::uint8_t>(nearest);
 }
 
-// thresholds()[k] is the least linear value whose sRGB level is k + 1: the decision is a comparison and so
-// exact, where evaluating the curve would be off near every boundary.
+// thresholds()[k] is the least double whose sRGB level is k + 1: the decision is a comparison and so exact, where
+// evaluating the curve would be off near every boundary.
 inline const std::array<double, 255>& srgbThresholds()
 {
     static const std::array<double, 255> table = [] {
         std::array<double, 255> t{};
         for (int k = 0; k < 255; ++k) {
             const long double s = (static_cast<long double>(k) + 0.5L) / 255.0L;
-            t[static_cast<std::size_t>(k)] = static_cast<double>(
-                s <= 0.04045L ? s / 12.92L : std::pow((s + 0.055L) / 1.055L, 2.4L));
+            const long double exact = s <= 0.04045L ? s / 12.92L : std::pow((s + 0.055L) / 1.055L, 2.4L);
+            auto least = static_cast<double>(exact);
+            if (static_cast<long double>(least) < exact)
+                least = std::nextafter(least, 1.0);
+            t[static_cast<std::size_t>(k)] = least;
         }
         return t;
     }();

@@ -69,7 +69,8 @@ inline MessageHeader readMessageHeader(const Buffer& message, std::uint32_t fram
         failMalformed("wire format version", MessageHeader::formatVersion, header.version);
     if (header.kind > MessageKind::Abort)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
-    if (header.framebuffer != framebuffer)
+    // Not of reductions: in the first one ranks find out that their ids differ.
+    if (header.framebuffer != framebuffer && header.kind > MessageKind::ReduceDown)
         failMalformed("for another framebuffer", framebuffer, header.framebuffer);
     return header;
 }

@@ -162,6 +162,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     }
     auto* color = reinterpret_cast<float*>(out + tableBytes);
     auto* depth = color + 4 * stored;
+    const std::uint64_t repeats = h.encoding == FragmentEncoding::Constant ? active.pixels : 1;
     const auto copyPixels = [&](int x, int y, int count) {
         const float* from = tile.pixel(x, y);
         std::memcpy(color, from, 4 * sizeof(float) * static_cast<std::size_t>(count));
@@ -176,7 +177,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
                     finite = finite && d == d;
                     *depth++ = canonicalDepth(d);
                 }
-            nonFinite += finite ? 0 : 1;
+            nonFinite += finite ? 0 : repeats;
         }
     };
     if (h.encoding == FragmentEncoding::Sparse) {

@@ -47,25 +47,31 @@ public:
     {
         const Region all{0, 0, width, height};
         const double pixelsPerUnit = 0.5 * height / static_cast<double>(tanHalfFov_);
-        double x0 = 1e30, y0 = 1e30, x1 = -1e30, y1 = -1e30;
+        const auto along = [](const double (&d)[3], const Vec3& axis) {
+            return d[0] * static_cast<double>(axis.x) + d[1] * static_cast<double>(axis.y) + d[2] * static_cast<double>(axis.z);
+        };
+        double x0 = 1e300, y0 = 1e300, x1 = -1e300, y1 = -1e300;
         int behind = 0;
+        bool near = false;
         for (int corner = 0; corner < 8; ++corner) {
             const Vec3 p{corner & 1 ? bounds.upper.x : bounds.lower.x, corner & 2 ? bounds.upper.y : bounds.lower.y,
                          corner & 4 ? bounds.upper.z : bounds.lower.z};
-            const Vec3 d = p - eye_;
-            const double depth = dot(d, forward_);
-            if (!(depth > 1e-6 * std::sqrt(static_cast<double>(dot(d, d))))) {
-                ++behind;
-                continue;
-            }
-            const double x = 0.5 * width + pixelsPerUnit * dot(d, right_) / depth;
-            const double y = 0.5 * height - pixelsPerUnit * dot(d, up_) / depth;
+            const double d[3] = {static_cast<double>(p.x) - static_cast<double>(eye_.x),
+                                 static_cast<double>(p.y) - static_cast<double>(eye_.y),
+                                 static_cast<double>(p.z) - static_cast<double>(eye_.z)};
+            // The axes are rounded to float: a depth below that rounding may have either sign.
+            const double depth = along(d, forward_);
+            const double rounding = 1e-6 * (std::fabs(d[0]) + std::fabs(d[1]) + std::fabs(d[2]));
+            behind += depth < -rounding;
+            near = near || depth <= rounding;
+            const double x = 0.5 * width + pixelsPerUnit * along(d, right_) / depth;
+            const double y = 0.5 * height - pixelsPerUnit * along(d, up_) / depth;
             x0 = std::min(x0, x), x1 = std::max(x1, x);
             y0 = std::min(y0, y), y1 = std::max(y1, y);
         }
         if (behind == 8)
             return {};
-        if (behind > 0)
+        if (near)
             return all;
         // One pixel more on each side covers the rounding of all this and of the renderer's rays.
         const auto pixel = [](double v) { return static_cast<int>(std::floor(std::clamp(v, -1e6, 1e6))); };
