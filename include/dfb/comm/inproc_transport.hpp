@@ -170,7 +170,7 @@ public:
         return true;
     }
 
-    void stop()
+    void stop(bool)
     {
         Endpoint& self = endpoint(rank_);
         std::lock_guard<std::mutex> lock(self.mutex);

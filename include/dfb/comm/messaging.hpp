@@ -28,7 +28,6 @@ public:
     // In a task; several at once, in any order.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
     virtual void malformed(int source, const std::exception_ptr& error) = 0;
-    virtual void transportFailed() = 0;
 
 protected:
     ~MessageReceiver() = default;
@@ -41,13 +40,18 @@ public:
 
     Messaging(const typename Transport::Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress mode,
               std::shared_ptr<Executor> executor, std::uint32_t id, MessageReceiver& receiver)
-        : pool_(pool), transport_(communicator, std::move(pool), mode), executor_(std::move(executor)), id_(id),
-          receiver_(receiver),
+        : pool_(pool), transport_(communicator, std::move(pool), mode), mode_(mode), executor_(std::move(executor)),
+          id_(id), receiver_(receiver),
           reductions_(transport_.rank(), transport_.size(),
                       [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) { sendReduction(to, key, up, bytes); })
     {
+    }
+
+    // From here on the receiver is called.
+    void start()
+    {
         transport_.start(*this);
-        if (transport_.needsPolling() && mode == Progress::Thread)
+        if (transport_.needsPolling() && mode_ == Progress::Thread)
             progress_.start();
     }
 
@@ -55,8 +59,7 @@ public:
     ~Messaging()
     {
         progress_.stop();
-        if (!failed_)
-            transport_.stop();
+        transport_.stop(!failed_);
         std::unique_lock<std::mutex> lock(mutex_);
         changed_.wait(lock, [this] { return tasks_ == 0; });
     }
@@ -218,21 +221,19 @@ private:
 
     void fail(const ErrorInfo& error) override
     {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (failed_)
-                return;
-            failure_ = error;
-            failed_ = true;
-            changed_.notify_all();
-        }
-        receiver_.transportFailed();
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (failed_)
+            return;
+        failure_ = error;
+        failed_ = true;
+        changed_.notify_all();
     }
 
     void wake() override { progress_.wake(); }
 
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
+    Progress mode_;
     std::shared_ptr<Executor> executor_;
     std::uint32_t id_;
     MessageReceiver& receiver_;

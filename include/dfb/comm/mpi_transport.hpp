@@ -93,9 +93,16 @@ public:
         }
     }
 
-    // Collective. Goes on receiving until the sends of all ranks have completed.
-    void stop()
+    // Orderly it is collective, and goes on receiving until the sends of all ranks have completed.
+    void stop(bool orderly)
     {
+        if (!orderly) {
+            // MPI may still use these buffers, and freeing a communicator waits for others: both are left to it.
+            new std::vector<Buffer>(std::move(sending_));
+            new std::vector<Receive>(std::move(receiving_));
+            comm_ = MPI_COMM_NULL;
+            return;
+        }
         MPI_Request barrier = MPI_REQUEST_NULL;
         bool entered = false;
         for (int done = 0; !done;) {

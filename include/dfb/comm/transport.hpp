@@ -14,8 +14,9 @@
 //   bool poll();                                 one thread at a time; never blocks; moves what can be moved; true if
 //                                                something was; calls the handler
 //   bool quiet() const;                          nothing waits to be sent
-//   void stop();                                 when no rank expects anything more; collective where the transport
-//                                                needs it; afterwards the handler is not called
+//   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects anything
+//                                                more; collective where the transport needs it. Else (it has
+//                                                failed): waits for nobody
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -75,7 +76,7 @@ template <class T, class = void>
 struct HasStartAndStop : std::false_type {};
 template <class T>
 struct HasStartAndStop<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
-                                      decltype(std::declval<T&>().stop())>> : std::true_type {};
+                                      decltype(std::declval<T&>().stop(true))>> : std::true_type {};
 
 } // namespace detail
 
@@ -95,7 +96,7 @@ constexpr bool checkTransport()
     static_assert(HasSend<T>::value, "dfb: Transport must provide void send(int destination, Buffer&&)");
     static_assert(HasPoll<T>::value, "dfb: Transport must provide bool poll(), bool needsPolling() const "
                                      "and bool quiet() const");
-    static_assert(HasStartAndStop<T>::value, "dfb: Transport must provide void start(TransportHandler&) and void stop()");
+    static_assert(HasStartAndStop<T>::value, "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     return is_transport_v<T>;
 }
 

@@ -40,6 +40,7 @@ public:
         messaging_ = std::make_unique<Messaging<Transport>>(communicator, pool_, config_.progress,
                                                                     config_.executor, config_.id, self);
         outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
+        messaging_->start();
         Agreement mine;
         try {
             if (config_.displayRank < 0 || config_.displayRank >= size())
@@ -102,7 +103,6 @@ public:
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
         renderNs_ = 0;
-        declarationsApplied_ = false;
         tilesLeft_ = countUnknown + (params.declared ? 0 : static_cast<std::int64_t>(ownedTiles().size()));
         beginTime_ = Clock::now();
         frameOpen_ = true;
@@ -127,7 +127,7 @@ public:
         if (owner != rank()) {
             messaging_->send(owner, std::move(message));
         } else if (gate_.enter(tile.frame)) {
-            arrive(std::move(message));
+            arrive(std::move(message), {});
             gate_.leave();
         }
     }
@@ -156,6 +156,8 @@ public:
     {
         if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
             guarded([] { throw InvalidArgument("end() of a frame with declared inputs without declare()"); });
+        if (!image().empty())
+            guarded([this] { pipeline_->finishBackground(); });
         const Verdict verdict = conclude();
         if (verdict.error)
             throw FrameError(*verdict.error);
@@ -239,8 +241,6 @@ private:
         return where;
     }
 
-    void transportFailed() override { outcome_->setFailed(); }
-
     void handle(int source, MessageKind kind, Buffer&& message)
     {
         if (kind == MessageKind::Abort) {
@@ -251,7 +251,7 @@ private:
         if (outcome_->failed())
             return;
         switch (kind) {
-        case MessageKind::Fragment: arrive(std::move(message)); break;
+        case MessageKind::Fragment: arrive(std::move(message), messageFrom(source)); break;
         case MessageKind::Manifest:
             if (!wantsDeclaration_) {
                 ErrorInfo info;
@@ -282,14 +282,12 @@ private:
 
     // ---- tiles
 
-    void arrive(Buffer&& message)
+    // `where` says what is known of the place.
+    void arrive(Buffer&& message, ErrorInfo where)
     {
-        ErrorInfo where;
         guarded(
             [&] {
                 const int ready = pipeline_->arrive(std::move(message), where);
-                if (declarationsApplied_ && !manifests_.expected().count(static_cast<int>(where.tile)))
-                    failUndeclared();
                 if (ready >= 0)
                     submitFinish(ready);
             },
@@ -342,40 +340,16 @@ private:
     {
         if (outcome_->failed())
             return;
-        const auto& expected = manifests_.expected();
-        declarationsApplied_ = true; // from now on arrive() looks
-        const int stranger = pipeline_->table().firstUndeclared(expected);
+        // A pixel operation that is not pointwise sees background tiles too.
+        const bool all = !IsPointwise<PixelOp>::value;
         ErrorInfo where;
-        const auto declareTile = [&](int tile, const ManifestExchange::Inputs& inputs) {
-            where.tile = tile;
-            ++tilesLeft_;
-            if (pipeline_->table().declare(tile, inputs))
-                submitFinish(tile);
-        };
         guarded(
             [&] {
-                if (stranger >= 0) {
-                    where.tile = stranger;
-                    failUndeclared();
-                }
-                for (const auto& [tile, inputs] : expected)
-                    declareTile(tile, inputs);
-                // A pixel operation that is not pointwise sees background tiles too.
-                if constexpr (!IsPointwise<PixelOp>::value)
-                    for (int tile : ownedTiles())
-                        if (!expected.count(tile))
-                            declareTile(tile, {});
+                pipeline_->table().declare(
+                    manifests_.expected(), all, where, [this](int) { ++tilesLeft_; }, [this](int tile) { submitFinish(tile); });
                 tilesLess(countUnknown);
             },
             where);
-    }
-
-    [[noreturn]] static void failUndeclared()
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::UnannouncedInput;
-        info.message = "no rank declared an input for this tile";
-        throw Error(std::move(info));
     }
 
     // ---- failure, verdict, end
@@ -393,7 +367,8 @@ private:
 
     void failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
-        outcome_->fail(reason, where);
+        if (!outcome_->fail(reason, where))
+            gate_.countLate(); // too late to matter to this frame
         tryVote();
     }
 
@@ -448,7 +423,7 @@ private:
     FrameParams params_;
     std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
     bool frameOpen_ = false;
-    std::atomic<bool> wantsDeclaration_{false}, declarationsApplied_{false};
+    std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};
     std::atomic<std::int64_t> renderNs_{0};

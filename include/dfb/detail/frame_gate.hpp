@@ -25,6 +25,7 @@ public:
     // The last frame that was opened; 0 before the first.
     std::int64_t frame() const noexcept { return frame_; }
     bool isOpen() const noexcept { return open_; }
+    void countLate() noexcept { ++late_; }
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
     // Opens the next frame and returns the messages that came too early for it.

@@ -31,28 +31,32 @@ public:
         hasVerdict_ = failed_ = voted_ = false;
     }
 
-    // The frame has failed on some rank. From any thread, as the rest.
-    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed); }
+    // The frame has failed on some rank, or the transport has. From any thread, as the rest.
+    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || messaging_.failed(); }
 
-    // Another rank says so, or the transport has.
+    // Another rank says so.
     void setFailed() noexcept { failed_ = true; }
 
-    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow.
-    void fail(const std::exception_ptr& reason, const ErrorInfo& where)
+    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if this
+    // rank has voted: then it is too late.
+    bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);
         info.rank = messaging_.rank();
         info.frame = gate_.frame();
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (error_ || voted_)
-                return;
+            if (voted_)
+                return false;
+            if (error_)
+                return true;
             error_ = std::move(info);
         }
         failed_ = true;
         for (int other = 0; other < messaging_.size(); ++other)
             if (other != messaging_.rank())
                 messaging_.send(other, MessageKind::Abort, gate_.frame());
+        return true;
     }
 
     // Enters the verdict, once: when `done()`, or when the frame has failed. `figures()` gives this rank's Verdict.

@@ -129,17 +129,19 @@ public:
         }
     }
 
-    // On the display rank, when all tiles are there: fills in those that nobody touched.
-    void fillBackground()
+    // What the pixel operation makes of the background; throws what it throws.
+    void finishBackground()
     {
-        std::array<float, 4> rgba = table_.frameInfo().background;
+        background_ = table_.frameInfo().background;
         if constexpr (IsPointwise<PixelOp>::value) {
             const float depth = std::numeric_limits<float>::infinity();
-            PixelTile pixel{0, {0, 0, 1, 1}, rgba.data(), config_.depth ? &depth : nullptr};
+            PixelTile pixel{0, {0, 0, 1, 1}, background_.data(), config_.depth ? &depth : nullptr};
             std::as_const(pixelOp_).process(pixel);
         }
-        gather_.fillBackground(rgba);
     }
+
+    // On the display rank, when all tiles are there: fills in those that nobody touched.
+    void fillBackground() { gather_.fillBackground(background_); }
 
     // Input pixels of this frame, set on this rank, that had an infinity or NaN.
     std::int64_t nonFinitePixels() const noexcept { return nonFinite_; }
@@ -150,6 +152,7 @@ private:
     PixelOp pixelOp_;
     TileTable<TileOp> table_;
     FinalGather gather_;
+    std::array<float, 4> background_{};
     std::atomic<std::int64_t> nonFinite_{0};
 };
 

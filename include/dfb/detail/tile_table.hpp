@@ -7,8 +7,10 @@
 #include <dfb/tile_op.hpp>
 
 #include <array>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -46,6 +48,9 @@ inline void checkTile(const TileHeader& tile, const TileLayout& layout, const Ti
     throw InvalidArgument(std::move(info));
 }
 
+// Per tile the (source, part) of what will come.
+using ExpectedInputs = std::map<int, std::vector<std::pair<std::uint32_t, std::uint16_t>>>;
+
 // arrive() and declare() may be called from any thread, for one frame at a time.
 template <class TileOp>
 class TileTable {
@@ -79,6 +84,7 @@ public:
     // `info` is what all tiles have in common. No other member may be running.
     void newFrame(const TileInfo& info, const FrameData& data)
     {
+        expected_ = nullptr;
         info_ = info;
         data_ = data;
     }
@@ -102,14 +108,33 @@ public:
         return becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
     }
 
-    // What will come for a tile, in each pass; none is possible. True if that is already all there.
-    bool declare(int tile, const std::vector<std::pair<std::uint32_t, std::uint16_t>>& inputs)
+    // What will come for each tile, in each pass; nothing for a tile that is not named. Calls `ready(tile)` for those whose
+    // inputs are already all there, and before that `counted(tile)` for each tile that is waited for. `all`: also for the
+    // tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker throws; `where`
+    // then names the tile.
+    template <class Counted, class Ready>
+    void declare(const ExpectedInputs& expected, bool all, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {
-        const std::lock_guard<std::mutex> lock(mutexOf(tile));
-        Slot& slot = slotFor(tile);
-        for (DependencyTracker& tree : slot.trees)
-            tree.declare(inputs);
-        return becomesReady(slot, allComplete(slot));
+        expected_ = &expected; // from now on slotFor() knows
+        for (std::size_t i = 0; i < owned_.size(); ++i) {
+            const auto inputs = expected.find(owned_[i]);
+            const bool named = inputs != expected.end();
+            bool complete = false;
+            where.tile = owned_[i];
+            {
+                const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
+                const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
+                if (!named && !all && !touched)
+                    continue;
+                Slot& slot = slotFor(owned_[i]);
+                if (!slot.declared)
+                    declareSlot(slot, named ? inputs->second : ExpectedInputs::mapped_type{});
+                complete = becomesReady(slot, allComplete(slot));
+            }
+            counted(owned_[i]);
+            if (complete)
+                ready(owned_[i]);
+        }
     }
 
     // The tile must be complete. Nothing else touches its op any more.
@@ -126,22 +151,10 @@ public:
         return count;
     }
 
-    // The first tile of this frame that has had an input though none was declared for it; -1 if there is none.
-    template <class Expected>
-    int firstUndeclared(const Expected& expected)
-    {
-        for (std::size_t i = 0; i < slots_.size(); ++i) {
-            const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
-            if (slots_[i] && slots_[i]->frame == info_.frame && slots_[i]->touched && !expected.count(owned_[i]))
-                return owned_[i];
-        }
-        return -1;
-    }
-
 private:
     struct Slot {
         std::int64_t frame = -1;
-        bool ready = false, touched = false;
+        bool ready = false, touched = false, declared = false;
         std::vector<DependencyTracker> trees; // one per pass
         TileOp op;
     };
@@ -155,7 +168,7 @@ private:
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             slot->frame = info_.frame;
-            slot->ready = slot->touched = false;
+            slot->ready = slot->touched = slot->declared = false;
             slot->trees.resize(static_cast<std::size_t>(info_.passes));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();
@@ -166,8 +179,18 @@ private:
                 slot->op.newFrame(info, data_);
             else
                 slot->op.newFrame(info);
+            const ExpectedInputs* expected = expected_;
+            if (expected && !expected->count(tile))
+                declareSlot(*slot, {});
         }
         return *slot;
+    }
+
+    static void declareSlot(Slot& slot, const ExpectedInputs::mapped_type& inputs)
+    {
+        slot.declared = true;
+        for (DependencyTracker& tree : slot.trees)
+            tree.declare(inputs);
     }
 
     static bool allComplete(const Slot& slot)
@@ -192,6 +215,7 @@ private:
     std::vector<int> owned_;
     std::vector<std::unique_ptr<Slot>> slots_;
     std::array<std::mutex, 64> mutexes_;
+    std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;
     FrameData data_{};
 };

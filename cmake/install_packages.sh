@@ -1,0 +1,85 @@
+#!/bin/sh
+# Installs what building dfb, its tests and its examples needs and this machine lacks: on Debian and Ubuntu with apt-get;
+# elsewhere says what is missing and exits with 1. Quick when nothing is missing.
+set -eu
+
+have() {
+    command -v "$1" >/dev/null 2>&1
+}
+
+say() {
+    echo "install_packages.sh: $*" >&2
+}
+
+# Name of Debian's package for whatever is missing of what can be had in other ways, too.
+tools() {
+    have c++ || have g++ || have clang++ || echo g++
+    have cmake || echo cmake
+    have ninja || echo ninja-build
+    # Any MPI will do; two of them side by side get in each other's way.
+    if ! have mpiexec || ! have mpicxx; then
+        echo mpich libmpich-dev
+    fi
+}
+
+libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev
+    libtinyobjloader-dev"
+
+# Without dpkg: the header that each library is known by.
+missing_headers() {
+    while read -r name headers; do
+        for header in $headers; do
+            if echo "#include <$header>" | "${CXX:-c++}" -std=c++17 -E -x c++ - >/dev/null 2>&1; then
+                continue 2
+            fi
+        done
+        echo "$name"
+    done <<END
+oneTBB tbb/parallel_for.h
+Snappy snappy.h
+Catch2 catch2/catch_all.hpp catch2/catch.hpp
+Embree(3_or_4) embree4/rtcore.h embree3/rtcore.h
+CLI11 CLI/CLI.hpp
+nlohmann-json nlohmann/json.hpp
+xxHash xxhash.h
+libpng png.h
+tinyobjloader tiny_obj_loader.h
+END
+}
+
+if ! have apt-get || ! have dpkg-query; then
+    # shellcheck disable=SC2046 # one word per package
+    missing=$(echo $(tools) $(missing_headers))
+    [ -z "$missing" ] && exit 0
+    say "please install, with your system's package manager: $missing"
+    say "(headers in an unusual place are found through CPATH)"
+    exit 1
+fi
+
+missing=$(tools)
+for package in $libraries; do
+    [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2>/dev/null)" = installed ] || missing="$missing $package"
+done
+missing=$(echo $missing)
+[ -z "$missing" ] && exit 0
+
+if [ "$(id -u)" -eq 0 ]; then
+    as_root=env
+elif have sudo; then
+    as_root="sudo env"
+else
+    say "these packages are missing, and installing them needs root or sudo: apt-get install $missing"
+    exit 1
+fi
+say "installing: $missing"
+
+apt() {
+    $as_root DEBIAN_FRONTEND=noninteractive apt-get -y -q -o DPkg::Lock::Timeout=300 "$@"
+}
+
+# shellcheck disable=SC2086 # one word per package
+if ! apt install --no-install-recommends $missing; then
+    say "refreshing the package lists and trying once more"
+    apt update
+    apt install --no-install-recommends $missing
+fi

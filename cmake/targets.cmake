@@ -1,0 +1,62 @@
+# dfb::core        the library, on threads alone
+# dfb::mpi, dfb::tbb, dfb::snappy   core and one dependency more, which the definition DFB_HAS_... tells the headers
+# dfb::dfb         core and all of these that are switched on
+# dfb::strict_fp   for bitwise equal images over compilers: no contraction of a * b + c to one rounding
+
+function(_dfb_add_component name)
+  add_library(dfb_${name} INTERFACE)
+  add_library(dfb::${name} ALIAS dfb_${name})
+  set_target_properties(dfb_${name} PROPERTIES EXPORT_NAME ${name})
+endfunction()
+
+# find_package, and what to do when there is nothing to find.
+macro(_dfb_require option packages target)
+  find_package(${ARGN} QUIET)
+  if(NOT TARGET ${target})
+    message(FATAL_ERROR "dfb: ${ARGV3} was not found. Install it (Debian and Ubuntu: apt-get install ${packages}), "
+      "or leave it out with -D${option}=OFF.")
+  endif()
+endmacro()
+
+find_package(Threads REQUIRED)
+_dfb_add_component(core)
+target_compile_features(dfb_core INTERFACE cxx_std_17)
+target_include_directories(dfb_core INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/include>)
+target_link_libraries(dfb_core INTERFACE Threads::Threads)
+
+_dfb_add_component(strict_fp)
+target_compile_options(dfb_strict_fp INTERFACE
+  $<$<COMPILE_LANG_AND_ID:CXX,GNU,Clang,AppleClang,IntelLLVM>:-ffp-contract=off>)
+
+set(DFB_COMPONENTS core)
+
+if(DFB_WITH_MPI)
+  _dfb_require(DFB_WITH_MPI "mpich libmpich-dev" MPI::MPI_CXX MPI 3.1 COMPONENTS CXX)
+  _dfb_add_component(mpi)
+  target_link_libraries(dfb_mpi INTERFACE dfb_core MPI::MPI_CXX)
+  target_compile_definitions(dfb_mpi INTERFACE DFB_HAS_MPI=1)
+  list(APPEND DFB_COMPONENTS mpi)
+endif()
+
+if(DFB_WITH_TBB)
+  _dfb_require(DFB_WITH_TBB "libtbb-dev" TBB::tbb TBB CONFIG)
+  _dfb_add_component(tbb)
+  target_link_libraries(dfb_tbb INTERFACE dfb_core TBB::tbb)
+  target_compile_definitions(dfb_tbb INTERFACE DFB_HAS_TBB=1)
+  list(APPEND DFB_COMPONENTS tbb)
+endif()
+
+if(DFB_WITH_SNAPPY)
+  _dfb_require(DFB_WITH_SNAPPY "libsnappy-dev" Snappy::snappy Snappy CONFIG)
+  _dfb_add_component(snappy)
+  target_link_libraries(dfb_snappy INTERFACE dfb_core Snappy::snappy)
+  target_compile_definitions(dfb_snappy INTERFACE DFB_HAS_SNAPPY=1)
+  list(APPEND DFB_COMPONENTS snappy)
+endif()
+
+# Not exported: the installed package puts dfb::dfb together from the components that were asked for.
+add_library(dfb INTERFACE)
+add_library(dfb::dfb ALIAS dfb)
+foreach(_dfb_component IN LISTS DFB_COMPONENTS)
+  target_link_libraries(dfb INTERFACE dfb_${_dfb_component})
+endforeach()

@@ -1,0 +1,61 @@
+#!/bin/sh
+# sh examples/demo.sh [SCENE FILE...]
+# Installs what is missing, builds dfb_render (preset "release", in build/release) and renders the files, or a made-up
+# scene, on 4 MPI ranks, each of which has a part of the data. Writes demo.png into the current folder.
+set -eu
+
+ranks=4
+size=1024x768
+picture=demo.png
+
+say() {
+    echo "demo.sh: $*"
+}
+
+for argument in "$@"; do
+    case $argument in
+    -*)
+        echo "usage: sh examples/demo.sh [SCENE FILE...]" >&2
+        echo "scene files: NAME_XxYxZ_TYPE.raw volumes, .ply and .obj meshes, .xyz particles; several make one scene" >&2
+        exit 2
+        ;;
+    esac
+    if [ ! -f "$argument" ] || [ ! -r "$argument" ]; then
+        echo "demo.sh: cannot read the file '$argument'" >&2
+        exit 1
+    fi
+done
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+build=$root/build/release
+jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+
+sh "$root/cmake/install_packages.sh"
+say "building dfb_render in $build"
+(
+    cd "$root"
+    cmake --preset release
+    cmake --build --preset release --parallel "$jobs" --target dfb_render
+)
+
+# The launcher of the MPI that was built with.
+mpiexec=$(sed -n 's/^MPIEXEC_EXECUTABLE:[A-Z]*=//p' "$build/CMakeCache.txt")
+flags=
+if "$mpiexec" --version 2>&1 | grep -E 'Open MPI|OpenRTE|PRRTE' >/dev/null; then
+    flags="--oversubscribe --bind-to none"
+    [ "$(id -u)" -ne 0 ] || flags="$flags --allow-run-as-root"
+fi
+
+if [ $# -eq 0 ]; then
+    set -- demo
+fi
+say "rendering $* on $ranks ranks"
+rm -f "$picture"
+started=$(date +%s)
+# shellcheck disable=SC2086 # one word per flag
+"$mpiexec" -n $ranks $flags "$build/examples/embree/dfb_render" "$@" --mode data --size $size --output "$picture"
+if [ ! -s "$picture" ]; then
+    echo "demo.sh: dfb_render has written no picture" >&2
+    exit 1
+fi
+say "done in $(($(date +%s) - started)) s; the picture ($size) is $PWD/$picture"

@@ -1,0 +1,18 @@
+// An archetype: nothing but what a PixelOp must have; each case takes one part away.
+#include <dfb/dfb.hpp>
+
+struct Op {
+#if defined(CASE_NO_COPY) // expect: dfb: PixelOp must provide a copy constructor
+    Op() = default;
+    Op(const Op&) = delete;
+#endif
+
+#if defined(CASE_NO_PROCESS) // expect: dfb: PixelOp must provide void process(PixelTile&) const
+#elif defined(CASE_PROCESS_NOT_CONST) // expect: dfb: PixelOp must provide void process(PixelTile&) const
+    void process(dfb::PixelTile&);
+#else
+    void process(dfb::PixelTile&) const;
+#endif
+};
+
+template class dfb::DistributedFrameBuffer<dfb::AlphaBlend, Op, dfb::InprocTransport>;

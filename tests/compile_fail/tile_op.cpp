@@ -1,0 +1,36 @@
+// An archetype: nothing but what a TileOp must have; each case takes one part away.
+#include <dfb/dfb.hpp>
+
+struct Op {
+#if defined(CASE_NO_DEFAULT_CONSTRUCTOR) // expect: dfb: TileOp must provide a default constructor
+    explicit Op(int);
+#endif
+
+#if defined(CASE_NO_CHANNELS) // expect: dfb: TileOp must provide static constexpr ChannelMask channels
+#else
+    static constexpr dfb::ChannelMask channels = dfb::colorChannel;
+#endif
+
+#if defined(CASE_NO_NEW_FRAME) // expect: dfb: TileOp must provide void newFrame(const TileInfo&)
+#elif defined(CASE_WRONG_NEW_FRAME) // expect: dfb: TileOp must provide void newFrame(const TileInfo&)
+    void newFrame(int);
+#else
+    void newFrame(const dfb::TileInfo&);
+#endif
+
+#if defined(CASE_NO_ADD) // expect: dfb: TileOp must provide void add(Fragment&&)
+#elif defined(CASE_WRONG_ADD) // expect: dfb: TileOp must provide void add(Fragment&&)
+    void add(dfb::Fragment&);
+#else
+    void add(dfb::Fragment&&);
+#endif
+
+#if defined(CASE_NO_FINISH) // expect: dfb: TileOp must provide void finish(FinishedTile&)
+#elif defined(CASE_WRONG_FINISH) // expect: dfb: TileOp must provide void finish(FinishedTile&)
+    void finish();
+#else
+    void finish(dfb::FinishedTile&);
+#endif
+};
+
+template class dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, dfb::InprocTransport>;

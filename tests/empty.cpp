@@ -1,0 +1,1 @@
+// Nothing: the headers come from the command line.

@@ -1,0 +1,95 @@
+# Tests of the source tree: they call the compiler with -fsyntax-only, so they need no build folder of their own and
+# run side by side.
+if(MSVC)
+  return()
+endif()
+
+set(_compile ${CMAKE_CXX_COMPILER} -std=c++17 -fsyntax-only -fno-diagnostics-show-caret)
+set(_include ${PROJECT_SOURCE_DIR}/include)
+
+add_test(NAME guard.layers
+  COMMAND ${CMAKE_COMMAND} -DROOT=${_include} -P ${CMAKE_CURRENT_SOURCE_DIR}/layers.cmake)
+set_tests_properties(guard.layers PROPERTIES LABELS guard)
+
+# Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
+# with that component, the umbrella with each set of components, all others with nothing but our include folder.
+function(_dfb_flags_of out target)
+  set(folders "$<TARGET_PROPERTY:${target},INTERFACE_INCLUDE_DIRECTORIES>")
+  set(${out} "$<$<BOOL:${folders}>:-idirafter$<JOIN:${folders},$<SEMICOLON>-idirafter>>" PARENT_SCOPE)
+endfunction()
+
+function(_dfb_add_header_test name header)
+  add_test(NAME header.${name}
+    COMMAND ${_compile} -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror -I${_include} ${ARGN}
+      -include ${header} -include ${header} -x c++ ${CMAKE_CURRENT_SOURCE_DIR}/empty.cpp
+    COMMAND_EXPAND_LISTS)
+  set_tests_properties(header.${name} PROPERTIES LABELS guard)
+endfunction()
+
+_dfb_flags_of(_mpi_flags MPI::MPI_CXX)
+_dfb_flags_of(_tbb_flags TBB::tbb)
+_dfb_flags_of(_snappy_flags Snappy::snappy)
+set(_mpi_door dfb/comm/mpi_transport.hpp)
+set(_tbb_door dfb/tbb_executor.hpp)
+set(_snappy_door dfb/comm/snappy_codec.hpp)
+
+file(GLOB_RECURSE _headers CONFIGURE_DEPENDS RELATIVE ${_include} ${_include}/dfb/*.hpp)
+list(REMOVE_ITEM _headers ${_mpi_door} ${_tbb_door} ${_snappy_door})
+foreach(_header IN LISTS _headers)
+  string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_header})
+  string(REPLACE "/" "." _name ${_name})
+  _dfb_add_header_test(${_name} ${_header})
+endforeach()
+foreach(_component mpi tbb snappy)
+  if(TARGET dfb::${_component})
+    string(TOUPPER ${_component} _upper)
+    string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_${_component}_door})
+    string(REPLACE "/" "." _name ${_name})
+    _dfb_add_header_test(${_name} ${_${_component}_door} "${_${_component}_flags}")
+    _dfb_add_header_test(dfb.with_${_component} dfb/dfb.hpp -DDFB_HAS_${_upper}=1 "${_${_component}_flags}")
+  endif()
+endforeach()
+
+# Without components nothing of MPI, oneTBB and Snappy is touched, even where they are installed.
+list(TRANSFORM _headers PREPEND "-include;" OUTPUT_VARIABLE _include_all)
+add_test(NAME guard.core_dependencies
+  COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include} ${_include_all} -M -x c++ ${CMAKE_CURRENT_SOURCE_DIR}/empty.cpp)
+set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
+  FAIL_REGULAR_EXPRESSION "/mpi\\.h;/mpicxx\\.h;/snappy[a-z-]*\\.h;/(tbb|oneapi)/[a-z_/]*\\.h")
+
+# Two translation units that use everything make one program; the headers stay quiet under stricter warnings.
+add_executable(test_odr odr/first.cpp odr/second.cpp)
+target_link_libraries(test_odr PRIVATE dfb_developer)
+target_compile_options(test_odr PRIVATE -Wconversion)
+add_test(NAME guard.odr COMMAND test_odr)
+set_tests_properties(guard.odr PROPERTIES LABELS guard)
+
+# Wrong use gives our message, as the first error. The cases stand in the files: a line
+#   #elif defined(CASE_<NAME>) // expect: <message>      or   // flags: <flag>... expect: <message>
+# is all that a new one needs here. Without a case the file is the control, which must compile.
+function(_dfb_add_compile_fail file)
+  set(path ${CMAKE_CURRENT_SOURCE_DIR}/compile_fail/${file}.cpp)
+  set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS ${path})
+  add_test(NAME compile_fail.${file}.control COMMAND ${_compile} -I${_include} ${path})
+  set_tests_properties(compile_fail.${file}.control PROPERTIES LABELS compile_fail)
+  file(STRINGS ${path} lines REGEX "defined\\(CASE_")
+  foreach(line IN LISTS lines)
+    if(NOT line MATCHES "^#(el)?if defined\\(CASE_([A-Z0-9_]+)\\) // (flags: (.*) )?expect: (.+)$")
+      message(FATAL_ERROR "${path}: no case and its message in '${line}'")
+    endif()
+    set(case ${CMAKE_MATCH_2})
+    separate_arguments(flags UNIX_COMMAND "${CMAKE_MATCH_4}")
+    string(REGEX REPLACE "([][+.*()^?|$\\])" "\\\\\\1" message "${CMAKE_MATCH_5}")
+    string(TOLOWER ${case} name)
+    add_test(NAME compile_fail.${file}.${name}
+      COMMAND ${_compile} -Wfatal-errors -I${_include} ${flags} -DCASE_${case} ${path})
+    set_tests_properties(compile_fail.${file}.${name} PROPERTIES
+      LABELS compile_fail PASS_REGULAR_EXPRESSION "error:[^\n]*${message}")
+  endforeach()
+endfunction()
+
+file(GLOB _files CONFIGURE_DEPENDS compile_fail/*.cpp)
+foreach(_file IN LISTS _files)
+  get_filename_component(_file ${_file} NAME_WE)
+  _dfb_add_compile_fail(${_file})
+endforeach()

@@ -1,0 +1,932 @@
+// What goes wrong: every call that can not be right, every failure of a frame, and ranks that leave. The same error on
+// every rank, no hang, and the next frame is right.
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <functional>
+#include <future>
+#include <limits>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using scene::Loop;
+using scene::Picture;
+using scene::Scene;
+
+// A transport whose messages a test can look at, change and hold back.
+struct Switchboard {
+    enum class Verdict { Pass, Hold };
+    // Called for each message to another rank, from any thread.
+    std::function<Verdict(int from, int to, const dfb::detail::MessageHeader&, dfb::Buffer&)> inspect;
+    std::atomic<std::int64_t> sent{0};
+
+    std::mutex mutex;
+    std::vector<std::function<void()>> held;
+
+    void release()
+    {
+        std::vector<std::function<void()>> all;
+        {
+            const std::lock_guard<std::mutex> lock(mutex);
+            all.swap(held);
+        }
+        for (const auto& send : all)
+            send();
+    }
+};
+
+class InspectedTransport {
+public:
+    struct Communicator {
+        dfb::InprocCommunicator inner;
+        std::shared_ptr<Switchboard> board;
+    };
+    static constexpr const char* name = "inspected";
+
+    InspectedTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
+        : board_(c.board), inner_(c.inner, std::move(pool), progress)
+    {
+    }
+    int rank() const { return inner_.rank(); }
+    int size() const { return inner_.size(); }
+    bool needsPolling() const { return inner_.needsPolling(); }
+    void start(dfb::TransportHandler& handler) { inner_.start(handler); }
+    void send(int destination, dfb::Buffer&& message)
+    {
+        ++board_->sent;
+        if (board_->inspect) {
+            const auto header = dfb::detail::loadAs<dfb::detail::MessageHeader>(message.data());
+            if (board_->inspect(rank(), destination, header, message) == Switchboard::Verdict::Hold) {
+                const auto kept = std::make_shared<dfb::Buffer>(std::move(message));
+                const std::lock_guard<std::mutex> lock(board_->mutex);
+                board_->held.push_back([this, destination, kept] { inner_.send(destination, std::move(*kept)); });
+                return;
+            }
+        }
+        inner_.send(destination, std::move(message));
+    }
+    bool poll() { return inner_.poll(); }
+    bool quiet() const { return inner_.quiet(); }
+    void stop(bool orderly) { inner_.stop(orderly); }
+
+private:
+    std::shared_ptr<Switchboard> board_;
+    dfb::InprocTransport inner_;
+};
+
+using Blend = dfb::BasicAlphaBlend<16>;
+template <class TileOp, class PixelOp = dfb::NoPixelOp>
+using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
+template <class TileOp>
+using InspectedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, InspectedTransport>;
+
+// One worker: tasks run in the order of arrival.
+dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
+{
+    dfb::FrameBufferConfig config;
+    config.width = s.width;
+    config.height = s.height;
+    config.format = dfb::OutputFormat::RGBA32F;
+    config.depth = true;
+    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+    return config;
+}
+
+// What came out of a call, as text.
+template <class Call>
+std::string outcomeOf(const Call& call)
+{
+    try {
+        call();
+    } catch (const dfb::FrameError& e) {
+        return std::string("FrameError: ") + e.what();
+    } catch (const dfb::InvalidArgument& e) {
+        return std::string("InvalidArgument: ") + e.what();
+    } catch (const dfb::TransportError& e) {
+        return std::string("TransportError: ") + e.what();
+    } catch (const std::exception& e) {
+        return std::string("exception: ") + e.what();
+    }
+    return "fine";
+}
+
+bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
+
+bool allSame(const std::vector<std::string>& texts)
+{
+    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
+}
+
+std::string joined(const std::vector<std::string>& texts)
+{
+    std::string all;
+    for (const std::string& t : texts)
+        all += "\n  " + t;
+    return all;
+}
+
+// The errors that each rank got out of one bad frame, and whether the good frame after it was right.
+struct BadFrame {
+    std::vector<std::string> texts;
+    std::size_t wrongAfter = 1;
+};
+
+// `frame(fb)` runs the bad frame on each rank and may throw; after it comes a good one.
+template <class Fb, class Frame>
+BadFrame badFrame(int ranks, const Scene& s, const dfb::FrameBufferConfig& config, const Frame& frame)
+{
+    BadFrame result;
+    result.texts.resize(static_cast<std::size_t>(ranks));
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        auto mine = config;
+        mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        Fb fb(communicator, mine);
+        result.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { frame(fb); });
+        const auto report = scene::renderLoop(fb, s, Loop::Listing3);
+        if (fb.isDisplayRank())
+            result.wrongAfter = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+    });
+    return result;
+}
+
+// Sends one tile.
+template <class Frame, class Tile>
+void send(Frame& frame, Tile& tile, int index, int generation, std::uint32_t source, std::uint16_t part, int children)
+{
+    frame.start(tile, index);
+    tile.generation = generation;
+    tile.source = source;
+    tile.part = part;
+    tile.children = children;
+    frame.setTile(tile);
+}
+
+// An AlphaBlend that throws where it is told to.
+struct Faulty : dfb::BasicAlphaBlend<16> {
+    enum class Where { Nowhere, NewFrame, Add, Finish };
+    struct FrameData {
+        Where where = Where::Nowhere;
+        int rank = -1;
+        bool standard = true; // throw a std::exception
+    };
+    void newFrame(const dfb::TileInfo& info, const FrameData& data)
+    {
+        data_ = data;
+        rank_ = info.rank;
+        failIn(Where::NewFrame);
+        BasicAlphaBlend::newFrame(info);
+    }
+    void add(dfb::Fragment&& fragment)
+    {
+        failIn(Where::Add);
+        BasicAlphaBlend::add(std::move(fragment));
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        failIn(Where::Finish);
+        BasicAlphaBlend::finish(out);
+    }
+
+private:
+    void failIn(Where where) const
+    {
+        if (data_.where != where || data_.rank != rank_)
+            return;
+        if (data_.standard)
+            throw std::runtime_error("the op broke");
+        throw 5;
+    }
+    FrameData data_;
+    int rank_ = -1;
+};
+static_assert(dfb::is_tile_op_v<Faulty>);
+
+template <bool Pointwise>
+struct FaultyPixelOp {
+    static constexpr bool pointwise = Pointwise;
+    struct FrameData {
+        int rank = -1;
+    };
+    int rank = -1;
+    FrameData data{};
+
+    void newFrame(const FrameData& d) { data = d; }
+    void process(dfb::PixelTile&) const
+    {
+        if (rank == data.rank)
+            throw std::runtime_error("the pixel op broke");
+    }
+};
+
+// A codec that copies.
+struct CopyCodec final : dfb::Codec {
+    std::uint8_t id() const noexcept override { return 9; }
+    std::size_t bound(std::size_t byteCount) const override { return byteCount; }
+    std::size_t compress(const std::byte* in, std::size_t byteCount, std::byte* out) const override
+    {
+        std::copy(in, in + byteCount, out);
+        return byteCount;
+    }
+    bool decompress(const std::byte* in, std::size_t byteCount, std::byte* out, std::size_t raw) const override
+    {
+        std::copy(in, in + std::min(byteCount, raw), out);
+        return byteCount == raw;
+    }
+};
+
+// What each rank got out of making a framebuffer when `change(rank, config)` was done to its configuration. A good one on the
+// same communicator follows.
+std::vector<std::string> constructed(int ranks, const std::function<void(int, dfb::FrameBufferConfig&)>& change)
+{
+    std::vector<std::string> texts(static_cast<std::size_t>(ranks));
+    const Scene s = scene::makeScene(3);
+    std::size_t wrongAfter = 1;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(s);
+        change(communicator.rank(), config);
+        texts[static_cast<std::size_t>(communicator.rank())] = outcomeOf([&] { FrameBuffer<Blend> fb(communicator, config); });
+        FrameBuffer<Blend> fb(communicator, configOf(s));
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
+        if (fb.isDisplayRank())
+            wrongAfter = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+    });
+    if (wrongAfter > 0)
+        throw std::logic_error("the framebuffer after the bad one gives a wrong image");
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("A tile that can not be right is refused at once, and nothing is sent", "[errors]")
+{
+    const Scene s = scene::makeScene(4);
+    std::vector<std::string> texts;
+    std::int64_t sentMeanwhile = -1;
+    std::size_t wrong = 1;
+    const auto board = std::make_shared<Switchboard>();
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(s);
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        using Fb = InspectedFrameBuffer<Blend>;
+        Fb fb({communicator, board}, config);
+        // The frame comes to rank 0 when the bad calls are over: what is sent meanwhile was sent by them.
+        static std::promise<void>* over = nullptr;
+        std::promise<void> promise;
+        if (fb.rank() == 1)
+            over = &promise;
+        fb.allReduce({0}, Fb::Reduce::Sum);
+        if (fb.rank() == 0)
+            over->get_future().wait();
+        if (fb.rank() == 1) {
+            auto frame = fb.begin(scene::paramsOf(s));
+            auto tile = std::make_unique<Fb::Tile>();
+            const std::int64_t before = board->sent;
+            const auto tryTile = [&](const std::function<void(dfb::TileHeader&)>& change) {
+                frame.start(*tile, 3);
+                tile->pixel(0, 0)[3] = 1;
+                change(*tile);
+                texts.push_back(outcomeOf([&] { frame.setTile(*tile); }));
+            };
+            tryTile([](dfb::TileHeader& t) { t.frame += 1; });
+            tryTile([](dfb::TileHeader& t) { t.frame = -1; });
+            tryTile([](dfb::TileHeader& t) { t.region.x1 -= 1; });
+            tryTile([](dfb::TileHeader& t) { t.tile = 4; }); // the region is another's
+            tryTile([](dfb::TileHeader& t) { t.tile = -1; });
+            tryTile([](dfb::TileHeader& t) { t.tile = 28; });
+            tryTile([](dfb::TileHeader& t) { t.pass = 1; });
+            tryTile([](dfb::TileHeader& t) { t.pass = -1; });
+            tryTile([](dfb::TileHeader& t) { t.generation = -1; });
+            tryTile([](dfb::TileHeader& t) { t.generation = 1 << 20; });
+            tryTile([](dfb::TileHeader& t) { t.children = -1; });
+            texts.push_back(outcomeOf([&] { frame.start(*tile, 28); }));
+            texts.push_back(outcomeOf([&] { frame.start(*tile, -1); }));
+            texts.push_back(outcomeOf([&] { frame.start(*tile, 0, 1); }));
+            texts.push_back(outcomeOf([&] { frame.declare({}); }));
+            texts.push_back(outcomeOf([&] { fb.begin(); }));
+            sentMeanwhile = board->sent - before;
+            promise.set_value();
+            // None of it has harmed the frame.
+            for (int index = 0; index < 28; ++index)
+                for (const dfb::Brick& brick : s.bricks) {
+                    frame.start(*tile, index);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    scene::renderBrick(s, brick, *tile);
+                    frame.setTile(*tile);
+                }
+            frame.end();
+        } else {
+            auto frame = fb.begin(scene::paramsOf(s));
+            auto tile = std::make_unique<Fb::Tile>();
+            for (int index = 0; index < 28; ++index) {
+                frame.start(*tile, index);
+                tile->children = 4;
+                frame.setTile(*tile);
+            }
+            const auto report = frame.end();
+            wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+        }
+    });
+    REQUIRE(texts.size() == 16);
+    for (const std::string& text : texts) {
+        INFO(text);
+        CHECK(has(text, "InvalidArgument"));
+    }
+    CHECK(has(texts[0], "frame 2"));
+    CHECK(has(texts[10], "-1 children"));
+    CHECK(has(texts[10], "tile 3"));
+    CHECK(sentMeanwhile == 0);
+    CHECK(wrong == 0);
+}
+
+TEST_CASE("Frame parameters that can not be are refused", "[errors]")
+{
+    std::vector<std::string> texts;
+    const Scene s = scene::makeScene(1);
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(s));
+        dfb::FrameParams params;
+        params.passes = 0;
+        texts.push_back(outcomeOf([&] { fb.begin(params); }));
+        params.passes = 1;
+        params.declarationKey = 5;
+        texts.push_back(outcomeOf([&] { fb.begin(params); }));
+        params.declared = true;
+        auto frame = fb.begin(params);
+        texts.push_back(outcomeOf([&] { frame.declare({{28, 0, 0}}); }));
+        texts.push_back(outcomeOf([&] { frame.declare({{-1, 0, 0}}); }));
+        frame.declare({});
+        texts.push_back(outcomeOf([&] { frame.declare({}); }));
+        frame.end();
+        auto second = fb.begin(params); // the declaration still holds
+        texts.push_back(second.wantsDeclaration() ? "wants one" : outcomeOf([&] { second.declare({}); }));
+        second.end();
+    });
+    for (const std::string& text : texts) {
+        INFO(text);
+        CHECK(has(text, "InvalidArgument"));
+    }
+}
+
+TEST_CASE("A wrong or differing configuration is refused on every rank", "[errors]")
+{
+    const auto refused = [](const std::function<void(int, dfb::FrameBufferConfig&)>& change) {
+        for (const int ranks : {2, 5}) {
+            const auto texts = constructed(ranks, change);
+            UNSCOPED_INFO(joined(texts));
+            if (!allSame(texts) || !has(texts.front(), "InvalidArgument"))
+                return false;
+        }
+        return true;
+    };
+    // Wrong on all, or on one.
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.width = 0; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.height = 65537; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.displayRank = -1; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.displayRank = 5; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.width = rank == 1 ? -7 : c.width; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) {
+        if (rank == 1)
+            c.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks; };
+    }));
+    // Different on one.
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.width += rank == 1; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.height += rank == 0; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.format = rank == 1 ? dfb::OutputFormat::RGBA8 : c.format; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.depth = rank != 1; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.displayRank = rank == 1; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.ownerMap = rank == 1 ? dfb::hashOwner : dfb::linearOwner; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.codec = rank == 1 ? std::make_shared<CopyCodec>() : nullptr; }));
+
+    std::vector<std::string> texts(3);
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        const auto config = configOf(scene::makeScene(1));
+        texts[static_cast<std::size_t>(communicator.rank())] = outcomeOf([&] {
+            if (communicator.rank() == 2)
+                FrameBuffer<dfb::BasicAlphaBlend<8>>(communicator, config);
+            else
+                FrameBuffer<Blend>(communicator, config);
+        });
+    });
+    INFO(joined(texts));
+    CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
+}
+
+TEST_CASE("Different framebuffer ids are refused on every rank", "[errors]")
+{
+    const auto texts = constructed(3, [](int rank, dfb::FrameBufferConfig& c) { c.id = rank == 1 ? 8 : 7; });
+    INFO(joined(texts));
+    CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
+}
+
+TEST_CASE("A frame begun with different backgrounds fails on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(4);
+    const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+        Scene other = s;
+        other.background[2] = fb.rank() == 1 ? 0.75f : 0.5f;
+        scene::renderLoop(fb, other, Loop::Listing3);
+    });
+    INFO(joined(bad.texts));
+    CHECK(allSame(bad.texts));
+    CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
+    CHECK(bad.wrongAfter == 0);
+}
+
+TEST_CASE("An exception in a renderer fails the frame on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    for (const bool declared : {true, false})
+        for (int culprit = 0; culprit < 3; ++culprit) {
+            const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+                const auto render = [&](auto& tile) {
+                    if (fb.rank() == culprit && tile.tile > 3)
+                        throw std::runtime_error("the renderer broke");
+                };
+                if (declared)
+                    dfb::renderDataParallel(fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {97, 61, 1}}}}),
+                                            scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) { render(tile); });
+                else
+                    dfb::renderImageParallel(fb, render);
+            });
+            INFO("rank " << culprit << joined(bad.texts));
+            CHECK(allSame(bad.texts));
+            CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code"));
+            CHECK(has(bad.texts[0], "rank " + std::to_string(culprit)));
+            CHECK(has(bad.texts[0], "the renderer broke"));
+            CHECK(bad.wrongAfter == 0);
+        }
+}
+
+TEST_CASE("An exception in a tile operation fails the frame on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    for (const auto where : {Faulty::Where::NewFrame, Faulty::Where::Add, Faulty::Where::Finish})
+        for (int culprit = 0; culprit < 3; ++culprit)
+            for (const bool standard : {true, false}) {
+                const BadFrame bad = badFrame<FrameBuffer<Faulty>>(3, s, configOf(s), [&](auto& fb) {
+                    dfb::renderDataParallel(
+                        fb, dfb::World(scene::bricksOf(s, fb.rank(), 3)), scene::FlatCamera(),
+                        [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, {},
+                        {where, culprit, standard});
+                });
+                INFO("in " << static_cast<int>(where) << " on rank " << culprit << joined(bad.texts));
+                CHECK(allSame(bad.texts));
+                CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code"));
+                CHECK(has(bad.texts[0], "rank " + std::to_string(culprit)));
+                CHECK(has(bad.texts[0], "tile "));
+                CHECK(has(bad.texts[0], standard ? "the op broke" : "not a std::exception"));
+                CHECK(bad.wrongAfter == 0);
+            }
+}
+
+namespace {
+
+// A bad frame of a framebuffer with a FaultyPixelOp that throws on one rank.
+template <bool Pointwise>
+BadFrame brokenPixelOp(int culprit, const Scene& s)
+{
+    BadFrame bad;
+    bad.texts.resize(3);
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        using Fb = FrameBuffer<Blend, FaultyPixelOp<Pointwise>>;
+        Fb fb(communicator, configOf(s), {communicator.rank(), {}});
+        const dfb::World world(scene::bricksOf(s, fb.rank(), 3));
+        const auto render = [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); };
+        bad.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            dfb::renderDataParallel(fb, world, scene::FlatCamera(), render, scene::paramsOf(s), {}, {culprit});
+        });
+        const auto report = dfb::renderDataParallel(fb, world, scene::FlatCamera(), render, scene::paramsOf(s));
+        if (fb.isDisplayRank())
+            bad.wrongAfter = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+    });
+    return bad;
+}
+
+} // namespace
+
+TEST_CASE("An exception in a pixel operation fails the frame on every rank", "[errors]")
+{
+    for (const int bricks : {9, 0}) {
+        const Scene s = scene::makeScene(bricks);
+        for (int culprit = 0; culprit < 3; ++culprit) {
+            const BadFrame bad = brokenPixelOp<false>(culprit, s);
+            INFO("not pointwise, " << bricks << " bricks, rank " << culprit << joined(bad.texts));
+            CHECK(allSame(bad.texts));
+            CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code: rank " + std::to_string(culprit)));
+            CHECK(has(bad.texts[0], "the pixel op broke"));
+            CHECK(bad.wrongAfter == 0);
+        }
+    }
+    const Scene s = scene::makeScene(9);
+    for (int culprit = 0; culprit < 3; ++culprit) {
+        const BadFrame bad = brokenPixelOp<true>(culprit, s);
+        INFO("pointwise, rank " << culprit << joined(bad.texts));
+        CHECK(allSame(bad.texts));
+        CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code: rank " + std::to_string(culprit)));
+        CHECK(bad.wrongAfter == 0);
+    }
+}
+
+TEST_CASE("An exception of a pointwise pixel operation on the background fails the frame on every rank", "[errors]")
+{
+    // Only the display rank computes the background colour.
+    const BadFrame bad = brokenPixelOp<true>(0, scene::makeScene(0));
+    INFO(joined(bad.texts));
+    CHECK(allSame(bad.texts));
+    CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code: rank 0"));
+    CHECK(bad.wrongAfter == 0);
+}
+
+TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    for (int culprit = 0; culprit < 3; ++culprit)
+        for (const bool byException : {false, true}) {
+            const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+                if (fb.rank() != culprit) {
+                    scene::renderLoop(fb, s, Loop::Declared);
+                    return;
+                }
+                dfb::FrameParams params = scene::paramsOf(s);
+                params.declared = true;
+                auto frame = fb.begin(params);
+                if (byException)
+                    throw std::runtime_error("something else broke");
+            });
+            INFO("rank " << culprit << joined(bad.texts));
+            for (int rank = 0; rank < 3; ++rank) {
+                const std::string& text = bad.texts[static_cast<std::size_t>(rank)];
+                if (rank == culprit)
+                    CHECK(text == (byException ? "exception: something else broke" : "fine"));
+                else
+                    CHECK(has(text, "FrameError: dfb: frame cancelled: rank " + std::to_string(culprit)));
+            }
+            CHECK(bad.wrongAfter == 0);
+        }
+}
+
+TEST_CASE("Frames that all ranks leave, many times over", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    std::size_t wrong = 1;
+    std::int64_t frame = 0;
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(s, 2));
+        for (int i = 0; i < 50; ++i) {
+            auto open = fb.begin();
+            auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
+            for (int index = 0; index < 28 && i % 2 == 0; ++index)
+                send(open, *tile, index, 1, static_cast<std::uint32_t>(fb.rank()), 0, 0);
+        }
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
+        if (fb.isDisplayRank()) {
+            wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+            frame = report.frame;
+        }
+    });
+    CHECK(wrong == 0);
+    CHECK(frame == 51);
+}
+
+TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are named", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    const int index = 5;
+    struct Mistake {
+        const char* name;
+        std::function<void(const std::function<void(int, std::uint32_t, std::uint16_t, int)>&)> inputs; // generation, source, part, children
+        std::vector<std::string> parts;
+    };
+    const std::vector<Mistake> mistakes{
+        {"too many", [](const auto& in) { in(1, 50, 0, 0), in(1, 51, 0, 0), in(1, 52, 0, 0), in(0, 9, 0, 2); },
+         {"too many inputs", "generation 1", "expected 2, got 3", "source 5"}},
+        {"too many roots", [](const auto& in) { in(0, 9, 0, 1), in(0, 8, 0, 1); },
+         {"too many inputs", "generation 0", "source 8", "expected 1, got 2"}},
+        {"duplicate", [](const auto& in) { in(1, 50, 3, 0), in(1, 50, 3, 0), in(0, 9, 0, 2); },
+         {"duplicate input", "generation 1", "source 50", "expected 1, got 2"}},
+        {"unannounced", [](const auto& in) { in(2, 50, 0, 0), in(1, 51, 0, 0), in(0, 9, 0, 1); },
+         {"unannounced input", "generation 2", "source 50", "expected 0, got 1"}},
+    };
+    for (const Mistake& mistake : mistakes)
+        for (int culprit = 0; culprit < 3; ++culprit) {
+            auto config = configOf(s);
+            config.ownerMap = [index](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
+            const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
+                auto frame = fb.begin();
+                auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
+                if (fb.rank() == 0)
+                    for (int other = 0; other < 28; ++other)
+                        if (other != index)
+                            send(frame, *tile, other, 0, 0, 0, 0);
+                if (fb.rank() == culprit)
+                    mistake.inputs([&](int generation, std::uint32_t source, std::uint16_t part, int children) {
+                        send(frame, *tile, index, generation, source, part, children);
+                    });
+                frame.end();
+            });
+            INFO(mistake.name << " from rank " << culprit << joined(bad.texts));
+            CHECK(allSame(bad.texts));
+            // The owner noticed.
+            CHECK(has(bad.texts[0], "rank 1, frame 1, tile " + std::to_string(index) + ", pass 0"));
+            for (const std::string& part : mistake.parts)
+                CHECK(has(bad.texts[0], part));
+            CHECK(bad.wrongAfter == 0);
+        }
+}
+
+TEST_CASE("An input that comes when its owner has already voted does not vanish", "[errors]")
+{
+    // One too many, held back until the owner is done: an error, or at least counted as late.
+    const auto board = std::make_shared<Switchboard>();
+    board->inspect = [](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+        const bool extra = header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
+                           && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 99;
+        return from == 1 && extra ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
+    };
+    const Scene s = scene::makeScene(0, 1, 16, 16);
+    std::vector<std::string> texts(3);
+    std::vector<std::int64_t> late(3);
+    std::promise<void> ownerVoted;
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        using Fb = InspectedFrameBuffer<Blend>;
+        auto config = configOf(s);
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 2; };
+        config.format = dfb::OutputFormat::None;
+        Fb fb({communicator, board}, config);
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        fb.allReduce({0}, Fb::Reduce::Sum);
+        if (fb.rank() == 0) {
+            // The first reduction message of rank 2 in the frame is its vote.
+            auto inspect = board->inspect;
+            board->inspect = [&, inspect](int from, int to, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+                if (from == 2 && header.kind == dfb::detail::MessageKind::ReduceUp && header.number == 1)
+                    ownerVoted.set_value();
+                return inspect(from, to, header, message);
+            };
+        }
+        fb.allReduce({0}, Fb::Reduce::Sum);
+        texts[rank] = outcomeOf([&] {
+            auto frame = fb.begin();
+            auto tile = std::make_unique<Fb::Tile>();
+            if (fb.rank() == 2)
+                send(frame, *tile, 0, 0, 2, 0, 0);
+            if (fb.rank() == 1) {
+                send(frame, *tile, 0, 1, 99, 0, 0);
+                ownerVoted.get_future().wait();
+                board->release();
+            }
+            late[rank] += frame.end().lateMessages;
+        });
+        // Late messages are in the next verdict.
+        auto frame = fb.begin();
+        auto tile = std::make_unique<Fb::Tile>();
+        if (fb.rank() == 2)
+            send(frame, *tile, 0, 0, 2, 0, 0);
+        late[rank] += frame.end().lateMessages;
+    });
+    INFO(joined(texts) << "\n  late: " << late[0]);
+    CHECK(allSame(texts));
+    CHECK((late[0] == 1 || has(texts[0], "FrameError: dfb: unannounced input")));
+}
+
+TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    struct Mistake {
+        const char* name;
+        std::vector<dfb::TileInput> declared;
+        std::vector<dfb::TileInput> sent;
+        std::vector<std::string> parts;
+    };
+    const std::vector<Mistake> mistakes{
+        {"another source", {{5, 50, 0}}, {{5, 51, 0}, {5, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
+        {"another part", {{5, 50, 0}}, {{5, 50, 1}, {5, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 50", "expected 0, got 1"}},
+        {"a tile that nobody declared", {{4, 50, 0}}, {{5, 51, 0}, {4, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
+        {"declared twice", {{5, 50, 0}, {5, 50, 0}}, {{5, 50, 0}}, {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
+        {"sent twice", {{5, 50, 0}, {5, 51, 0}}, {{5, 50, 0}, {5, 50, 0}, {5, 51, 0}}, {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
+    };
+    for (const Mistake& mistake : mistakes)
+        for (int culprit = 0; culprit < 3; ++culprit)
+            for (const bool sendFirst : {false, true}) {
+                auto config = configOf(s);
+                config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 4 || tile == 5 ? 1 : 0; };
+                const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
+                    dfb::FrameParams params;
+                    params.declared = true;
+                    auto frame = fb.begin(params);
+                    auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
+                    const auto sendAll = [&] {
+                        for (const dfb::TileInput& input : mistake.sent)
+                            if (fb.rank() == culprit)
+                                send(frame, *tile, input.tile, 1, input.source, input.part, 0);
+                    };
+                    if (sendFirst)
+                        sendAll();
+                    frame.declare(fb.rank() == culprit ? mistake.declared : std::vector<dfb::TileInput>());
+                    if (!sendFirst)
+                        sendAll();
+                    frame.end();
+                });
+                INFO(mistake.name << " on rank " << culprit << (sendFirst ? ", sent before" : ", sent after") << joined(bad.texts));
+                CHECK(allSame(bad.texts));
+                CHECK(has(bad.texts[0], "FrameError"));
+                CHECK(has(bad.texts[0], "rank 1"));
+                for (const std::string& part : mistake.parts)
+                    CHECK(has(bad.texts[0], part));
+                CHECK(bad.wrongAfter == 0);
+            }
+}
+
+TEST_CASE("end() without declare() fails the frame on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    for (int culprit = 0; culprit < 3; ++culprit) {
+        const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+            dfb::FrameParams params;
+            params.declared = true;
+            auto frame = fb.begin(params);
+            if (fb.rank() != culprit)
+                frame.declare({});
+            frame.end();
+        });
+        INFO(joined(bad.texts));
+        CHECK(allSame(bad.texts));
+        CHECK(has(bad.texts[0], "FrameError"));
+        CHECK(has(bad.texts[0], "rank " + std::to_string(culprit)));
+        CHECK(has(bad.texts[0], "declare()"));
+        CHECK(bad.wrongAfter == 0);
+    }
+}
+
+TEST_CASE("A broken message fails the frame on every rank and names its sender", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    const auto board = std::make_shared<Switchboard>();
+    std::atomic<bool> done{false};
+    board->inspect = [&](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+        // The first input from rank 2 loses its last byte.
+        if (from == 2 && header.kind == dfb::detail::MessageKind::Fragment && !done.exchange(true))
+            message.shrink(message.size() - 1);
+        return Switchboard::Verdict::Pass;
+    };
+    std::vector<std::string> texts(3);
+    std::size_t wrong = 1;
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        InspectedFrameBuffer<Blend> fb({communicator, board}, configOf(s));
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
+        if (fb.isDisplayRank())
+            wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+    });
+    INFO(joined(texts));
+    CHECK(done);
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "FrameError: dfb: malformed message"));
+    CHECK(has(texts[0], "from rank 2"));
+    CHECK(wrong == 0);
+}
+
+TEST_CASE("Messages of a frame that is over are counted and do no harm", "[errors]")
+{
+    const Scene s = scene::makeScene(0, 1, 97, 61);
+    const auto board = std::make_shared<Switchboard>();
+    board->inspect = [](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer&) {
+        return from == 1 && header.kind == dfb::detail::MessageKind::Fragment && header.number == 1 ? Switchboard::Verdict::Hold
+                                                                                                  : Switchboard::Verdict::Pass;
+    };
+    std::string first;
+    std::vector<std::int64_t> late;
+    std::vector<std::size_t> wrong;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        using Fb = InspectedFrameBuffer<Blend>;
+        auto config = configOf(s);
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        Fb fb({communicator, board}, config);
+        auto tile = std::make_unique<Fb::Tile>();
+        const auto setAll = [&](Fb::Frame& frame) {
+            for (int index = 0; index < 28; ++index)
+                send(frame, *tile, index, 0, 1, 0, 0);
+        };
+        {
+            // What rank 1 sends is on its way for long; rank 1 gives the frame up, rank 0 waits for its tiles.
+            auto frame = fb.begin();
+            if (fb.rank() == 1)
+                for (int index = 0; index < 5; ++index)
+                    send(frame, *tile, index, 0, 1, 0, 0);
+            else
+                first = outcomeOf([&] { frame.end(); });
+        }
+        fb.allReduce({0}, Fb::Reduce::Sum); // the frame is over on both
+        for (int i = 0; i < 2; ++i) {
+            auto frame = fb.begin(scene::paramsOf(s));
+            if (fb.rank() == 1) {
+                board->release();
+                setAll(frame);
+            }
+            const auto report = frame.end();
+            if (fb.isDisplayRank()) {
+                late.push_back(report.lateMessages);
+                wrong.push_back(scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)));
+            }
+        }
+    });
+    CHECK(has(first, "frame cancelled: rank 1"));
+    CHECK(late == std::vector<std::int64_t>{5, 0});
+    CHECK(wrong == std::vector<std::size_t>(2));
+}
+
+TEST_CASE("A rank that leaves by an exception outside frames: the others get a TransportError", "[errors]")
+{
+    const Scene s = scene::makeScene(6);
+    enum class When { BetweenFrames, BeforeAllReduce, BeforeTheFirstFrame };
+    for (const When when : {When::BetweenFrames, When::BeforeAllReduce, When::BeforeTheFirstFrame})
+        for (const auto loop : {Loop::Listing3, Loop::Declared})
+            for (int culprit = 0; culprit < 4; ++culprit) {
+                std::vector<std::string> texts(4);
+                const std::string thrown = outcomeOf([&] {
+                    dfb::runRanks(4, [&](dfb::InprocCommunicator communicator) {
+                        using Fb = FrameBuffer<Blend>;
+                        const auto rank = static_cast<std::size_t>(communicator.rank());
+                        std::unique_ptr<Fb> fb;
+                        texts[rank] = outcomeOf([&] {
+                            fb = std::make_unique<Fb>(communicator, configOf(s));
+                            if (when != When::BeforeTheFirstFrame)
+                                scene::renderLoop(*fb, s, loop);
+                        });
+                        if (communicator.rank() == culprit)
+                            throw std::runtime_error("out of disk");
+                        if (!fb)
+                            return; // the other left before this rank got that far
+                        texts[rank] = outcomeOf([&] {
+                            if (when == When::BeforeAllReduce)
+                                fb->allReduce({1}, Fb::Reduce::Sum);
+                            else
+                                scene::renderLoop(*fb, s, loop);
+                        });
+                        const std::string again = outcomeOf([&] { fb->begin(); });
+                        if (again.compare(0, 14, "TransportError") != 0)
+                            texts[rank] = "begin() afterwards: " + again;
+                    });
+                });
+                INFO("when " << static_cast<int>(when) << ", rank " << culprit << joined(texts) << "\n  " << thrown);
+                CHECK(thrown == "exception: out of disk");
+                for (int rank = 0; rank < 4; ++rank)
+                    if (rank != culprit) {
+                        const std::string& text = texts[static_cast<std::size_t>(rank)];
+                        CHECK(has(text, "TransportError: dfb: transport failure: rank " + std::to_string(culprit)));
+                        CHECK(has(text, "out of disk"));
+                    }
+            }
+}
+
+TEST_CASE("A rank that leaves before the framebuffer is made", "[errors]")
+{
+    for (const int leaver : {0, 1, 2}) {
+        std::vector<std::string> texts(3);
+        std::promise<void> left, firstGone;
+        const auto leftFuture = left.get_future().share();
+        const auto firstGoneFuture = firstGone.get_future().share();
+        const std::string thrown = outcomeOf([&] {
+            dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+                const int rank = communicator.rank();
+                if (rank == leaver) {
+                    left.set_value();
+                    throw std::runtime_error("no input file");
+                }
+                leftFuture.wait();
+                // One after the other: the second sends to a rank that is gone.
+                const bool first = rank == (leaver == 0 ? 1 : 0);
+                if (!first)
+                    firstGoneFuture.wait();
+                texts[static_cast<std::size_t>(rank)] =
+                    outcomeOf([&] { FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(1))); });
+                if (first)
+                    firstGone.set_value();
+            });
+        });
+        INFO("rank " << leaver << joined(texts) << "\n  " << thrown);
+        CHECK(thrown == "exception: no input file");
+        for (int rank = 0; rank < 3; ++rank)
+            if (rank != leaver)
+                CHECK(has(texts[static_cast<std::size_t>(rank)], "TransportError"));
+    }
+}
+
+TEST_CASE("runRanks refuses a number of ranks that is none", "[errors]")
+{
+    CHECK_THROWS_AS(dfb::runRanks(0, [](dfb::InprocCommunicator) {}), dfb::InvalidArgument);
+    int calls = 0;
+    dfb::runRanks(1, [&](dfb::InprocCommunicator c) { calls += c.rank() == 0 && c.size() == 1; });
+    CHECK(calls == 1);
+}

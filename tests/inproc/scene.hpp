@@ -1,0 +1,253 @@
+// Scene: bricks whose pixels are a pure function of (seed, brick, pass, pixel), the loops that render them on any number
+// of ranks, and the reference image of the same scene. For the tests with ranks in one process and those with MPI.
+#pragma once
+
+#include "../reference.hpp"
+
+#include <dfb/dfb.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace scene {
+
+// Bricks are boxes whose x and y are pixels: FlatCamera looks straight at them.
+struct FlatCamera {
+    dfb::Region project(const dfb::Box3& b, int, int) const
+    {
+        return {static_cast<int>(b.lower.x), static_cast<int>(b.lower.y), static_cast<int>(b.upper.x), static_cast<int>(b.upper.y)};
+    }
+};
+
+struct Scene {
+    int width = 97, height = 61; // primes
+    int passes = 1;
+    std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
+    std::uint64_t seed = 1;
+    std::vector<dfb::Brick> bricks;
+};
+
+inline std::uint64_t mix(std::uint64_t h)
+{
+    h += 0x9e3779b97f4a7c15u;
+    h = (h ^ (h >> 30)) * 0xbf58476d1ce4e5b9u;
+    h = (h ^ (h >> 27)) * 0x94d049bb133111ebu;
+    return h ^ (h >> 31);
+}
+
+// `count` bricks, some of which overlap on the image, the first over all of it, the rest in part of it: some tiles stay
+// background where count > 1 and the first is left out.
+inline Scene makeScene(int brickCount, std::uint64_t seed = 1, int width = 97, int height = 61, int passes = 1)
+{
+    Scene s;
+    s.width = width, s.height = height, s.passes = passes, s.seed = seed;
+    for (int i = 0; i < brickCount; ++i) {
+        const std::uint64_t h = mix(seed * 131 + static_cast<std::uint64_t>(i));
+        const int w = std::max(1, static_cast<int>(h % static_cast<std::uint64_t>(width)) / 2 + width / 8);
+        const int v = std::max(1, static_cast<int>((h >> 16) % static_cast<std::uint64_t>(height)) / 2 + height / 8);
+        const int x = static_cast<int>((h >> 32) % static_cast<std::uint64_t>(width));
+        const int y = static_cast<int>((h >> 48) % static_cast<std::uint64_t>(height));
+        s.bricks.push_back({static_cast<std::uint32_t>(10 + 3 * i),
+                            {{static_cast<float>(x), static_cast<float>(y), 0},
+                             {static_cast<float>(std::min(width, x + w)), static_cast<float>(std::min(height, y + v)), 1}}});
+    }
+    return s;
+}
+
+// What a brick has at a pixel; nothing where it is not, or has a hole.
+inline std::optional<reference::Sample> sampleOf(const Scene& s, const dfb::Brick& brick, int pass, int x, int y)
+{
+    if (!FlatCamera().project(brick.bounds, s.width, s.height).contains(x, y))
+        return std::nullopt;
+    const std::uint64_t h = mix(mix(mix(s.seed ^ mix(brick.id)) + static_cast<std::uint64_t>(pass)) + static_cast<std::uint64_t>(y) * 65536
+                                + static_cast<std::uint64_t>(x));
+    if (h % 8 == 0)
+        return std::nullopt;
+    reference::Sample sample;
+    sample.source = brick.id;
+    sample.depth = static_cast<float>((h >> 8) % 5); // many ties
+    const auto part = [h](int shift) { return static_cast<float>((h >> shift) & 0x3ff) / 1024.0f; };
+    const float alpha = h % 32 == 1 ? 0.0f : h % 32 == 2 ? 1.0f : part(12);
+    sample.rgba = {part(22) * (alpha > 0 ? alpha : 1), part(32) * alpha, part(42) * alpha, alpha};
+    if (h % 64 == 3)
+        sample.rgba = {1e-41f, 0, 0, 0}; // a denormal
+    return sample;
+}
+
+template <class Tile>
+void renderBrick(const Scene& s, const dfb::Brick& brick, Tile& tile)
+{
+    for (int y = tile.region.y0; y < tile.region.y1; ++y)
+        for (int x = tile.region.x0; x < tile.region.x1; ++x)
+            if (const auto sample = sampleOf(s, brick, tile.pass, x, y)) {
+                const int px = x - tile.region.x0, py = y - tile.region.y0;
+                std::copy(sample->rgba.begin(), sample->rgba.end(), tile.pixel(px, py));
+                tile.depth[py * Tile::size + px] = sample->depth;
+            }
+}
+
+inline dfb::FrameParams paramsOf(const Scene& s)
+{
+    dfb::FrameParams params;
+    params.background = s.background;
+    params.passes = s.passes;
+    return params;
+}
+
+// The bricks of one rank. Different values of `deal` deal them out differently; -1 gives all to the last rank.
+inline std::vector<dfb::Brick> bricksOf(const Scene& s, int rank, int rankCount, int deal = 0)
+{
+    std::vector<dfb::Brick> mine;
+    for (std::size_t i = 0; i < s.bricks.size(); ++i) {
+        const auto n = static_cast<std::uint64_t>(rankCount);
+        const std::uint64_t owner = deal < 0 ? n - 1 : deal == 0 ? i % n : mix(i * 7 + static_cast<std::uint64_t>(deal)) % n;
+        if (static_cast<int>(owner) == rank)
+            mine.push_back(s.bricks[i]);
+    }
+    return mine;
+}
+
+enum class Loop {
+    Listing3,    // by hand, as in the paper: the owner sends a background tile that announces the bricks
+    Declared,    // renderDataParallel
+    ImageOwned,  // renderImageParallel of owned tiles; the scene has one brick
+    ImageDealt   // renderImageParallel of tiles dealt out otherwise
+};
+
+inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
+
+// Listing 3 of the paper.
+template <class FrameBuffer>
+dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb::Brick>& mine)
+{
+    auto frame = fb.begin(paramsOf(s));
+    const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+    const auto meets = [&](const dfb::Brick& brick, int index) {
+        return !dfb::intersection(FlatCamera().project(brick.bounds, s.width, s.height), fb.layout().region(index)).empty();
+    };
+    for (int pass = 0; pass < s.passes; ++pass) {
+        for (int index : fb.ownedTiles()) {
+            frame.start(*tile, index, pass);
+            tile->children = static_cast<int>(
+                std::count_if(s.bricks.begin(), s.bricks.end(), [&](const dfb::Brick& b) { return meets(b, index); }));
+            frame.setTile(*tile);
+        }
+        for (int index = 0; index < fb.layout().tileCount(); ++index)
+            for (const dfb::Brick& brick : mine)
+                if (meets(brick, index)) {
+                    frame.start(*tile, index, pass);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    renderBrick(s, brick, *tile);
+                    frame.setTile(*tile);
+                }
+    }
+    return frame.end();
+}
+
+template <class FrameBuffer>
+dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal = 0, std::uint64_t declarationKey = 0)
+{
+    const auto mine = bricksOf(s, fb.rank(), fb.size(), deal);
+    const auto render = [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); };
+    switch (loop) {
+    case Loop::Listing3: return listing3(fb, s, mine);
+    case Loop::ImageOwned: return dfb::renderImageParallel(fb, render, paramsOf(s));
+    case Loop::ImageDealt: {
+        std::vector<int> tiles;
+        for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+            if ((tile + tile / 5 + deal) % fb.size() == fb.rank())
+                tiles.push_back(tile);
+        return dfb::renderImageParallel(fb, tiles, render, paramsOf(s));
+    }
+    case Loop::Declared: break;
+    }
+    dfb::FrameParams params = paramsOf(s);
+    params.declarationKey = declarationKey;
+    return dfb::renderDataParallel(fb, dfb::World(mine), FlatCamera(),
+                                   [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); }, params);
+}
+
+// What the display rank had after a frame.
+struct Picture {
+    int width = 0, height = 0;
+    dfb::OutputFormat format = dfb::OutputFormat::None;
+    std::vector<std::byte> bytes;
+    std::vector<float> depth;
+    dfb::FrameReport report;
+
+    explicit Picture() = default;
+    Picture(const dfb::Image& image, const dfb::FrameReport& r)
+        : width(image.width()), height(image.height()), format(image.format()), report(r)
+    {
+        if (!image.empty())
+            bytes.assign(image.bytes(), image.bytes() + image.pixelCount() * dfb::bytesPerPixel(format));
+        if (image.hasDepth())
+            depth.assign(image.depth(), image.depth() + image.pixelCount());
+    }
+
+    std::uint64_t hash() const
+    {
+        return reference::hashOf(bytes.data(), bytes.size()) ^ 3 * reference::hashOf(depth.data(), depth.size() * sizeof(float));
+    }
+    float value(std::size_t i) const
+    {
+        float v = 0;
+        std::memcpy(&v, bytes.data() + i * sizeof v, sizeof v);
+        return v;
+    }
+};
+
+inline std::vector<reference::Pixel> referenceOf(const Scene& s)
+{
+    std::vector<reference::Pixel> result;
+    for (int y = 0; y < s.height; ++y)
+        for (int x = 0; x < s.width; ++x) {
+            std::vector<reference::Pixel> passes;
+            for (int pass = 0; pass < s.passes; ++pass) {
+                std::vector<reference::Sample> samples;
+                for (const dfb::Brick& brick : s.bricks)
+                    if (const auto sample = sampleOf(s, brick, pass, x, y))
+                        samples.push_back(*sample);
+                passes.push_back(reference::composite(std::move(samples), s.background));
+            }
+            result.push_back(reference::mean(passes));
+        }
+    return result;
+}
+
+// Number of values that are off: floats by more than 1 ulp, bytes and depths at all. All of them if the size is wrong.
+inline std::size_t wrongValues(const Picture& picture, const std::vector<reference::Pixel>& expected)
+{
+    const std::size_t count = expected.size();
+    if (picture.bytes.size() != count * dfb::bytesPerPixel(picture.format) || picture.bytes.empty()
+        || (!picture.depth.empty() && picture.depth.size() != count))
+        return 4 * count;
+    std::size_t wrong = 0;
+    for (std::size_t i = 0; i < count; ++i) {
+        for (std::size_t c = 0; c < 4; ++c) {
+            const reference::Exact exact = expected[i].rgba[c];
+            if (picture.format == dfb::OutputFormat::RGBA32F) {
+                wrong += reference::ulpsBetween(picture.value(4 * i + c), reference::toFloat(exact)) > 1;
+            } else {
+                const bool srgb = picture.format == dfb::OutputFormat::SRGBA8 && c < 3;
+                wrong += static_cast<std::uint8_t>(picture.bytes[4 * i + c])
+                         != (srgb ? reference::toSrgb8(exact) : reference::toUnorm8(exact));
+            }
+        }
+        wrong += !picture.depth.empty() && picture.depth[i] != expected[i].depth;
+    }
+    return wrong;
+}
+
+} // namespace scene

@@ -1,0 +1,83 @@
+# Tests of the package: installs dfb, then builds and runs a stranger's project (CMakeLists.txt beside this file)
+# against it in every way that the README promises.
+set(_stage ${CMAKE_CURRENT_BINARY_DIR}/stage)
+set(_others ${DFB_COMPONENTS})
+list(REMOVE_ITEM _others core)
+
+# Emptied first: an install over an older one can leave stale files.
+add_test(NAME package.clean COMMAND ${CMAKE_COMMAND} -E rm -rf ${_stage})
+set_tests_properties(package.clean PROPERTIES LABELS package FIXTURES_SETUP dfb_stage_clean)
+add_test(NAME package.install COMMAND ${CMAKE_COMMAND} --install ${PROJECT_BINARY_DIR} --prefix ${_stage})
+set_tests_properties(package.install PROPERTIES LABELS package
+  FIXTURES_REQUIRED dfb_stage_clean FIXTURES_SETUP dfb_stage)
+
+# dfb_add_package_test(<name> HOW <how> [VERSION <version>] [COMPONENTS <component>...] [EXPECT <component>...]
+#                      [WITHOUT <package>...] [OPTIONS <option>...] [FAILS <regex>])
+# WITHOUT: packages that are not found, as on a machine that does not have them.
+function(dfb_add_package_test name)
+  cmake_parse_arguments(PARSE_ARGV 1 A "" "HOW;VERSION;FAILS" "COMPONENTS;EXPECT;WITHOUT;OPTIONS")
+  list(JOIN A_COMPONENTS "," components)
+  list(JOIN A_EXPECT "," expect)
+  list(TRANSFORM A_WITHOUT REPLACE "(.+)" "-DCMAKE_DISABLE_FIND_PACKAGE_\\1=ON")
+  set(arguments -DHOW=${A_HOW} -DVERSION=${A_VERSION} -DCOMPONENTS=${components} -DEXPECT=${expect}
+    -DCMAKE_CXX_COMPILER=${CMAKE_CXX_COMPILER} -DCMAKE_CXX_COMPILER_LAUNCHER=${CMAKE_CXX_COMPILER_LAUNCHER}
+    ${A_WITHOUT} ${A_OPTIONS})
+  if(A_HOW STREQUAL "find_package")
+    list(APPEND arguments -Ddfb_ROOT=${_stage})
+  elseif(A_HOW STREQUAL "add_subdirectory")
+    list(APPEND arguments -DDFB_SOURCE=${PROJECT_SOURCE_DIR})
+  else()
+    list(APPEND arguments -DFETCHCONTENT_SOURCE_DIR_DFB=${PROJECT_SOURCE_DIR})
+  endif()
+  list(JOIN arguments "|" arguments)
+
+  add_test(NAME package.${name} COMMAND ${CMAKE_COMMAND}
+    -DSOURCE=${CMAKE_CURRENT_SOURCE_DIR}/package
+    -DBUILD=${CMAKE_CURRENT_BINARY_DIR}/package/${name}
+    -DGENERATOR=${CMAKE_GENERATOR}
+    -DARGUMENTS=${arguments}
+    -DFAILS=${A_FAILS}
+    -P ${CMAKE_CURRENT_SOURCE_DIR}/package/build_and_run.cmake)
+  set_tests_properties(package.${name} PROPERTIES LABELS package TIMEOUT 180)
+  if(A_HOW STREQUAL "find_package")
+    set_tests_properties(package.${name} PROPERTIES FIXTURES_REQUIRED dfb_stage)
+  endif()
+endfunction()
+
+set(_name_of_mpi MPI)
+set(_name_of_tbb TBB)
+set(_name_of_snappy Snappy)
+
+# Everything, in three ways.
+dfb_add_package_test(find_package HOW find_package VERSION 0.1 EXPECT ${_others})
+foreach(_how add_subdirectory FetchContent)
+  set(_options "")
+  foreach(_component mpi tbb snappy)
+    string(TOUPPER ${_component} _upper)
+    list(APPEND _options -DDFB_WITH_${_upper}=${DFB_WITH_${_upper}})
+  endforeach()
+  dfb_add_package_test(${_how} HOW ${_how} EXPECT ${_others} OPTIONS ${_options})
+endforeach()
+
+# Core alone, and each component alone, on a machine that has nothing else.
+dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy)
+dfb_add_package_test(add_subdirectory_core HOW add_subdirectory WITHOUT MPI TBB Snappy
+  OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF)
+foreach(_component IN LISTS _others)
+  set(_without MPI TBB Snappy)
+  list(REMOVE_ITEM _without ${_name_of_${_component}})
+  dfb_add_package_test(find_package_${_component} HOW find_package
+    COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
+endforeach()
+
+# What can not be had is said clearly.
+dfb_add_package_test(other_minor_version HOW find_package VERSION 0.0 FAILS "requested version \"0.0\"")
+dfb_add_package_test(unknown_component HOW find_package COMPONENTS cuda FAILS "component 'cuda' is not installed")
+foreach(_component IN LISTS _others)
+  set(_package ${_name_of_${_component}})
+  string(TOUPPER ${_component} _upper)
+  dfb_add_package_test(find_package_misses_${_component} HOW find_package WITHOUT ${_package}
+    FAILS "component '${_component}' needs ${_package}")
+  dfb_add_package_test(add_subdirectory_misses_${_component} HOW add_subdirectory WITHOUT ${_package}
+    FAILS "${_package} was not found.*apt-get install .*-DDFB_WITH_${_upper}=OFF")
+endforeach()

@@ -1,0 +1,136 @@
+// The serial reference that results are compared with: per pixel, in arithmetic of more than twice the precision
+// of double, with no thought of speed. It shares no code with the library.
+#pragma once
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <tuple>
+#include <vector>
+
+namespace reference {
+
+#if defined(__SIZEOF_FLOAT128__)
+__extension__ typedef __float128 Exact; // 113 bits
+#else
+using Exact = long double;
+#endif
+
+// One input of a pixel.
+struct Sample {
+    std::array<float, 4> rgba{}; // premultiplied
+    float depth = std::numeric_limits<float>::infinity();
+    std::uint32_t source = 0;
+    std::uint16_t part = 0;
+};
+
+struct Pixel {
+    std::array<Exact, 4> rgba{};
+    float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0
+};
+
+using Color = std::array<float, 4>;
+
+// Front to back by (depth, source, part), a NaN for a depth being farthest: A += T a, T *= 1 - a; the background last.
+inline Pixel composite(std::vector<Sample> samples, const Color& background)
+{
+    for (Sample& s : samples)
+        if (std::isnan(s.depth))
+            s.depth = std::numeric_limits<float>::infinity();
+    std::stable_sort(samples.begin(), samples.end(), [](const Sample& a, const Sample& b) {
+        return std::tie(a.depth, a.source, a.part) < std::tie(b.depth, b.source, b.part);
+    });
+    Pixel result;
+    Exact transmittance = 1;
+    for (const Sample& s : samples) {
+        for (std::size_t c = 0; c < 4; ++c)
+            result.rgba[c] += transmittance * static_cast<Exact>(s.rgba[c]);
+        transmittance *= 1 - static_cast<Exact>(s.rgba[3]);
+        if (s.rgba[3] > 0.0f)
+            result.depth = std::min(result.depth, s.depth);
+    }
+    for (std::size_t c = 0; c < 4; ++c)
+        result.rgba[c] += transmittance * static_cast<Exact>(background[c]);
+    return result;
+}
+
+// The mean of passes that were composited each by itself; the nearest of their depths.
+inline Pixel mean(const std::vector<Pixel>& passes)
+{
+    Pixel result;
+    for (const Pixel& pass : passes) {
+        for (std::size_t c = 0; c < 4; ++c)
+            result.rgba[c] += pass.rgba[c];
+        result.depth = std::min(result.depth, pass.depth);
+    }
+    for (Exact& value : result.rgba)
+        value /= static_cast<Exact>(passes.size());
+    return result;
+}
+
+inline float toFloat(Exact value) { return static_cast<float>(value); }
+
+// To the nearest of 0..255, ties to even, clamped; NaN gives 0.
+inline std::uint8_t toUnorm8(Exact value)
+{
+    if (!(value > 0))
+        return 0;
+    if (value >= 1)
+        return 255;
+    const Exact scaled = value * 255;
+    const int below = static_cast<int>(scaled);
+    const Exact rest = scaled - below;
+    const Exact half = static_cast<Exact>(0.5);
+    return static_cast<std::uint8_t>(below + (rest > half || (rest == half && below % 2 == 1) ? 1 : 0));
+}
+
+// Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. With the
+// fifth power on both sides there is no root to take.
+inline bool isAboveSrgbLevel(Exact value, int level)
+{
+    const Exact s = static_cast<Exact>(2 * level + 1) / 510;
+    if (s * 100000 <= 4045)
+        return value * 1292 >= s * 100;
+    const Exact base = (s * 1000 + 55) / 1055;
+    const Exact base4 = base * base * base * base;
+    return value > 0 && value * value * value * value * value >= base4 * base4 * base4;
+}
+
+inline std::uint8_t toSrgb8(Exact value)
+{
+    int level = 0;
+    for (int step = 128; step > 0; step /= 2)
+        if (isAboveSrgbLevel(value, level + step - 1))
+            level += step;
+    return static_cast<std::uint8_t>(level);
+}
+
+// How many floats lie from a to b; 0 for equal ones (also 0 and -0) and for two NaNs.
+inline std::int64_t ulpsBetween(float a, float b)
+{
+    if (std::isnan(a) || std::isnan(b))
+        return std::isnan(a) && std::isnan(b) ? 0 : std::numeric_limits<std::int64_t>::max();
+    const auto ordered = [](float value) {
+        std::int32_t bits = 0;
+        std::memcpy(&bits, &value, sizeof bits);
+        return bits >= 0 ? std::int64_t{bits} : -std::int64_t{bits & 0x7fffffff};
+    };
+    const std::int64_t distance = ordered(a) - ordered(b);
+    return distance < 0 ? -distance : distance;
+}
+
+// FNV-1a.
+inline std::uint64_t hashOf(const void* data, std::size_t byteCount)
+{
+    const auto* bytes = static_cast<const unsigned char*>(data);
+    std::uint64_t hash = 14695981039346656037u;
+    for (std::size_t i = 0; i < byteCount; ++i)
+        hash = (hash ^ bytes[i]) * 1099511628211u;
+    return hash;
+}
+
+} // namespace reference

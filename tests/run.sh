@@ -1,0 +1,14 @@
+#!/bin/sh
+# sh tests/run.sh [CTEST ARGUMENT...]
+# Installs what is missing, builds the preset "dev" in build/dev, and runs all tests; arguments go to ctest, for
+# example: sh tests/run.sh -L unit
+set -eu
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+cd "$root"
+sh cmake/install_packages.sh
+
+jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+cmake --preset dev
+cmake --build --preset dev --parallel "$jobs"
+exec ctest --preset dev --parallel "$jobs" "$@"

@@ -1,0 +1,156 @@
+// Executors: loops and tasks on workers.
+#include "catch.hpp"
+
+#include <dfb/exec.hpp>
+#if defined(DFB_HAS_TBB)
+#include <dfb/tbb_executor.hpp>
+#endif
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace {
+
+template <class Executor>
+void check(int threads)
+{
+    INFO(threads << " threads");
+    SECTION("a loop calls each index once")
+    {
+        Executor executor(threads);
+        CHECK(executor.concurrency() >= 1);
+        for (const std::size_t count : {0, 1, 2, 3, 17, 5000}) {
+            std::vector<std::atomic<int>> calls(count);
+            executor.parallelFor(count, [&](std::size_t i) { ++calls[i]; });
+            CHECK(std::all_of(calls.begin(), calls.end(), [](const auto& n) { return n == 1; }));
+        }
+    }
+    SECTION("loops nest, in loops and in tasks")
+    {
+        std::atomic<int> inner{0}, inTask{0};
+        {
+            Executor executor(threads);
+            executor.parallelFor(13, [&](std::size_t) {
+                executor.parallelFor(7, [&](std::size_t) { executor.parallelFor(3, [&](std::size_t) { ++inner; }); });
+            });
+            CHECK(inner == 13 * 7 * 3);
+            for (int i = 0; i < 5; ++i)
+                executor.submit([&] { executor.parallelFor(11, [&](std::size_t) { ++inTask; }); });
+        }
+        CHECK(inTask == 55);
+    }
+    SECTION("an exception of a body comes out of the loop, and the executor goes on")
+    {
+        Executor executor(threads);
+        for (const std::size_t culprit : {0, 50, 99}) {
+            std::string what;
+            try {
+                executor.parallelFor(100, [&](std::size_t i) {
+                    if (i == culprit)
+                        throw std::runtime_error("body " + std::to_string(i));
+                });
+            } catch (const std::runtime_error& e) {
+                what = e.what();
+            }
+            CHECK(what == "body " + std::to_string(culprit));
+            std::atomic<int> calls{0};
+            executor.parallelFor(10, [&](std::size_t) { ++calls; });
+            CHECK(calls == 10);
+        }
+        // From within a nested loop too.
+        CHECK_THROWS_AS(executor.parallelFor(3, [&](std::size_t) {
+            executor.parallelFor(3, [](std::size_t i) {
+                if (i == 1)
+                    throw std::runtime_error("inner");
+            });
+        }), std::runtime_error);
+    }
+    SECTION("what was submitted has run when the executor is gone, also what tasks submit")
+    {
+        std::atomic<int> ran{0};
+        {
+            Executor executor(threads);
+            std::vector<std::thread> submitters;
+            for (int t = 0; t < 3; ++t)
+                submitters.emplace_back([&] {
+                    for (int i = 0; i < 200; ++i)
+                        executor.submit([&] {
+                            ++ran;
+                            if (ran % 2 == 0)
+                                executor.submit([&] { ran += 1000000; });
+                        });
+                });
+            for (std::thread& thread : submitters)
+                thread.join();
+        }
+        CHECK(ran % 1000000 == 600);
+        CHECK(ran >= 1000000);
+    }
+    SECTION("loops of several threads at once")
+    {
+        Executor executor(threads);
+        std::atomic<int> calls{0};
+        std::vector<std::thread> callers;
+        for (int t = 0; t < 4; ++t)
+            callers.emplace_back([&] {
+                for (int i = 0; i < 20; ++i)
+                    executor.parallelFor(25, [&](std::size_t) { ++calls; });
+            });
+        for (std::thread& thread : callers)
+            thread.join();
+        CHECK(calls == 4 * 20 * 25);
+    }
+}
+
+} // namespace
+
+TEST_CASE("ThreadExecutor", "[executor]")
+{
+    for (const int threads : {1, 2, 3, 0})
+        DYNAMIC_SECTION("threads: " << threads) { check<dfb::ThreadExecutor>(threads); }
+}
+
+#if defined(DFB_HAS_TBB)
+TEST_CASE("TbbExecutor", "[executor]")
+{
+    for (const int threads : {1, 2, 3, 0})
+        DYNAMIC_SECTION("threads: " << threads) { check<dfb::TbbExecutor>(threads); }
+}
+#endif
+
+TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[executor]")
+{
+    CHECK(dfb::ThreadExecutor(3).concurrency() == 3);
+    dfb::ThreadExecutor executor(3);
+    // Each body waits for the others: with fewer workers this would not end.
+    std::mutex mutex;
+    std::condition_variable changed;
+    int arrived = 0;
+    executor.parallelFor(3, [&](std::size_t) {
+        std::unique_lock<std::mutex> lock(mutex);
+        ++arrived;
+        changed.notify_all();
+        changed.wait(lock, [&] { return arrived == 3; });
+    });
+    CHECK(arrived == 3);
+}
+
+TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
+{
+    dfb::ThreadExecutor executor(1);
+    std::atomic<int> tasks{0};
+    std::vector<int> seen(5);
+    executor.parallelFor(5, [&](std::size_t i) {
+        seen[i] = tasks;
+        executor.submit([&] { ++tasks; });
+    });
+    std::sort(seen.begin(), seen.end());
+    CHECK(seen == std::vector<int>{0, 1, 2, 3, 4});
+}

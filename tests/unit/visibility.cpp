@@ -1,0 +1,194 @@
+// World, camera and visibility: a projection covers whatever rays can meet of a box.
+#include "catch.hpp"
+
+#include <dfb/render/visibility.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <random>
+#include <set>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using Random = std::mt19937_64;
+
+double uniform(Random& random, double low, double high)
+{
+    return low + (high - low) * static_cast<double>(random() >> 11) * 0x1p-53;
+}
+
+dfb::Vec3 point(Random& random, double extent)
+{
+    return {static_cast<float>(uniform(random, -extent, extent)), static_cast<float>(uniform(random, -extent, extent)),
+            static_cast<float>(uniform(random, -extent, extent))};
+}
+
+// Whether a ray meets a box at a positive distance, in double.
+bool meets(const dfb::Vec3& eye, const dfb::Vec3& direction, const dfb::Box3& box)
+{
+    const double o[3] = {eye.x, eye.y, eye.z}, d[3] = {direction.x, direction.y, direction.z};
+    const double lower[3] = {box.lower.x, box.lower.y, box.lower.z}, upper[3] = {box.upper.x, box.upper.y, box.upper.z};
+    double from = 0, to = std::numeric_limits<double>::infinity();
+    for (int a = 0; a < 3; ++a) {
+        if (d[a] == 0) {
+            if (o[a] < lower[a] || o[a] > upper[a])
+                return false;
+            continue;
+        }
+        const double t0 = (lower[a] - o[a]) / d[a], t1 = (upper[a] - o[a]) / d[a];
+        from = std::max(from, std::min(t0, t1));
+        to = std::min(to, std::max(t0, t1));
+    }
+    return from <= to;
+}
+
+} // namespace
+
+TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[visibility]")
+{
+    Random random(21);
+    std::size_t missed = 0, hits = 0, behind = 0, around = 0;
+    std::string example;
+    const std::vector<std::pair<int, int>> sizes{{40, 30}, {1, 1}, {64, 1}, {3, 57}};
+    for (int i = 0; i < 600; ++i) {
+        const auto [width, height] = sizes[static_cast<std::size_t>(i) % sizes.size()];
+        const dfb::Vec3 eye = point(random, 3), target = point(random, 1);
+        const dfb::PerspectiveCamera camera(eye, target, {0.1f, 1.0f, -0.05f}, static_cast<float>(uniform(random, 2, 160)));
+        // From a thousandth of a unit to several, some of them around the eye or behind it.
+        const float extent = static_cast<float>(std::pow(10.0, uniform(random, -3, 0.7)));
+        const dfb::Vec3 center = i % 5 == 0 ? eye : point(random, 3);
+        const dfb::Vec3 a = center + extent * point(random, 1), b = center + extent * point(random, 1);
+        const dfb::Box3 box{{std::min(a.x, b.x), std::min(a.y, b.y), std::min(a.z, b.z)},
+                            {std::max(a.x, b.x), std::max(a.y, b.y), std::max(a.z, b.z)}};
+        const dfb::Region region = camera.project(box, width, height);
+        CHECK(dfb::intersection(region, {0, 0, width, height}) == region);
+        behind += region.empty();
+        around += meets(eye, {1, 0, 0}, box) && meets(eye, {-1, 0, 0}, box);
+        for (int y = 0; y < height; ++y)
+            for (int x = 0; x < width; ++x)
+                for (int s = 0; s < 5; ++s) {
+                    // The corners and a random point of the pixel.
+                    const double dx = s < 4 ? s % 2 : uniform(random, 0, 1), dy = s < 4 ? s / 2 : uniform(random, 0, 1);
+                    if (!meets(eye, camera.direction(static_cast<float>(x + dx), static_cast<float>(y + dy), width, height), box))
+                        continue;
+                    ++hits;
+                    if (!region.contains(x, y)) {
+                        ++missed;
+                        example = "scene " + std::to_string(i) + ", pixel " + std::to_string(x) + ' ' + std::to_string(y);
+                    }
+                }
+    }
+    INFO(example);
+    CHECK(missed == 0);
+    // The scenes are not all of one kind.
+    CHECK(hits > 10000);
+    CHECK(behind > 50);
+    CHECK(around > 5);
+}
+
+TEST_CASE("The projection covers the points of boxes in large images, and not much more", "[visibility]")
+{
+    Random random(5);
+    std::size_t missed = 0, inside = 0;
+    double largest = 0;
+    for (int i = 0; i < 300; ++i) {
+        const int width = 2000, height = 1500;
+        const dfb::PerspectiveCamera camera({0, 0, 10}, {0, 0, 0}, {0, 1, 0}, 40);
+        const dfb::Vec3 center = point(random, 2);
+        const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -4, 0)));
+        const dfb::Vec3 half{extent, 0.3f * extent, 0.7f * extent};
+        const dfb::Box3 box{center - half, center + half};
+        const dfb::Region region = camera.project(box, width, height);
+        const double pixelsPerUnit = 0.5 * height / std::tan(20 * 3.14159265358979 / 180);
+        double x0 = 1e9, x1 = -1e9, y0 = 1e9, y1 = -1e9;
+        for (int k = 0; k < 9 * 9 * 9; ++k) {
+            // Also the faces, edges and corners.
+            const double fx = k % 9 / 8.0, fy = k / 9 % 9 / 8.0, fz = k / 81 / 8.0;
+            const double px = box.lower.x + fx * (static_cast<double>(box.upper.x) - box.lower.x);
+            const double py = box.lower.y + fy * (static_cast<double>(box.upper.y) - box.lower.y);
+            const double pz = box.lower.z + fz * (static_cast<double>(box.upper.z) - box.lower.z);
+            const double x = 0.5 * width + pixelsPerUnit * px / (10 - pz), y = 0.5 * height - pixelsPerUnit * py / (10 - pz);
+            x0 = std::min(x0, x), x1 = std::max(x1, x);
+            y0 = std::min(y0, y), y1 = std::max(y1, y);
+            const int column = static_cast<int>(std::floor(x)), row = static_cast<int>(std::floor(y));
+            if (column < 0 || column >= width || row < 0 || row >= height)
+                continue;
+            ++inside;
+            missed += !region.contains(column, row);
+        }
+        if (!region.empty())
+            largest = std::max({largest, region.width() - (x1 - x0), region.height() - (y1 - y0)});
+    }
+    CHECK(missed == 0);
+    CHECK(inside > 100000);
+    // One pixel on each side, and the pixels that the ends lie in: the corners of a box are its extremes.
+    CHECK(largest <= 4.001);
+}
+
+TEST_CASE("Boxes behind, around and beside the camera", "[visibility]")
+{
+    const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 60);
+    CHECK(camera.project({{-1, -1, 6}, {1, 1, 8}}, 100, 80).empty());
+    CHECK(camera.project({{-1, -1, 4}, {1, 1, 8}}, 100, 80) == dfb::Region{0, 0, 100, 80});
+    CHECK(camera.project({{50, -1, -1}, {52, 1, 1}}, 100, 80).empty());
+    // So wide that its corners are at a right angle to the view: it still fills the image.
+    for (const float wide : {1e4f, 1e8f, 1e30f}) {
+        INFO("half width " << wide);
+        CHECK(camera.project({{-wide, -wide, -1}, {wide, wide, 1}}, 100, 80) == dfb::Region{0, 0, 100, 80});
+    }
+    const dfb::Region speck = camera.project({{0, 0, 0}, {0, 0, 0}}, 100, 80);
+    CHECK(speck.contains(50, 40));
+    CHECK(speck.width() <= 4);
+    CHECK(speck.height() <= 4);
+}
+
+TEST_CASE("Degenerate cameras and bricks that are none are refused", "[visibility]")
+{
+    using Camera = dfb::PerspectiveCamera;
+    CHECK_THROWS_AS(Camera({1, 2, 3}, {1, 2, 3}, {0, 1, 0}, 40), dfb::InvalidArgument);
+    CHECK_THROWS_AS(Camera({0, 5, 0}, {0, 0, 0}, {0, 1, 0}, 40), dfb::InvalidArgument);
+    CHECK_THROWS_AS(Camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 0), dfb::InvalidArgument);
+    CHECK_THROWS_AS(Camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 180), dfb::InvalidArgument);
+
+    const float notANumber = std::numeric_limits<float>::quiet_NaN(), infinity = std::numeric_limits<float>::infinity();
+    dfb::World world;
+    world.add({7, {{0, 0, 0}, {1, 1, 1}}});
+    CHECK_THROWS_AS(world.add({7, {{2, 0, 0}, {3, 1, 1}}}), dfb::InvalidArgument);
+    CHECK_THROWS_AS(world.add({8, {{2, 0, 0}, {1, 1, 1}}}), dfb::InvalidArgument);
+    CHECK_THROWS_AS(world.add({8, {{0, notANumber, 0}, {1, 1, 1}}}), dfb::InvalidArgument);
+    CHECK_THROWS_AS(world.add({8, {{0, 0, 0}, {1, 1, infinity}}}), dfb::InvalidArgument);
+    CHECK(world.bricks().size() == 1);
+    CHECK_NOTHROW(world.add({8, {{1, 1, 1}, {1, 1, 1}}}));
+}
+
+TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meets", "[visibility]")
+{
+    const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 60);
+    const dfb::TileLayout layout(100, 80, 16);
+    const dfb::World world({{5, {{-1, -1, -1}, {0, 0, 0}}}, {3, {{0, 0, 0}, {1, 1, 1}}}, {9, {{-1, -1, 6}, {1, 1, 8}}}});
+    const auto pairs = dfb::visibleTiles(world, camera, layout);
+    std::set<std::pair<int, int>> found;
+    for (const auto& p : pairs)
+        found.emplace(p.tile, p.brick);
+    CHECK(found.size() == pairs.size());
+    std::set<std::pair<int, int>> expected;
+    for (int brick = 0; brick < 3; ++brick)
+        for (int tile = 0; tile < layout.tileCount(); ++tile)
+            if (!dfb::intersection(camera.project(world.bricks()[static_cast<std::size_t>(brick)].bounds, 100, 80), layout.region(tile)).empty())
+                expected.emplace(tile, brick);
+    CHECK(found == expected);
+    CHECK(std::is_sorted(pairs.begin(), pairs.end(), [](const auto& a, const auto& b) { return a.tile < b.tile; }));
+
+    const auto inputs = dfb::inputsOf(world, pairs);
+    REQUIRE(inputs.size() == pairs.size());
+    for (std::size_t i = 0; i < inputs.size(); ++i) {
+        CHECK(inputs[i].tile == pairs[i].tile);
+        CHECK(inputs[i].source == world.bricks()[static_cast<std::size_t>(pairs[i].brick)].id);
+        CHECK(inputs[i].part == 0);
+    }
+    CHECK(dfb::visibleTiles(dfb::World(), camera, layout).empty());
+}
