@@ -7,10 +7,10 @@ namespace example {
 
 // What the user chooses about the view; angles in degrees.
 struct View {
-    float azimuth = 30;    // around the y axis, from +z towards +x
-    float elevation = 20;  // above the xz plane
+    float azimuth = 30;     // around the y axis, from +z towards +x
+    float elevation = 20;   // above the xz plane
     float fieldOfView = 35; // full vertical angle
-    float distance = 2.3f; // from the centre of what there is to see, in units of its largest extent
+    float distance = 2.3f;  // from the centre of what there is to see, in units of its largest extent
 };
 
 struct Camera {
@@ -40,8 +40,7 @@ inline Camera orbitCamera(const Box& focus, const View& view, int frame, int fra
     const Vec3d forward = outward * -1.0;
     const Vec3d right = normalize(cross(forward, Vec3d(0, 1, 0)));
     Camera camera;
-    camera.origin = Vec3(Vec3d(focus.center())
-                         + outward * static_cast<double>(view.distance * focus.largestExtent()));
+    camera.origin = Vec3(Vec3d(focus.center()) + outward * static_cast<double>(view.distance * focus.largestExtent()));
     camera.forward = Vec3(forward);
     camera.right = Vec3(right);
     camera.up = Vec3(cross(right, forward));

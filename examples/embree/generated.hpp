@@ -77,9 +77,7 @@ inline Mesh torusKnot(int along, int around)
             mesh.positions.push_back(Vec3(c + (side * std::cos(angle) + other * std::sin(angle)) * radius));
         }
     }
-    const auto vertex = [&](int i, int k) {
-        return static_cast<std::uint32_t>((i % along) * around + k % around);
-    };
+    const auto vertex = [&](int i, int k) { return static_cast<std::uint32_t>((i % along) * around + k % around); };
     for (int i = 0; i < along; ++i)
         for (int k = 0; k < around; ++k) {
             mesh.triangles.push_back({vertex(i, k), vertex(i + 1, k), vertex(i + 1, k + 1)});
@@ -91,8 +89,8 @@ inline Mesh torusKnot(int along, int around)
 // A swarm on a ring around the vertical axis.
 inline std::vector<Sphere> sphereRing(int count, std::uint64_t seed)
 {
-    static const Vec3 palette[] = {{0.75f, 0.13f, 0.06f}, {0.80f, 0.45f, 0.04f}, {0.10f, 0.40f, 0.55f},
-                                   {0.70f, 0.70f, 0.66f}};
+    static const Vec3 palette[] = {
+        {0.75f, 0.13f, 0.06f}, {0.80f, 0.45f, 0.04f}, {0.10f, 0.40f, 0.55f}, {0.70f, 0.70f, 0.66f}};
     std::vector<Sphere> spheres;
     for (int i = 0; i < count; ++i) {
         std::uint64_t key = hash64(seed, static_cast<std::uint64_t>(i));
@@ -133,8 +131,8 @@ inline Scene demoScene(std::uint64_t seed)
     auto waves = std::make_shared<const detail::WaveField>(Index3{size, size, size}, seed);
     auto cloud = [waves](int x, int y, int z) {
         const float half = 0.5f * (size - 1);
-        const Vec3 p = Vec3(static_cast<float>(x) - half, static_cast<float>(y) - half, static_cast<float>(z) - half)
-            * (1 / half);
+        const Vec3 p =
+            Vec3(static_cast<float>(x) - half, static_cast<float>(y) - half, static_cast<float>(z) - half) * (1 / half);
         const float inside = std::clamp(1.6f * (0.95f - length(p)), 0.0f, 1.0f);
         return std::min(1.0f, inside * (0.10f + 1.9f * (*waves)(x, y, z)));
     };

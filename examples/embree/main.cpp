@@ -27,7 +27,8 @@ namespace {
 
 bool wantsFloat(const Options& o)
 {
-    return !o.stats.empty() || !o.alpha.empty() || (o.output.size() > 4 && o.output.substr(o.output.size() - 4) == ".pfm");
+    return !o.stats.empty() || !o.alpha.empty()
+           || (o.output.size() > 4 && o.output.substr(o.output.size() - 4) == ".pfm");
 }
 
 dfb::FrameBufferConfig configOf(const Options& o, int threads)
@@ -35,9 +36,9 @@ dfb::FrameBufferConfig configOf(const Options& o, int threads)
     dfb::FrameBufferConfig config;
     config.width = o.width;
     config.height = o.height;
-    config.format = wantsFloat(o)                             ? dfb::OutputFormat::RGBA32F
+    config.format = wantsFloat(o)                           ? dfb::OutputFormat::RGBA32F
                     : !o.output.empty() || !o.depth.empty() ? dfb::OutputFormat::SRGBA8
-                                                              : dfb::OutputFormat::None;
+                                                            : dfb::OutputFormat::None;
     config.depth = !o.depth.empty();
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
@@ -201,9 +202,9 @@ int render(const typename Transport::Communicator& communicator, const Options& 
         double total = 0;
         for (const FrameStats& s : stats.frames)
             total += s.totalMs;
-        std::printf("%d %s of %dx%d on %d %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n", o.frames,
-                    o.frames == 1 ? "frame" : "frames", o.width, o.height, stats.ranks, stats.ranks == 1 ? "rank" : "ranks",
-                    total / o.frames, stats.frames.back().compositingOverheadMs);
+        std::printf("%d %s of %dx%d on %d %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n",
+                    o.frames, o.frames == 1 ? "frame" : "frames", o.width, o.height, stats.ranks,
+                    stats.ranks == 1 ? "rank" : "ranks", total / o.frames, stats.frames.back().compositingOverheadMs);
         for (const std::string* path : {&o.output, &o.alpha, &o.depth, &o.stats})
             if (!path->empty())
                 std::printf("wrote %s\n", path->c_str());
@@ -320,7 +321,8 @@ int main(int argc, char** argv)
         if (!parsed.options || parsed.options->ranks == 0)
             return runWithMpi(argc, argv, parsed);
         if (launchedWithOthers()) {
-            std::fprintf(stderr, "dfb_render: --ranks makes ranks of threads; start it without mpirun, or leave --ranks out\n");
+            std::fprintf(stderr,
+                         "dfb_render: --ranks makes ranks of threads; start it without mpirun, or leave --ranks out\n");
             return 2;
         }
 #endif

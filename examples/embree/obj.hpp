@@ -67,8 +67,9 @@ inline Mesh parseObj(const std::string& bytes, const std::string& name)
         s.polygon.clear();
         for (int i = 0; i < count; ++i) { // from 1, or backwards from -1
             const std::int64_t index = indices[i].vertex_index;
-            s.polygon.push_back(index > 0 ? index - 1
-                                : index < 0 ? static_cast<std::int64_t>(s.mesh.positions.size()) + index : -1);
+            s.polygon.push_back(index > 0   ? index - 1
+                                : index < 0 ? static_cast<std::int64_t>(s.mesh.positions.size()) + index
+                                            : -1);
         }
         detail::addPolygon(s.mesh, s.polygon, s.name + ": after triangle " + std::to_string(s.mesh.triangles.size()));
     };

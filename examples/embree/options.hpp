@@ -231,8 +231,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1))
         ->option_text("T")
         ->group(picture);
-    app.add_option("--background", background, "Opaque colour behind the scene, linear, each 0 to 1; default: none, "
-                                               "the image stays transparent")
+    app.add_option("--background", background,
+                   "Opaque colour behind the scene, linear, each 0 to 1; default: none, "
+                   "the image stays transparent")
         ->delimiter(',')
         ->expected(3)
         ->check(detail::number(0, 1))

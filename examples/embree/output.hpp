@@ -38,8 +38,8 @@ inline void writeFloats(const std::string& path, int width, int height, const fl
     for (int y = height - 1; y >= 0; --y) {
         std::size_t at = 0;
         for (int x = 0; x < width; ++x) {
-            const float* pixel = values
-                + (static_cast<std::ptrdiff_t>(y) * width + x) * static_cast<std::ptrdiff_t>(stride);
+            const float* pixel =
+                values + (static_cast<std::ptrdiff_t>(y) * width + x) * static_cast<std::ptrdiff_t>(stride);
             for (int c = 0; c < planes; ++c)
                 row[at++] = pixel[c];
         }

@@ -106,8 +106,8 @@ private:
                 if (result.ec != std::errc() || result.ptr != end)
                     fail("bad element count '" + words[2] + "'");
                 elements_.push_back(element);
-            } else if (words[0] == "property" && !elements_.empty() && (words.size() == 3
-                       || (words.size() == 5 && words[1] == "list"))) {
+            } else if (words[0] == "property" && !elements_.empty()
+                       && (words.size() == 3 || (words.size() == 5 && words[1] == "list"))) {
                 PlyProperty property;
                 property.name = words.back();
                 property.isList = words.size() == 5;
@@ -147,9 +147,14 @@ private:
 
     PlyType typeOf(const std::string& word) const
     {
-        static const std::array<std::array<const char*, 2>, 8> names{{{"char", "int8"}, {"uchar", "uint8"},
-            {"short", "int16"}, {"ushort", "uint16"}, {"int", "int32"}, {"uint", "uint32"}, {"float", "float32"},
-            {"double", "float64"}}};
+        static const std::array<std::array<const char*, 2>, 8> names{{{"char", "int8"},
+                                                                      {"uchar", "uint8"},
+                                                                      {"short", "int16"},
+                                                                      {"ushort", "uint16"},
+                                                                      {"int", "int32"},
+                                                                      {"uint", "uint32"},
+                                                                      {"float", "float32"},
+                                                                      {"double", "float64"}}};
         for (std::size_t i = 0; i < names.size(); ++i)
             if (word == names[i][0] || word == names[i][1])
                 return static_cast<PlyType>(i);
@@ -189,8 +194,9 @@ private:
 
     double number(PlyType type, const PlyElement& element, std::uint64_t row)
     {
-        const auto where = [&] { return " in " + element.name + ' ' + std::to_string(row) + " of "
-                                     + std::to_string(element.count); };
+        const auto where = [&] {
+            return " in " + element.name + ' ' + std::to_string(row) + " of " + std::to_string(element.count);
+        };
         if (format_ == Format::Ascii) {
             skipSpace();
             double value = 0;
@@ -198,8 +204,8 @@ private:
             if (at_ == bytes_.size())
                 fail("it ends early," + where());
             at_ = static_cast<std::size_t>(result.ptr - bytes_.data());
-            const bool ended = at_ == bytes_.size() || bytes_[at_] == ' '
-                || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
+            const bool ended =
+                at_ == bytes_.size() || bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
             if (result.ec != std::errc() || !ended)
                 fail("expected a number," + where());
             return value;

@@ -56,8 +56,7 @@ inline RankScene loadRankScene(const Options& options, int rank, int rankCount)
         if (options.mode == Mode::Image || rankOfBrick(brick, count, rankCount) == rank) {
             const std::uint32_t id = static_cast<std::uint32_t>(brick);
             result.brickIds.push_back(id);
-            result.renderers.emplace_back(loadBrick(scene, id, result.cells[id]), result.info,
-                                          renderSettings(options));
+            result.renderers.emplace_back(loadBrick(scene, id, result.cells[id]), result.info, renderSettings(options));
         }
     return result;
 }

@@ -20,8 +20,8 @@ struct RenderSettings {
     int frames = 1;            // of one turn of the camera
     int passes = 1;            // samples per pixel
     std::uint64_t seed = 0;
-    float opacity = 0.6f;          // of a surface or sphere
-    float earlyTermination = 0;    // a ray ends when less than this passes through it; 0: never
+    float opacity = 0.6f;       // of a surface or sphere
+    float earlyTermination = 0; // a ray ends when less than this passes through it; 0: never
     View view;
 };
 

@@ -63,8 +63,8 @@ struct VolumeObject {
         const Index3& d = source.info.dims;
         Box box;
         box.grow(placement.toWorld({0, 0, 0}));
-        box.grow(placement.toWorld({static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1),
-                                    static_cast<float>(d[2] - 1)}));
+        box.grow(placement.toWorld(
+            {static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1), static_cast<float>(d[2] - 1)}));
         return box;
     }
 };
@@ -107,8 +107,8 @@ struct Scene {
         const Placement placement = fitToUnitCube(box, fit);
         for (Vec3& p : mesh.positions)
             p = placement.toWorld(p);
-        static const Vec3 palette[] = {{0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f},
-                                       {0.62f, 0.20f, 0.18f}};
+        static const Vec3 palette[] = {
+            {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
         MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
         object.normals = vertexNormals(object.mesh);
         box = Box();
@@ -181,9 +181,9 @@ inline void bisect(const Box& box, int count, std::vector<Box>& cells)
     const Vec3 extent = box.extent();
     const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
     const int lower = count / 2;
-    const float plane = static_cast<float>(
-        static_cast<double>(box.lo[axis])
-        + static_cast<double>(extent[axis]) * static_cast<double>(lower) / static_cast<double>(count));
+    const float plane = static_cast<float>(static_cast<double>(box.lo[axis])
+                                           + static_cast<double>(extent[axis]) * static_cast<double>(lower)
+                                                 / static_cast<double>(count));
     Box a = box, b = box;
     a.hi[axis] = plane;
     b.lo[axis] = plane;
@@ -282,8 +282,8 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         const int last = object.source.info.dims[axis] - 1;
         // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
         const auto voxel = [&](float world, float slack) {
-            return static_cast<int>(std::floor(std::clamp((world - offset) / scale + slack, -1.0f,
-                                                          static_cast<float>(last) + 1.0f)));
+            return static_cast<int>(
+                std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
         };
         lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
         hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
@@ -348,8 +348,8 @@ inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell)
     brick.id = id;
     brick.cell = cell;
     // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
-    const Box reach = cell.padded(1e-5f * std::max(scene.bounds.largestExtent(),
-                                                   std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
+    const Box reach = cell.padded(
+        1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
     for (const VolumeObject& object : scene.volumes)
         detail::addVolume(brick, object);
     for (const MeshObject& object : scene.meshes)

@@ -24,12 +24,11 @@ public:
         struct Point {
             float value, r, g, b, alpha;
         };
-        static const Point points[] = {
-            {0.00f, 0.30f, 0.45f, 0.60f, 0.000f}, {0.08f, 0.30f, 0.45f, 0.60f, 0.000f},
-            {0.12f, 0.32f, 0.50f, 0.66f, 0.012f}, {0.22f, 0.55f, 0.66f, 0.70f, 0.022f},
-            {0.30f, 0.80f, 0.66f, 0.42f, 0.020f}, {0.40f, 0.88f, 0.40f, 0.12f, 0.110f},
-            {0.55f, 0.78f, 0.16f, 0.06f, 0.160f}, {0.80f, 0.90f, 0.50f, 0.10f, 0.240f},
-            {1.00f, 0.98f, 0.88f, 0.62f, 0.400f}};
+        static const Point points[] = {{0.00f, 0.30f, 0.45f, 0.60f, 0.000f}, {0.08f, 0.30f, 0.45f, 0.60f, 0.000f},
+                                       {0.12f, 0.32f, 0.50f, 0.66f, 0.012f}, {0.22f, 0.55f, 0.66f, 0.70f, 0.022f},
+                                       {0.30f, 0.80f, 0.66f, 0.42f, 0.020f}, {0.40f, 0.88f, 0.40f, 0.12f, 0.110f},
+                                       {0.55f, 0.78f, 0.16f, 0.06f, 0.160f}, {0.80f, 0.90f, 0.50f, 0.10f, 0.240f},
+                                       {1.00f, 0.98f, 0.88f, 0.62f, 0.400f}};
         std::size_t segment = 0;
         for (std::size_t i = 0; i < table_.size(); ++i) {
             const float value = std::min(1.0f, static_cast<float>(i) / static_cast<float>(size));
@@ -51,8 +50,7 @@ public:
         const std::size_t i = static_cast<std::size_t>(at);
         const float f = at - static_cast<float>(i);
         const Entry &a = table_[i], &b = table_[i + 1];
-        return {a.r + f * (b.r - a.r), a.g + f * (b.g - a.g), a.b + f * (b.b - a.b),
-                a.alpha + f * (b.alpha - a.alpha)};
+        return {a.r + f * (b.r - a.r), a.g + f * (b.g - a.g), a.b + f * (b.b - a.b), a.alpha + f * (b.alpha - a.alpha)};
     }
 
     // Whether every value in [lo, hi] has opacity 0, with room for the rounding of an interpolated value.

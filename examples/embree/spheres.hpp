@@ -28,9 +28,9 @@ inline Sphere atom(std::string_view element)
         float radius;
         Vec3 color;
     };
-    static const Entry entries[] = {
-        {"H", 1.20f, {0.80f, 0.80f, 0.80f}}, {"C", 1.70f, {0.26f, 0.46f, 0.44f}}, {"N", 1.55f, {0.10f, 0.24f, 0.62f}},
-        {"O", 1.52f, {0.72f, 0.24f, 0.14f}}, {"S", 1.80f, {0.85f, 0.62f, 0.05f}}, {"P", 1.80f, {0.85f, 0.30f, 0.03f}}};
+    static const Entry entries[] = {{"H", 1.20f, {0.80f, 0.80f, 0.80f}}, {"C", 1.70f, {0.26f, 0.46f, 0.44f}},
+                                    {"N", 1.55f, {0.10f, 0.24f, 0.62f}}, {"O", 1.52f, {0.72f, 0.24f, 0.14f}},
+                                    {"S", 1.80f, {0.85f, 0.62f, 0.05f}}, {"P", 1.80f, {0.85f, 0.30f, 0.03f}}};
     Sphere sphere;
     sphere.radius = 1.7f;
     sphere.color = {0.55f, 0.20f, 0.50f};
@@ -88,7 +88,7 @@ inline std::vector<Sphere> parseXyz(std::string_view bytes, const std::string& n
         line = nextLine();
         Sphere sphere = detail::atom(nextWord(line));
         const bool ok = number(nextWord(line), sphere.center.x) && number(nextWord(line), sphere.center.y)
-            && number(nextWord(line), sphere.center.z) && nextWord(line).empty() && isUsable(sphere.center);
+                        && number(nextWord(line), sphere.center.z) && nextWord(line).empty() && isUsable(sphere.center);
         if (!ok)
             fail("expected 'element x y z' with finite numbers below 1e15");
         spheres.push_back(sphere);

@@ -84,8 +84,9 @@ public:
         rtcIntersect1(scene_.get(), &query.context, &ray);
 #endif
         std::sort(hits.begin(), hits.end(), [](const Hit& a, const Hit& b) {
-            return a.t != b.t ? a.t < b.t
-                : a.geometry != b.geometry ? a.geometry < b.geometry : a.primitive < b.primitive;
+            return a.t != b.t                 ? a.t < b.t
+                   : a.geometry != b.geometry ? a.geometry < b.geometry
+                                              : a.primitive < b.primitive;
         });
         // A point on an edge belongs to two triangles but is seen once.
         hits.erase(std::unique(hits.begin(), hits.end(),
@@ -130,8 +131,8 @@ private:
         positions.emplace_back(); // Embree loads 16 bytes per vertex, so there must be some behind the last one
         rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_VERTEX, 0, RTC_FORMAT_FLOAT3, positions.data(), 0,
                                    sizeof(Vec3), count);
-        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, part.mesh.triangles.data(),
-                                   0, sizeof(Triangle), part.mesh.triangles.size());
+        rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, part.mesh.triangles.data(), 0,
+                                   sizeof(Triangle), part.mesh.triangles.size());
         rtcSetGeometryIntersectFilterFunction(geometry, onTriangle);
         finish(geometry, &part);
     }
@@ -175,7 +176,7 @@ private:
         u = std::clamp(u, 0.0, 1.0);
         v = std::clamp(v, 0.0, 1.0 - u);
         const Vec3d normal = Vec3d(part.normals[triangle[0]]) * (1 - u - v) + Vec3d(part.normals[triangle[1]]) * u
-            + Vec3d(part.normals[triangle[2]]) * v;
+                             + Vec3d(part.normals[triangle[2]]) * v;
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];

@@ -120,7 +120,7 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
 {
     VolumeInfo info = parseVolumeName(path);
     const std::uint64_t expected = static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
-        * static_cast<std::uint64_t>(info.dims[2]) * voxelBytes(info.type);
+                                   * static_cast<std::uint64_t>(info.dims[2]) * voxelBytes(info.type);
     stream.seekg(0, std::ios::end);
     const std::streamoff got = stream.tellg();
     if (!stream || got < 0)
@@ -157,8 +157,8 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
     std::streamoff position = -1;
     return [stream, path, info, position](int x0, int x1, int y, int z, std::byte* out) mutable {
         const auto wide = [](int i) { return static_cast<std::streamoff>(i); };
-        const std::streamoff begin = ((wide(z) * info.dims[1] + y) * info.dims[0] + x0)
-            * static_cast<std::streamoff>(voxelBytes(info.type));
+        const std::streamoff begin =
+            ((wide(z) * info.dims[1] + y) * info.dims[0] + x0) * static_cast<std::streamoff>(voxelBytes(info.type));
         const std::streamsize bytes = (wide(x1) - x0) * static_cast<std::streamsize>(voxelBytes(info.type));
         if (position != begin) // a seek throws the stream's buffer away
             stream->seekg(begin);
@@ -203,8 +203,9 @@ inline Box visibleBounds(const VolumeSource& source)
             std::memcpy(&voxel, row.data() + static_cast<std::size_t>(x) * sizeof voxel, sizeof voxel);
             return static_cast<float>(voxel);
         };
-        return info.type == VoxelType::UInt8 ? as(std::uint8_t{}) : info.type == VoxelType::UInt16
-            ? as(std::uint16_t{}) : as(float{});
+        return info.type == VoxelType::UInt8    ? as(std::uint8_t{})
+               : info.type == VoxelType::UInt16 ? as(std::uint16_t{})
+                                                : as(float{});
     };
     Box box;
     const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
@@ -260,7 +261,7 @@ public:
     std::size_t index(int x, int y, int z) const
     {
         return static_cast<std::size_t>(z - lo_[2]) * nxy_ + static_cast<std::size_t>(y - lo_[1]) * nx_
-            + static_cast<std::size_t>(x - lo_[0]);
+               + static_cast<std::size_t>(x - lo_[0]);
     }
     template <class T>
     const T* data() const

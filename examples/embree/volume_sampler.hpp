@@ -143,7 +143,8 @@ private:
     std::size_t cellIndex(int x, int y, int z) const
     {
         return (static_cast<std::size_t>(z) * static_cast<std::size_t>(cells_[1]) + static_cast<std::size_t>(y))
-            * static_cast<std::size_t>(cells_[0]) + static_cast<std::size_t>(x);
+                   * static_cast<std::size_t>(cells_[0])
+               + static_cast<std::size_t>(x);
     }
 
     // distances_: number of cells to the nearest that has something to see, diagonals counting as one; all cells
@@ -205,7 +206,7 @@ private:
     Vec3 shift_;
     TransferFunction transferFunction_;
     float valueScale_;
-    Vec3 slopeScale_; // from differences of voxels to a gradient along the world's axes, in values per voxel
+    Vec3 slopeScale_;           // from differences of voxels to a gradient along the world's axes, in values per voxel
     Index3 cells0_{}, cells_{}; // first cell and number of cells
     std::vector<std::uint8_t> distances_;
 };

@@ -76,7 +76,7 @@ public:
     {
         for (int c = 0; c < classCount; ++c)
             for (std::byte* block : free_[static_cast<std::size_t>(c)])
-                ::operator delete(block, std::align_val_t{alignment});
+                ::operator delete (block, std::align_val_t{alignment});
     }
 
     // A block of at least `byteCount` bytes, not cleared. Throws std::bad_alloc.
@@ -96,7 +96,7 @@ public:
             }
         }
         if (!block)
-            block = static_cast<std::byte*>(::operator new(bytesOf(c), std::align_val_t{alignment}));
+            block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
         return Buffer(shared_from_this(), block, byteCount, c);
     }
 

@@ -99,8 +99,7 @@ inline int firstOutOfOrder(const float* front, const float* back, bool frontWins
 // Sorts and blends: composites `count` pixels of several layers under `row` at [x, x + count), each pixel front to
 // back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
 // without depth makes all depths count as equal. `order` is scratch space.
-inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers,
-                         std::vector<int>& order)
+inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     const std::size_t n = layers.size();
     auto blend = [&](int begin, int end) {
@@ -113,8 +112,8 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     order.resize(n);
     for (std::size_t i = 0; i < n; ++i)
         order[i] = static_cast<int>(i);
-    const bool sorted = n > 1
-                        && std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
+    const bool sorted =
+        n > 1 && std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
     if (!sorted) {
         blend(0, count);
         return;
@@ -137,8 +136,8 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
         int end = count;
         for (std::size_t i = 1; i < n && end > begin + 1; ++i)
             end = detail::firstOutOfOrder(layers[static_cast<std::size_t>(order[i - 1])].depth,
-                                          layers[static_cast<std::size_t>(order[i])].depth,
-                                          order[i - 1] < order[i], begin + 1, end);
+                                          layers[static_cast<std::size_t>(order[i])].depth, order[i - 1] < order[i],
+                                          begin + 1, end);
         blend(begin, end);
         begin = end;
     }
@@ -189,8 +188,8 @@ public:
                 }
                 if (r.spanCount > 0 && r.spans->x <= x0) {
                     const int offset = x0 - r.spans->x;
-                    layers_.push_back({r.color + 4 * static_cast<std::ptrdiff_t>(offset),
-                                       r.depth ? r.depth + offset : nullptr});
+                    layers_.push_back(
+                        {r.color + 4 * static_cast<std::ptrdiff_t>(offset), r.depth ? r.depth + offset : nullptr});
                 }
             }
             if (!layers_.empty())

@@ -183,7 +183,7 @@ private:
     }
 
     std::vector<Generation> generations_;
-    std::vector<Input> inputs_; // sorted
+    std::vector<Input> inputs_;                                     // sorted
     std::vector<std::pair<std::uint32_t, std::uint16_t>> declared_; // sorted
     bool hasDeclaration_ = false;
     int current_ = 0; // the first generation that is not complete

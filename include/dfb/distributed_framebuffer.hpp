@@ -107,7 +107,8 @@ public:
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
     // InvalidArgument, with nothing sent, if a frame is open or `params` can not be.
-    Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {}, const PixelFrameData& pixelData = {})
+    Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {},
+                const PixelFrameData& pixelData = {})
     {
         engine_.begin(params, tileData, pixelData);
         return Frame(&engine_);
@@ -115,9 +116,9 @@ public:
 
     enum class Reduce : std::uint8_t { Sum, Min, Max };
 
-    // Collective, outside frames: combines `values` element by element over all ranks; the result is the same everywhere.
-    // For a user's own figures, or to agree on whether all ranks could load their data. Throws InvalidArgument on every
-    // rank if their numbers of values differ.
+    // Collective, outside frames: combines `values` element by element over all ranks; the result is the same
+    // everywhere. For a user's own figures, or to agree on whether all ranks could load their data. Throws
+    // InvalidArgument on every rank if their numbers of values differ.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
         return engine_.allReduce(values, [how](std::int64_t x, std::int64_t y) {

@@ -14,16 +14,16 @@
 namespace dfb {
 
 enum class ErrorKind : std::uint32_t {
-    InvalidArgument,   // a call with arguments that can never be right
-    TooManyInputs,     // a generation has received more tiles than were announced for it
-    DuplicateInput,    // the same (pass, generation, source, part) came twice for one tile
-    UnannouncedInput,  // an input of a generation or source that nobody announced
-    NegativeChildren,  // a tile announced fewer than zero children
-    MalformedMessage,  // bytes off the wire that are not a message of this framebuffer
-    Disagreement,      // ranks were given different configurations or frame parameters
-    UserCode,          // an exception out of a renderer, a tile operation or a pixel operation
-    Cancelled,         // a frame was left without end()
-    Transport          // the transport reported a failure
+    InvalidArgument,  // a call with arguments that can never be right
+    TooManyInputs,    // a generation has received more tiles than were announced for it
+    DuplicateInput,   // the same (pass, generation, source, part) came twice for one tile
+    UnannouncedInput, // an input of a generation or source that nobody announced
+    NegativeChildren, // a tile announced fewer than zero children
+    MalformedMessage, // bytes off the wire that are not a message of this framebuffer
+    Disagreement,     // ranks were given different configurations or frame parameters
+    UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
+    Cancelled,        // a frame was left without end()
+    Transport         // the transport reported a failure
 };
 
 inline const char* toString(ErrorKind kind)
@@ -46,15 +46,15 @@ inline const char* toString(ErrorKind kind)
 // What went wrong, and where. A negative number means "does not apply".
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
-    int rank = -1;               // the rank that noticed
+    int rank = -1; // the rank that noticed
     std::int64_t frame = -1;
     std::int64_t tile = -1;
     std::int64_t pass = -1;
     std::int64_t generation = -1;
-    std::int64_t source = -1;    // brick id, or rank
+    std::int64_t source = -1; // brick id, or rank
     std::int64_t expected = -1;
     std::int64_t got = -1;
-    std::string message;         // the detail in words, may be empty
+    std::string message; // the detail in words, may be empty
 
     // One line that names everything that applies.
     std::string describe() const

@@ -27,10 +27,10 @@ struct FragmentRow {
 
 // How the pixels of a fragment are stored.
 enum class FragmentEncoding : std::uint8_t {
-    Empty,    // no active pixel: "nothing here"
-    Sparse,   // row spans
-    Dense,    // every pixel of the region, no spans
-    Constant  // every pixel of the region alike: one pixel is stored
+    Empty,   // no active pixel: "nothing here"
+    Sparse,  // row spans
+    Dense,   // every pixel of the region, no spans
+    Constant // every pixel of the region alike: one pixel is stored
 };
 
 class Fragment {
@@ -38,13 +38,13 @@ public:
     // The parts of a decoded message; made by detail::decodeFragment, which has checked them.
     struct Parts {
         FragmentEncoding encoding = FragmentEncoding::Empty;
-        int rowBegin = 0, rowEnd = 0;               // rows that have active pixels, counted in the region
-        std::uint32_t activePixels = 0;             // that contribute, also where fewer are stored
+        int rowBegin = 0, rowEnd = 0;                 // rows that have active pixels, counted in the region
+        std::uint32_t activePixels = 0;               // that contribute, also where fewer are stored
         const std::uint16_t* rowSpanCounts = nullptr; // Sparse: one per row in [rowBegin, rowEnd)
-        const Span* spans = nullptr;                // Sparse: all spans, row by row; else one full-width span
+        const Span* spans = nullptr;                  // Sparse: all spans, row by row; else one full-width span
         const float* color = nullptr;
         const float* depth = nullptr;
-        Span fullRow;                               // Dense and Constant
+        Span fullRow; // Dense and Constant
     };
 
     Fragment() = default;

@@ -15,14 +15,14 @@ namespace dfb {
 // What a framebuffer is made with. Everything but executor and progress must be the same on all ranks, which is
 // checked when it is made.
 struct FrameBufferConfig {
-    int width = 0, height = 0;                   // pixels, 1 to 65536
-    OutputFormat format = OutputFormat::RGBA8;   // of the image on the display rank
-    bool depth = false;                          // the image has depth as well
+    int width = 0, height = 0;                 // pixels, 1 to 65536
+    OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
+    bool depth = false;                        // the image has depth as well
     int displayRank = 0;
-    OwnerMap ownerMap = latticeOwner;            // null: latticeOwner
-    std::shared_ptr<const Codec> codec{};        // null: messages are not compressed
-    std::uint32_t id = 0;                        // stands in every message
-    std::shared_ptr<Executor> executor{};        // null: a ThreadExecutor with one thread per core
+    OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
+    std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
+    std::uint32_t id = 0;                 // stands in every message
+    std::shared_ptr<Executor> executor{}; // null: a ThreadExecutor with one thread per core
     Progress progress = Progress::Thread;
 };
 
@@ -42,17 +42,17 @@ struct FrameParams {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    double totalMs = 0;                 // begin() to the return of end(), this rank
-    double renderMs = 0;                // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0;   // the call of end() to its return, this rank
-    double renderMsMax = 0;             // all: the longest renderMs
-    std::int64_t bytesSent = 0;         // all: message bytes to other ranks, without the transport's own
-    std::int64_t messagesSent = 0;      // all
-    std::int64_t tilesTotal = 0;        // in the image
-    std::int64_t tilesTouched = 0;      // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;   // all: input pixels with an infinity or NaN (see detail/wire.hpp)
-    std::int64_t lateMessages = 0;      // all: of cancelled or failed frames, dropped since the last verdict
-    std::int64_t peakMemoryBytes = 0;   // all: most that one rank's framebuffer ever held in message and image memory
+    double totalMs = 0;               // begin() to the return of end(), this rank
+    double renderMs = 0;              // begin() to the call of end(), this rank
+    double compositingOverheadMs = 0; // the call of end() to its return, this rank
+    double renderMsMax = 0;           // all: the longest renderMs
+    std::int64_t bytesSent = 0;       // all: message bytes to other ranks, without the transport's own
+    std::int64_t messagesSent = 0;    // all
+    std::int64_t tilesTotal = 0;      // in the image
+    std::int64_t tilesTouched = 0;    // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0; // all: input pixels with an infinity or NaN (see detail/wire.hpp)
+    std::int64_t lateMessages = 0;    // all: of cancelled or failed frames, dropped since the last verdict
+    std::int64_t peakMemoryBytes = 0; // all: most that one rank's framebuffer ever held in message and image memory
 };
 
 } // namespace dfb

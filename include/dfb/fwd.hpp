@@ -3,11 +3,11 @@
 
 namespace dfb {
 
-struct NoPixelOp;        // ops/pixel_ops.hpp
-class MpiTransport;      // comm/mpi_transport.hpp
-class InprocTransport;   // comm/inproc_transport.hpp
-class Executor;          // exec.hpp
-class Image;             // image.hpp
+struct NoPixelOp;      // ops/pixel_ops.hpp
+class MpiTransport;    // comm/mpi_transport.hpp
+class InprocTransport; // comm/inproc_transport.hpp
+class Executor;        // exec.hpp
+class Image;           // image.hpp
 
 template <class TileOp, class PixelOp = NoPixelOp, class Transport = MpiTransport>
 class DistributedFrameBuffer; // distributed_framebuffer.hpp

@@ -37,10 +37,10 @@ inline Region intersection(const Region& a, const Region& b) noexcept
 
 // Pixels are premultiplied RGBA, 4 channels interleaved.
 enum class OutputFormat : std::uint32_t {
-    None,    // nothing travels to the display rank and nothing is stored there
-    RGBA8,   // 8 bits a channel, linear: 255 * value, rounded to nearest, ties to even
-    SRGBA8,  // 8 bits a channel, colour through the sRGB curve (IEC 61966-2-1), alpha linear
-    RGBA32F  // 32-bit float, linear
+    None,   // nothing travels to the display rank and nothing is stored there
+    RGBA8,  // 8 bits a channel, linear: 255 * value, rounded to nearest, ties to even
+    SRGBA8, // 8 bits a channel, colour through the sRGB curve (IEC 61966-2-1), alpha linear
+    RGBA32F // 32-bit float, linear
 };
 
 inline std::size_t bytesPerPixel(OutputFormat format) noexcept
@@ -72,7 +72,8 @@ inline std::uint8_t toUnorm8(double value) noexcept
     const double shift = 4503599627370496.0;
     const double product = value * 255.0, nearest = (product + shift) - shift;
     if (std::fabs(product - nearest) > 0.4999999999)
-        return static_cast<std::uint8_t>(std::lrint(std::floor(product)) + (aboveTie(value, std::floor(product)) ? 1 : 0));
+        return static_cast<std::uint8_t>(std::lrint(std::floor(product))
+                                         + (aboveTie(value, std::floor(product)) ? 1 : 0));
     return static_cast<std::uint8_t>(nearest);
 }
 

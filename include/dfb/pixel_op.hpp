@@ -38,27 +38,33 @@ struct PixelTile {
 namespace detail {
 
 template <class T, class = void>
-struct HasProcess : std::false_type {};
+struct HasProcess : std::false_type {
+};
 template <class T>
 struct HasProcess<T, std::void_t<decltype(std::declval<const T&>().process(std::declval<PixelTile&>()))>>
-    : std::true_type {};
+    : std::true_type {
+};
 
 template <class T, class = void>
-struct IsPointwise : std::false_type {};
+struct IsPointwise : std::false_type {
+};
 template <class T>
-struct IsPointwise<T, std::void_t<decltype(T::pointwise)>> : std::bool_constant<T::pointwise> {};
+struct IsPointwise<T, std::void_t<decltype(T::pointwise)>> : std::bool_constant<T::pointwise> {
+};
 
 template <class T, class = void>
-struct HasPixelNewFrame : std::false_type {};
+struct HasPixelNewFrame : std::false_type {
+};
 template <class T>
 struct HasPixelNewFrame<
     T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()))>>
-    : std::true_type {};
+    : std::true_type {
+};
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T> && detail::HasProcess<T>::value;
+inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::HasProcess<T>::value;
 
 namespace detail {
 

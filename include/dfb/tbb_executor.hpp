@@ -17,8 +17,7 @@ namespace dfb {
 class TbbExecutor final : public Executor {
 public:
     // 0: one per core.
-    explicit TbbExecutor(int threadCount = 0)
-        : arena_(threadCount > 0 ? threadCount : tbb::task_arena::automatic, 1)
+    explicit TbbExecutor(int threadCount = 0) : arena_(threadCount > 0 ? threadCount : tbb::task_arena::automatic, 1)
     {
         arena_.initialize();
     }
@@ -49,12 +48,13 @@ private:
     void run(std::size_t count, const std::function<void(std::size_t)>& body) override
     {
         arena_.execute([&] {
-            tbb::parallel_for(tbb::blocked_range<std::size_t>(0, count, 1),
-                              [&](const tbb::blocked_range<std::size_t>& range) {
-                                  for (std::size_t i = range.begin(); i != range.end(); ++i)
-                                      body(i);
-                              },
-                              tbb::simple_partitioner());
+            tbb::parallel_for(
+                tbb::blocked_range<std::size_t>(0, count, 1),
+                [&](const tbb::blocked_range<std::size_t>& range) {
+                    for (std::size_t i = range.begin(); i != range.end(); ++i)
+                        body(i);
+                },
+                tbb::simple_partitioner());
         });
     }
 

@@ -23,14 +23,14 @@ constexpr int floatsPerPixel(ChannelMask channels) noexcept
 
 // Who an input of a tile is. (tile, pass, generation, source, part) is unique in a frame.
 struct TileHeader {
-    std::int64_t frame = -1;   // set by Frame::start
-    int tile = -1;             // index in the TileLayout
-    Region region;             // its pixels; at the right and lower border smaller than the tile
-    int pass = 0;              // sample index: passes are composited each by itself, then averaged
-    int generation = 0;        // level in the tile's dependency tree
-    int children = 0;          // how many inputs of generation + 1 this one announces
-    std::uint32_t source = 0;  // brick id; the rank where there are no bricks
-    std::uint16_t part = 0;    // to tell apart several inputs of one source
+    std::int64_t frame = -1;  // set by Frame::start
+    int tile = -1;            // index in the TileLayout
+    Region region;            // its pixels; at the right and lower border smaller than the tile
+    int pass = 0;             // sample index: passes are composited each by itself, then averaged
+    int generation = 0;       // level in the tile's dependency tree
+    int children = 0;         // how many inputs of generation + 1 this one announces
+    std::uint32_t source = 0; // brick id; the rank where there are no bricks
+    std::uint16_t part = 0;   // to tell apart several inputs of one source
 };
 
 namespace detail {
@@ -39,7 +39,8 @@ struct DepthPlane {
     float depth[FloatCount];
 };
 template <int FloatCount>
-struct DepthPlane<false, FloatCount> {};
+struct DepthPlane<false, FloatCount> {
+};
 } // namespace detail
 
 // Pixel (x, y) of the tile, counted from region.x0 and region.y0, is color[4 * (y * size + x)] and

@@ -30,12 +30,12 @@ namespace dfb {
 
 // What a TileOp is told of the tile and the frame.
 struct TileInfo {
-    int rank = 0;                             // that owns the tile
+    int rank = 0; // that owns the tile
     std::int64_t frame = 0;
     int tile = 0;
-    Region region;                            // the tile's pixels
-    int passes = 1;                           // samples a pixel; each pass has a dependency tree of its own
-    bool wantsDepth = false;                  // the output has a depth channel
+    Region region;                               // the tile's pixels
+    int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
+    bool wantsDepth = false;                     // the output has a depth channel
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
 };
 
@@ -44,8 +44,8 @@ class FinishedTile {
 public:
     // Rows of `region.width()` pixels: colour in `format` at color + y * colorStride, depth (may be null) at
     // depth + y * depthStride.
-    FinishedTile(const Region& region, OutputFormat format, std::byte* color, std::size_t colorStride,
-                 float* depth, std::size_t depthStride)
+    FinishedTile(const Region& region, OutputFormat format, std::byte* color, std::size_t colorStride, float* depth,
+                 std::size_t depthStride)
         : region_(region), format_(format), color_(color), colorStride_(colorStride), depth_(depth),
           depthStride_(depthStride)
     {
@@ -94,15 +94,18 @@ struct FrameDataOf<T, std::void_t<typename T::FrameData>> {
 };
 
 template <class T, class = void>
-struct TileSizeOf : std::integral_constant<int, 64> {};
+struct TileSizeOf : std::integral_constant<int, 64> {
+};
 template <class T>
-struct TileSizeOf<T, std::void_t<decltype(T::tileSize)>> : std::integral_constant<int, T::tileSize> {};
+struct TileSizeOf<T, std::void_t<decltype(T::tileSize)>> : std::integral_constant<int, T::tileSize> {
+};
 
 template <class T, class = void>
-struct HasChannels : std::false_type {};
+struct HasChannels : std::false_type {
+};
 template <class T>
-struct HasChannels<T, std::void_t<decltype(T::channels)>>
-    : std::is_convertible<decltype(T::channels), ChannelMask> {};
+struct HasChannels<T, std::void_t<decltype(T::channels)>> : std::is_convertible<decltype(T::channels), ChannelMask> {
+};
 
 template <class T, class = void>
 struct NeededChannelsOf {
@@ -114,43 +117,51 @@ struct NeededChannelsOf<T, std::void_t<decltype(T::neededChannels)>> {
 };
 
 template <class T, class = void>
-struct HasNewFrame : std::false_type {};
+struct HasNewFrame : std::false_type {
+};
 template <class T>
 struct HasNewFrame<T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>()))>>
-    : std::true_type {};
+    : std::true_type {
+};
 
 template <class T, class = void>
-struct HasNewFrameWithData : std::false_type {};
+struct HasNewFrameWithData : std::false_type {
+};
 template <class T>
-struct HasNewFrameWithData<
-    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>(),
-                                                        std::declval<const typename FrameDataOf<T>::type&>()))>>
-    : std::true_type {};
+struct HasNewFrameWithData<T,
+                           std::void_t<decltype(std::declval<T&>().newFrame(
+                               std::declval<const TileInfo&>(), std::declval<const typename FrameDataOf<T>::type&>()))>>
+    : std::true_type {
+};
 
 template <class T, class = void>
-struct HasAdd : std::false_type {};
+struct HasAdd : std::false_type {
+};
 template <class T>
-struct HasAdd<T, std::void_t<decltype(std::declval<T&>().add(std::declval<Fragment&&>()))>> : std::true_type {};
+struct HasAdd<T, std::void_t<decltype(std::declval<T&>().add(std::declval<Fragment&&>()))>> : std::true_type {
+};
 
 template <class T, class = void>
-struct HasFinish : std::false_type {};
+struct HasFinish : std::false_type {
+};
 template <class T>
-struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>>
-    : std::true_type {};
+struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> : std::true_type {
+};
 
 template <class T, class = void>
-struct HasIsComplete : std::false_type {};
+struct HasIsComplete : std::false_type {
+};
 template <class T>
 struct HasIsComplete<T, std::void_t<decltype(std::declval<const T&>().isComplete())>>
-    : std::is_same<bool, decltype(std::declval<const T&>().isComplete())> {};
+    : std::is_same<bool, decltype(std::declval<const T&>().isComplete())> {
+};
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_tile_op_v =
-    std::is_default_constructible_v<T> && detail::HasChannels<T>::value
-    && (detail::HasNewFrame<T>::value || detail::HasNewFrameWithData<T>::value) && detail::HasAdd<T>::value
-    && detail::HasFinish<T>::value;
+inline constexpr bool is_tile_op_v = std::is_default_constructible_v<T>&& detail::HasChannels<T>::value
+                                     && (detail::HasNewFrame<T>::value || detail::HasNewFrameWithData<T>::value)
+                                     && detail::HasAdd<T>::value&& detail::HasFinish<T>::value;
 
 namespace detail {
 

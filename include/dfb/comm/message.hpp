@@ -31,8 +31,8 @@ struct MessageHeader {
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
     MessageKind kind = MessageKind::Fragment;
-    std::uint32_t framebuffer = 0;     // id of the receiving object
-    std::int64_t number = 0;           // of the frame; of the reduction
+    std::uint32_t framebuffer = 0; // id of the receiving object
+    std::int64_t number = 0;       // of the frame; of the reduction
 };
 static_assert(sizeof(MessageHeader) == 16 && std::is_trivially_copyable_v<MessageHeader>);
 

@@ -41,9 +41,9 @@ public:
     Messaging(const typename Transport::Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress mode,
               std::shared_ptr<Executor> executor, std::uint32_t id, MessageReceiver& receiver)
         : pool_(pool), transport_(communicator, std::move(pool), mode), mode_(mode), executor_(std::move(executor)),
-          id_(id), receiver_(receiver),
-          reductions_(transport_.rank(), transport_.size(),
-                      [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) { sendReduction(to, key, up, bytes); })
+          id_(id), receiver_(receiver), reductions_(transport_.rank(), transport_.size(),
+                                                    [this](int to, const ReductionKey& key, bool up,
+                                                           const Bytes& bytes) { sendReduction(to, key, up, bytes); })
     {
     }
 

@@ -35,7 +35,8 @@ public:
         MPI_Initialized(&initialized);
         MPI_Finalized(&finalized);
         if (!initialized || finalized)
-            throw TransportError(finalized ? "MPI has been finalised" : "MPI is not initialised: call MPI_Init_thread first");
+            throw TransportError(finalized ? "MPI has been finalised"
+                                           : "MPI is not initialised: call MPI_Init_thread first");
         int level = MPI_THREAD_SINGLE;
         MPI_Query_thread(&level);
         const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
@@ -157,8 +158,9 @@ private:
             if (message.size() > static_cast<std::size_t>(std::numeric_limits<int>::max()))
                 throw TransportError("a message of " + std::to_string(message.size()) + " bytes is over 2 GiB", rank_);
             MPI_Request request = MPI_REQUEST_NULL;
-            check(MPI_Isend(message.data(), static_cast<int>(message.size()), MPI_BYTE, destination, 0, comm_, &request),
-                  "MPI_Isend");
+            check(
+                MPI_Isend(message.data(), static_cast<int>(message.size()), MPI_BYTE, destination, 0, comm_, &request),
+                "MPI_Isend");
             sendRequests_.push_back(request);
             sending_.push_back(std::move(message));
         }

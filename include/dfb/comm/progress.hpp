@@ -19,7 +19,8 @@ namespace dfb {
 
 class ProgressThread {
 public:
-    // `poll`: true if something moved. `quiet`: nothing waits to be sent. Neither may throw or block. Does not start yet.
+    // `poll`: true if something moved. `quiet`: nothing waits to be sent. Neither may throw or block. Does not start
+    // yet.
     ProgressThread(std::function<bool()> poll, std::function<bool()> quiet)
         : poll_(std::move(poll)), quiet_(std::move(quiet))
     {

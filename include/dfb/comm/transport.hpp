@@ -14,7 +14,8 @@
 //   bool poll();                                 one thread at a time; never blocks; moves what can be moved; true if
 //                                                something was; calls the handler
 //   bool quiet() const;                          nothing waits to be sent
-//   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects anything
+//   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects
+//   anything
 //                                                more; collective where the transport needs it. Else (it has
 //                                                failed): waits for nobody
 #pragma once
@@ -49,41 +50,51 @@ protected:
 namespace detail {
 
 template <class T, class = void>
-struct HasCommunicator : std::false_type {};
+struct HasCommunicator : std::false_type {
+};
 template <class T>
 struct HasCommunicator<T, std::void_t<typename T::Communicator>>
-    : std::is_constructible<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress> {};
+    : std::is_constructible<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress> {
+};
 
 template <class T, class = void>
-struct HasRankAndSize : std::false_type {};
+struct HasRankAndSize : std::false_type {
+};
 template <class T>
-struct HasRankAndSize<T, std::void_t<decltype(std::declval<const T&>().rank()), decltype(std::declval<const T&>().size())>>
-    : std::true_type {};
+struct HasRankAndSize<T,
+                      std::void_t<decltype(std::declval<const T&>().rank()), decltype(std::declval<const T&>().size())>>
+    : std::true_type {
+};
 
 template <class T, class = void>
-struct HasSend : std::false_type {};
+struct HasSend : std::false_type {
+};
 template <class T>
-struct HasSend<T, std::void_t<decltype(std::declval<T&>().send(0, std::declval<Buffer&&>()))>> : std::true_type {};
+struct HasSend<T, std::void_t<decltype(std::declval<T&>().send(0, std::declval<Buffer&&>()))>> : std::true_type {
+};
 
 template <class T, class = void>
-struct HasPoll : std::false_type {};
+struct HasPoll : std::false_type {
+};
 template <class T>
 struct HasPoll<T, std::void_t<decltype(std::declval<T&>().poll()), decltype(std::declval<const T&>().needsPolling()),
                               decltype(std::declval<const T&>().quiet())>>
-    : std::is_same<bool, decltype(std::declval<T&>().poll())> {};
+    : std::is_same<bool, decltype(std::declval<T&>().poll())> {
+};
 
 template <class T, class = void>
-struct HasStartAndStop : std::false_type {};
+struct HasStartAndStop : std::false_type {
+};
 template <class T>
 struct HasStartAndStop<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
-                                      decltype(std::declval<T&>().stop(true))>> : std::true_type {};
+                                      decltype(std::declval<T&>().stop(true))>> : std::true_type {
+};
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_transport_v =
-    detail::HasCommunicator<T>::value && detail::HasRankAndSize<T>::value && detail::HasSend<T>::value
-    && detail::HasPoll<T>::value && detail::HasStartAndStop<T>::value;
+inline constexpr bool is_transport_v = detail::HasCommunicator<T>::value&& detail::HasRankAndSize<T>::value&&
+    detail::HasSend<T>::value&& detail::HasPoll<T>::value&& detail::HasStartAndStop<T>::value;
 
 namespace detail {
 
@@ -96,7 +107,8 @@ constexpr bool checkTransport()
     static_assert(HasSend<T>::value, "dfb: Transport must provide void send(int destination, Buffer&&)");
     static_assert(HasPoll<T>::value, "dfb: Transport must provide bool poll(), bool needsPolling() const "
                                      "and bool quiet() const");
-    static_assert(HasStartAndStop<T>::value, "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
+    static_assert(HasStartAndStop<T>::value,
+                  "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     return is_transport_v<T>;
 }
 

@@ -118,7 +118,8 @@ public:
         place.color = record + recordPrefix;
         place.colorStride = width * bytesPerPixel(settings_.format);
         if (settings_.depth) {
-            place.depth = reinterpret_cast<float*>(place.color + alignedTo16(place.colorStride * static_cast<std::size_t>(region.height())));
+            place.depth = reinterpret_cast<float*>(
+                place.color + alignedTo16(place.colorStride * static_cast<std::size_t>(region.height())));
             place.depthStride = width;
         }
         return place;
@@ -189,7 +190,8 @@ public:
             const Region region = layout_.region(tile);
             const std::size_t bytes = recordBytes(region);
             if (left < bytes)
-                failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes), static_cast<std::int64_t>(left));
+                failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes),
+                              static_cast<std::int64_t>(left));
             store(tile, region, in + recordPrefix);
             in += bytes;
             left -= bytes;
@@ -301,7 +303,8 @@ private:
         if (place.depth) {
             const std::byte* depth = pixels + alignedTo16(rowBytes * height);
             for (std::size_t y = 0; y < height; ++y)
-                std::memcpy(place.depth + y * place.depthStride, depth + y * width * sizeof(float), width * sizeof(float));
+                std::memcpy(place.depth + y * place.depthStride, depth + y * width * sizeof(float),
+                            width * sizeof(float));
         }
     }
 
@@ -313,7 +316,8 @@ private:
         message.shrink(batch.used);
         if (settings_.codec) {
             Buffer packed = pool_->acquire(prefix + settings_.codec->bound(h.rawBytes));
-            const std::size_t bytes = settings_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
+            const std::size_t bytes =
+                settings_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
             if (bytes < h.rawBytes) {
                 packed.shrink(prefix + bytes);
                 message = std::move(packed);

@@ -37,8 +37,8 @@ public:
         if (!config_.executor)
             config_.executor = std::make_shared<ThreadExecutor>();
         MessageReceiver& self = *this;
-        messaging_ = std::make_unique<Messaging<Transport>>(communicator, pool_, config_.progress,
-                                                                    config_.executor, config_.id, self);
+        messaging_ = std::make_unique<Messaging<Transport>>(communicator, pool_, config_.progress, config_.executor,
+                                                            config_.id, self);
         outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
         messaging_->start();
         Agreement mine;
@@ -50,12 +50,12 @@ public:
                 pool_, config_, std::move(pixelOp), rank(), size(),
                 [this](Buffer&& message) { messaging_->send(config_.displayRank, std::move(message)); });
             mine = Agreement::of(config_, Tile::size, Tile::channels, layout().tileCount(),
-                                         [this](int tile) { return tileOwner(tile); });
+                                 [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
         }
-        const auto all = Agreement::from(
-            messaging_->reduce(OutsideFrames, reductionCount_++, mine.bytes(), Agreement::combine));
+        const auto all =
+            Agreement::from(messaging_->reduce(OutsideFrames, reductionCount_++, mine.bytes(), Agreement::combine));
         if (!all.fine)
             throw InvalidArgument(all.text);
     }
@@ -202,10 +202,9 @@ public:
         ByteWriter out;
         for (std::int64_t v : values)
             out.put(v);
-        const Bytes result = messaging_->reduce(OutsideFrames, reductionCount_++, out.take(),
-                                                [operation](const Bytes& a, const Bytes& b) {
-                                                    return ReductionTable::combineElements(a, b, operation);
-                                                });
+        const Bytes result = messaging_->reduce(
+            OutsideFrames, reductionCount_++, out.take(),
+            [operation](const Bytes& a, const Bytes& b) { return ReductionTable::combineElements(a, b, operation); });
         if (result.size() != values.size() * sizeof(std::int64_t))
             throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
         std::vector<std::int64_t> reduced(values.size());
@@ -259,9 +258,9 @@ private:
                 info.message = "the sender declares its inputs, this rank expects no declaration";
                 throw Error(std::move(info));
             }
-            manifests_.receive(ByteReader(message.data() + sizeof(MessageHeader),
-                                                  message.size() - sizeof(MessageHeader)),
-                               [this](int tile) { return pipeline_->table().isMine(tile); });
+            manifests_.receive(
+                ByteReader(message.data() + sizeof(MessageHeader), message.size() - sizeof(MessageHeader)),
+                [this](int tile) { return pipeline_->table().isMine(tile); });
             messaging_->send(source, MessageKind::ManifestAck, gate_.frame());
             break;
         case MessageKind::ManifestAck:
@@ -326,13 +325,14 @@ private:
 
     void enterAllDeclared()
     {
-        messaging_->reductions().enter({AllDeclared, gate_.frame()}, {}, [](const Bytes& a, const Bytes&) { return a; },
-                                       [this, frame = gate_.frame()](const Bytes&) {
-                                           if (!gate_.enter(frame))
-                                               return;
-                                           applyDeclarations();
-                                           gate_.leave();
-                                       });
+        messaging_->reductions().enter(
+            {AllDeclared, gate_.frame()}, {}, [](const Bytes& a, const Bytes&) { return a; },
+            [this, frame = gate_.frame()](const Bytes&) {
+                if (!gate_.enter(frame))
+                    return;
+                applyDeclarations();
+                gate_.leave();
+            });
     }
 
     // Every manifest is here: now it is known what each owned tile waits for.
@@ -346,7 +346,8 @@ private:
         guarded(
             [&] {
                 pipeline_->table().declare(
-                    manifests_.expected(), all, where, [this](int) { ++tilesLeft_; }, [this](int tile) { submitFinish(tile); });
+                    manifests_.expected(), all, where, [this](int) { ++tilesLeft_; },
+                    [this](int tile) { submitFinish(tile); });
                 tilesLess(countUnknown);
             },
             where);
@@ -379,7 +380,8 @@ private:
                        [this] {
                            Verdict v;
                            v.paramsHash = fingerprintOf(params_);
-                           v.sums = {messaging_->bytesSent() - bytesBefore_, messaging_->messagesSent() - messagesBefore_,
+                           v.sums = {messaging_->bytesSent() - bytesBefore_,
+                                     messaging_->messagesSent() - messagesBefore_,
                                      ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
                                      pipeline_->nonFinitePixels(), gate_.takeLateCount()};
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_};

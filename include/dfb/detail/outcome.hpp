@@ -37,8 +37,8 @@ public:
     // Another rank says so.
     void setFailed() noexcept { failed_ = true; }
 
-    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if this
-    // rank has voted: then it is too late.
+    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if
+    // this rank has voted: then it is too late.
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);

@@ -28,13 +28,13 @@ public:
     using Tile = dfb::Tile<TileOp::channels, TileSizeOf<TileOp>::value>;
 
     // Throws InvalidArgument for a configuration that can not be.
-    TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, PixelOp pixelOp, int rank, int rankCount,
-                 FinalGather::Send sendToDisplay)
+    TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, PixelOp pixelOp, int rank,
+                 int rankCount, FinalGather::Send sendToDisplay)
         : pool_(std::move(pool)), config_(config), pixelOp_(std::move(pixelOp)),
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
-          gather_(pool_, table_.layout(), {config.format, config.depth, config.id, config.codec}, rank == config.displayRank,
-                  rankCount - 1, std::move(sendToDisplay))
+          gather_(pool_, table_.layout(), {config.format, config.depth, config.id, config.codec},
+                  rank == config.displayRank, rankCount - 1, std::move(sendToDisplay))
     {
     }
 
@@ -65,8 +65,8 @@ public:
                                   + std::to_string(table_.layout().tileCount()) + " tiles");
         if (pass < 0 || pass >= frame.passes)
             throw InvalidArgument("pass " + std::to_string(pass) + " of a frame of " + std::to_string(frame.passes));
-        static_cast<TileHeader&>(tile) = {frame.frame, index, table_.layout().region(index), pass, 0, 0,
-                                          static_cast<std::uint32_t>(frame.rank), 0};
+        static_cast<TileHeader&>(tile) = {frame.frame, index, table_.layout().region(index),          pass,
+                                          0,           0,     static_cast<std::uint32_t>(frame.rank), 0};
         tile.clear();
     }
 
@@ -74,7 +74,8 @@ public:
     Buffer encode(const Tile& tile)
     {
         const FloatEnvironment floatEnvironment;
-        const auto wanted = static_cast<ChannelMask>(NeededChannelsOf<TileOp>::value | (config_.depth ? depthChannel : 0));
+        const auto wanted =
+            static_cast<ChannelMask>(NeededChannelsOf<TileOp>::value | (config_.depth ? depthChannel : 0));
         std::uint64_t nonFinite = 0;
         Buffer message = encodeFragment(*pool_, tile, wanted, config_.id,
                                         table_.isMine(tile.tile) ? nullptr : config_.codec.get(), nonFinite);
@@ -83,12 +84,12 @@ public:
         return message;
     }
 
-    // Takes an input. Returns the tile if its inputs are now complete: call finish() for it, once; else -1. `where` gets
-    // what is known of the place when this throws Error.
+    // Takes an input. Returns the tile if its inputs are now complete: call finish() for it, once; else -1. `where`
+    // gets what is known of the place when this throws Error.
     int arrive(Buffer&& message, ErrorInfo& where)
     {
-        Fragment fragment = decodeFragment(*pool_, std::move(message), table_.layout(), table_.frameInfo().passes,
-                                           config_.codec.get());
+        Fragment fragment =
+            decodeFragment(*pool_, std::move(message), table_.layout(), table_.frameInfo().passes, config_.codec.get());
         const TileHeader& h = fragment.header();
         const int tile = h.tile;
         where.tile = tile;
@@ -111,7 +112,8 @@ public:
             table_.finish(tile, out);
             gather_.commit(tile, std::move(place));
         } else {
-            const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+            const auto width = static_cast<std::size_t>(region.width()),
+                       height = static_cast<std::size_t>(region.height());
             Buffer color = pool_->acquire(width * height * 4 * sizeof(float));
             Buffer depth = config_.depth ? pool_->acquire(width * height * sizeof(float)) : Buffer();
             auto* depthData = reinterpret_cast<float*>(depth.data());
@@ -121,7 +123,8 @@ public:
             std::as_const(pixelOp_).process(pixels);
             auto place = gather_.reserve(tile);
             for (std::size_t y = 0; y < height && place.color; ++y) {
-                convertPixels(pixels.color + 4 * width * y, region.width(), config_.format, place.color + y * place.colorStride);
+                convertPixels(pixels.color + 4 * width * y, region.width(), config_.format,
+                              place.color + y * place.colorStride);
                 if (place.depth)
                     std::copy_n(depthData + y * width, width, place.depth + y * place.depthStride);
             }

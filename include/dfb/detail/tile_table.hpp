@@ -108,10 +108,10 @@ public:
         return becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
     }
 
-    // What will come for each tile, in each pass; nothing for a tile that is not named. Calls `ready(tile)` for those whose
-    // inputs are already all there, and before that `counted(tile)` for each tile that is waited for. `all`: also for the
-    // tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker throws; `where`
-    // then names the tile.
+    // What will come for each tile, in each pass; nothing for a tile that is not named. Calls `ready(tile)` for those
+    // whose inputs are already all there, and before that `counted(tile)` for each tile that is waited for. `all`: also
+    // for the tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker
+    // throws; `where` then names the tile.
     template <class Counted, class Ready>
     void declare(const ExpectedInputs& expected, bool all, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {

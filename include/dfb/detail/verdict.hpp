@@ -72,9 +72,9 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
 
 struct Verdict {
     std::optional<ErrorInfo> error;
-    std::uint64_t paramsHash = 0;           // of what begin() was given; the same on all ranks
-    std::array<std::int64_t, 5> sums{};     // bytes, messages, tiles touched, non-finite pixels, late messages
-    std::array<std::int64_t, 2> maxima{};   // peak memory in bytes, rendering in ns
+    std::uint64_t paramsHash = 0;         // of what begin() was given; the same on all ranks
+    std::array<std::int64_t, 5> sums{};   // bytes, messages, tiles touched, non-finite pixels, late messages
+    std::array<std::int64_t, 2> maxima{}; // peak memory in bytes, rendering in ns
 
     std::vector<std::byte> bytes() const
     {
@@ -134,7 +134,8 @@ struct Agreement {
 
     // `tileSize`, `channels`: of the tile operation; `ownerOf(tile)`: the owner map's answers.
     template <class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, int tileSize, ChannelMask channels, int tileCount, const OwnerOf& ownerOf)
+    static Agreement of(const FrameBufferConfig& c, int tileSize, ChannelMask channels, int tileCount,
+                        const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)

@@ -35,7 +35,7 @@ struct FragmentHeader {
     std::uint32_t spanCount = 0;
     std::uint16_t rowBegin = 0, rowEnd = 0;
     FragmentEncoding encoding = FragmentEncoding::Empty;
-    std::uint8_t codec = 0;            // 0: the payload is raw
+    std::uint8_t codec = 0; // 0: the payload is raw
     std::uint16_t reserved = 0;
     std::uint32_t rawPayloadBytes = 0; // before compression
     std::uint32_t reserved2 = 0;
@@ -100,15 +100,17 @@ bool isConstant(const TileType& tile, bool withDepth)
             if (std::memcmp(tile.pixel(x, y), tile.color, 4 * sizeof(float)) != 0)
                 return false;
             if constexpr (TileType::hasDepth)
-                if (withDepth
-                    && std::memcmp(tile.depth + y * TileType::size + x, tile.depth, sizeof(float)) != 0)
+                if (withDepth && std::memcmp(tile.depth + y * TileType::size + x, tile.depth, sizeof(float)) != 0)
                     return false;
         }
     return true;
 }
 
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
-inline float canonicalDepth(float depth) { return depth == depth ? depth + 0.0f : std::numeric_limits<float>::infinity(); }
+inline float canonicalDepth(float depth)
+{
+    return depth == depth ? depth + 0.0f : std::numeric_limits<float>::infinity();
+}
 
 // Makes the message for a tile, with the channels of `wanted` that the tile has. Adds to `nonFinite` the number of
 // pixels that have an infinity or a NaN in the colour, or a NaN for a depth. `codec` may be null.
@@ -144,7 +146,8 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         h.spanCount = static_cast<std::uint32_t>(active.spans.size());
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
-    const std::size_t payload = tableBytes + stored * sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
+    const std::size_t payload =
+        tableBytes + stored * sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
     Buffer message = pool.acquire(fragmentPrefix + payload);

@@ -22,7 +22,8 @@ public:
     {
         if (fragment.header().generation != 0 || fragment.header().children != 0)
             throw InvalidArgument("an image-parallel tile is of generation 0 and has no children, this one is of "
-                                  "generation " + std::to_string(fragment.header().generation) + " and has "
+                                  "generation "
+                                  + std::to_string(fragment.header().generation) + " and has "
                                   + std::to_string(fragment.header().children));
         store_.add(std::move(fragment));
     }

@@ -14,11 +14,12 @@ namespace dfb {
 // must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once, for each
 // pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
 // brick.bounds into the cleared tile, depth growing away from the camera. Unlike in Listing 3 the owners do not count
-// the bricks that project to their tiles: each rank declares what it will send, so the two can not disagree. Throws what
-// Frame::end() throws; an exception of renderBrick becomes a FrameError on all ranks.
+// the bricks that project to their tiles: each rank declares what it will send, so the two can not disagree. Throws
+// what Frame::end() throws; an exception of renderBrick becomes a FrameError on all ranks.
 template <class FrameBuffer, class Camera, class RenderBrick>
-FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera& camera, const RenderBrick& renderBrick,
-                               FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera& camera,
+                               const RenderBrick& renderBrick, FrameParams params = {},
+                               const typename FrameBuffer::TileFrameData& tileData = {},
                                const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = true;

@@ -2,8 +2,8 @@
 //
 // A camera, for the loops in render/, is any type with
 //   Region project(const Box3& bounds, int width, int height) const;
-// the pixels of a width x height image that the box may cover for any sample position within a pixel: never too few; too
-// many cost a header each.
+// the pixels of a width x height image that the box may cover for any sample position within a pixel: never too few;
+// too many cost a header each.
 #pragma once
 
 #include <dfb/detail/manifest.hpp>
@@ -38,7 +38,8 @@ public:
     Vec3 direction(double x, double y, int width, int height) const
     {
         const double scale = 2.0 * static_cast<double>(tanHalfFov_) / height;
-        const auto u = static_cast<float>((x - 0.5 * width) * scale), v = static_cast<float>((0.5 * height - y) * scale);
+        const auto u = static_cast<float>((x - 0.5 * width) * scale),
+                   v = static_cast<float>((0.5 * height - y) * scale);
         return normalize(forward_ + u * right_ + v * up_);
     }
 
@@ -47,8 +48,9 @@ public:
     {
         const Region all{0, 0, width, height};
         const double pixelsPerUnit = 0.5 * height / static_cast<double>(tanHalfFov_);
-        const auto along = [](const double (&d)[3], const Vec3& axis) {
-            return d[0] * static_cast<double>(axis.x) + d[1] * static_cast<double>(axis.y) + d[2] * static_cast<double>(axis.z);
+        const auto along = [](const double(&d)[3], const Vec3& axis) {
+            return d[0] * static_cast<double>(axis.x) + d[1] * static_cast<double>(axis.y)
+                   + d[2] * static_cast<double>(axis.z);
         };
         double x0 = 1e300, y0 = 1e300, x1 = -1e300, y1 = -1e300;
         int behind = 0;
