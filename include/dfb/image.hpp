@@ -50,18 +50,8 @@ inline std::size_t bytesPerPixel(OutputFormat format) noexcept
 
 namespace detail {
 
-// Whether 255 * value rounds up from `floor`, its integer part: the sign of 255 * value - floor - 1/2 without rounding,
-// and to even where that is 0.
-inline bool aboveTie(double value, double floor) noexcept
-{
-    // value = high + low with at most 27 bits each, so that both products are exact.
-    const double split = value * 134217729.0, high = split - (split - value), low = value - high;
-    const double difference = (high * 255.0 - (floor + 0.5)) + low * 255.0;
-    return difference != 0.0 ? difference > 0.0 : std::fmod(floor, 2.0) != 0.0;
-}
-
-// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. Exact: where
-// the rounded product is too near to a tie to tell, the decision is made with all its bits.
+// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. The product is
+// rounded to double first, which brings values that should be ties, such as a mean of 1/6, back to them.
 inline std::uint8_t toUnorm8(double value) noexcept
 {
     if (!(value > 0.0))
@@ -70,11 +60,7 @@ inline std::uint8_t toUnorm8(double value) noexcept
         return 255;
     // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
     const double shift = 4503599627370496.0;
-    const double product = value * 255.0, nearest = (product + shift) - shift;
-    if (std::fabs(product - nearest) > 0.4999999999)
-        return static_cast<std::uint8_t>(std::lrint(std::floor(product))
-                                         + (aboveTie(value, std::floor(product)) ? 1 : 0));
-    return static_cast<std::uint8_t>(nearest);
+    return static_cast<std::uint8_t>((value * 255.0 + shift) - shift);
 }
 
 // thresholds()[k] is the least double whose sRGB level is k + 1: the decision is a comparison and so exact, where

@@ -25,7 +25,8 @@ namespace dfb::detail {
 // What receives the messages; it knows what they mean.
 class MessageReceiver {
 public:
-    // In a task; several at once, in any order.
+    // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
+    // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
     virtual void malformed(int source, const std::exception_ptr& error) = 0;
 
@@ -37,6 +38,7 @@ template <class Transport>
 class Messaging final : private TransportHandler {
 public:
     using Bytes = ReductionTable::Bytes;
+    static constexpr std::uint32_t ownScope = 0; // of reduce(); the receiver uses others
 
     Messaging(const typename Transport::Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress mode,
               std::shared_ptr<Executor> executor, std::uint32_t id, MessageReceiver& receiver)
@@ -112,6 +114,21 @@ public:
 
     ReductionTable& reductions() noexcept { return reductions_; }
 
+    // What a ReduceUp or ReduceDown message belongs to, and what it brings.
+    static ReductionKey keyOf(const MessageHeader& header, const Buffer& message)
+    {
+        return {loadAs<std::uint32_t>(message.data() + sizeof header), header.number};
+    }
+    static Bytes bytesOf(const Buffer& message)
+    {
+        return Bytes(message.data() + sizeof(MessageHeader) + sizeof(std::uint32_t), message.data() + message.size());
+    }
+
+    void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
+    {
+        reductions_.receive(source, keyOf(header, message), header.kind == MessageKind::ReduceUp, bytesOf(message));
+    }
+
     // Between ranks that may have messages for each other: as long as this is so, they are looked for.
     void expectMessages(bool expect) { progress_.expectMessages(expect); }
 
@@ -146,7 +163,7 @@ public:
     }
 
     // Collective: combines `own` over all ranks and waits for the result.
-    Bytes reduce(std::uint32_t scope, std::int64_t number, Bytes own, ReductionTable::Combine combine)
+    Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
         struct Result {
             std::atomic<bool> there{false};
@@ -154,11 +171,12 @@ public:
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         expectMessages(true);
-        reductions_.enter({scope, number}, std::move(own), std::move(combine), [this, result](const Bytes& bytes) {
-            result->bytes = bytes;
-            result->there = true;
-            notify();
-        });
+        reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
+                          [this, result](const Bytes& bytes) {
+                              result->bytes = bytes;
+                              result->there = true;
+                              notify();
+                          });
         wait([&] { return result->there.load(); });
         expectMessages(false);
         return result->bytes;
@@ -207,10 +225,10 @@ private:
                 if (message.size() < sizeof header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
                 const std::byte* body = std::as_const(message).data() + sizeof header;
-                const ReductionKey key{loadAs<std::uint32_t>(body), header.number};
-                reductions_.receive(source, key, header.kind == MessageKind::ReduceUp,
-                                    Bytes(body + sizeof key.scope, body - sizeof header + message.size()));
-                return;
+                if (loadAs<std::uint32_t>(body) == ownScope) {
+                    receiveReduction(source, header, message);
+                    return;
+                }
             }
         } catch (...) {
             receiver_.malformed(source, std::current_exception());
@@ -239,6 +257,7 @@ private:
     MessageReceiver& receiver_;
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
+    std::int64_t reductionCount_ = 0; // of reduce()
 
     std::mutex mutex_;
     std::condition_variable changed_;

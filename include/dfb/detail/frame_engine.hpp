@@ -53,9 +53,11 @@ public:
                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
+        } catch (
+            const std::exception& e) { // no memory, or out of the owner map: the others must not wait for this rank
+            mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};
         }
-        const auto all =
-            Agreement::from(messaging_->reduce(OutsideFrames, reductionCount_++, mine.bytes(), Agreement::combine));
+        const auto all = Agreement::from(messaging_->reduce(mine.bytes(), Agreement::combine));
         if (!all.fine)
             throw InvalidArgument(all.text);
     }
@@ -97,7 +99,12 @@ public:
         info.passes = params.passes;
         info.wantsDepth = config_.depth;
         info.background = params.background;
-        pipeline_->newFrame(info, tileData, pixelData);
+        std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
+        try {
+            pipeline_->newFrame(info, tileData, pixelData);
+        } catch (...) {
+            userError = std::current_exception();
+        }
         outcome_->newFrame();
         ownTilesDone_ = endCalled_ = false;
         bytesBefore_ = messaging_->bytesSent();
@@ -109,6 +116,8 @@ public:
         messaging_->expectMessages(true);
         for (auto& early : gate_.open())
             incoming(early.source, early.header, std::move(early.bytes));
+        if (userError)
+            failWith(userError); // comes out of end(), on all ranks
         if (!params.declared)
             tilesLess(countUnknown);
         else if (reuse)
@@ -202,9 +211,9 @@ public:
         ByteWriter out;
         for (std::int64_t v : values)
             out.put(v);
-        const Bytes result = messaging_->reduce(
-            OutsideFrames, reductionCount_++, out.take(),
-            [operation](const Bytes& a, const Bytes& b) { return ReductionTable::combineElements(a, b, operation); });
+        const Bytes result = messaging_->reduce(out.take(), [operation](const Bytes& a, const Bytes& b) {
+            return ReductionTable::combineElements(a, b, operation);
+        });
         if (result.size() != values.size() * sizeof(std::int64_t))
             throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
         std::vector<std::int64_t> reduced(values.size());
@@ -216,7 +225,7 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
-    enum Scope : std::uint32_t { OutsideFrames, AllDeclared, FrameVerdict };
+    enum Scope : std::uint32_t { AllDeclared = Messaging<Transport>::ownScope + 1, FrameVerdict };
 
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
@@ -227,7 +236,7 @@ private:
     {
         if (!gate_.enter(source, header, message))
             return;
-        guarded([&] { handle(source, header.kind, std::move(message)); }, messageFrom(source));
+        guarded([&] { handle(source, header, std::move(message)); }, messageFrom(source));
         gate_.leave();
     }
 
@@ -240,11 +249,17 @@ private:
         return where;
     }
 
-    void handle(int source, MessageKind kind, Buffer&& message)
+    void handle(int source, const MessageHeader& header, Buffer&& message)
     {
+        const MessageKind kind = header.kind;
         if (kind == MessageKind::Abort) {
-            outcome_->setFailed();
+            ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
+            outcome_->failElsewhere(getErrorInfo(body));
             tryVote();
+            return;
+        }
+        if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown) {
+            receiveReduction(source, header, message);
             return;
         }
         if (outcome_->failed())
@@ -277,6 +292,22 @@ private:
             break;
         default: break;
         }
+    }
+
+    // Ranks that were given different parameters may wait for different things, so that none of them would ever be
+    // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
+    void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
+    {
+        bool differs = false;
+        if (header.kind == MessageKind::ReduceUp && messaging_->keyOf(header, message).scope == AllDeclared) {
+            differs = !wantsDeclaration_;
+        } else if (header.kind == MessageKind::ReduceUp) {
+            const Verdict partial = Verdict::from(messaging_->bytesOf(message));
+            differs = !partial.error && partial.paramsHash != fingerprintOf(params_);
+        }
+        if (differs)
+            failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
+        messaging_->receiveReduction(source, header, message);
     }
 
     // ---- tiles
@@ -417,7 +448,6 @@ private:
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
     ManifestExchange manifests_;
-    std::int64_t reductionCount_ = 0;
 
     // The frame.
     FrameGate gate_;

@@ -34,29 +34,41 @@ public:
     // The frame has failed on some rank, or the transport has. From any thread, as the rest.
     bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || messaging_.failed(); }
 
-    // Another rank says so.
-    void setFailed() noexcept { failed_ = true; }
-
-    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if
-    // this rank has voted: then it is too late.
+    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if this
+    // rank has voted: then it is up to the others, and if they all have, it is too late.
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);
         info.rank = messaging_.rank();
         info.frame = gate_.frame();
+        bool first = false, late = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (voted_)
-                return false;
-            if (error_)
-                return true;
-            error_ = std::move(info);
+            late = voted_;
+            first = !error_;
+            if (first)
+                error_ = info;
         }
         failed_ = true;
-        for (int other = 0; other < messaging_.size(); ++other)
-            if (other != messaging_.rank())
-                messaging_.send(other, MessageKind::Abort, gate_.frame());
-        return true;
+        if (first) {
+            ByteWriter body;
+            put(body, info);
+            for (int other = 0; other < messaging_.size(); ++other)
+                if (other != messaging_.rank())
+                    messaging_.send(other, MessageKind::Abort, gate_.frame(), body.bytes());
+        }
+        return !late;
+    }
+
+    // Another rank says that it has failed, and why. vote() must follow.
+    void failElsewhere(const ErrorInfo& info)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (!error_)
+                error_ = info; // in case that rank has voted already
+        }
+        failed_ = true;
     }
 
     // Enters the verdict, once: when `done()`, or when the frame has failed. `figures()` gives this rank's Verdict.

@@ -48,8 +48,8 @@ public:
                   const typename FrameDataOf<PixelOp>::type& pixelData)
     {
         nonFinite_ = 0;
-        table_.newFrame(info, tileData);
         gather_.newFrame(info.frame);
+        table_.newFrame(info, tileData);
         if constexpr (HasPixelNewFrame<PixelOp>::value)
             pixelOp_.newFrame(pixelData);
         else

@@ -100,6 +100,14 @@ struct Verdict {
         return v;
     }
 
+    static ErrorInfo disagreement()
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Disagreement;
+        info.message = "the frame was begun with different parameters (background, passes, declared, declarationKey)";
+        return info;
+    }
+
     // Of several errors, the one of the lowest rank; one that says why before one that only says "cancelled".
     static bool outranks(const ErrorInfo& a, const ErrorInfo& b)
     {
@@ -113,12 +121,8 @@ struct Verdict {
         const Verdict b = from(second);
         if (b.error && (!a.error || outranks(*b.error, *a.error)))
             a.error = b.error;
-        if (!a.error && a.paramsHash != b.paramsHash) {
-            ErrorInfo info;
-            info.kind = ErrorKind::Disagreement;
-            info.message = "the ranks began the frame with different parameters (background, passes, declared)";
-            a.error = info;
-        }
+        if (!a.error && a.paramsHash != b.paramsHash)
+            a.error = disagreement();
         for (std::size_t i = 0; i < a.sums.size(); ++i)
             a.sums[i] += b.sums[i];
         for (std::size_t i = 0; i < a.maxima.size(); ++i)

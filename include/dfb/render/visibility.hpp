@@ -21,15 +21,15 @@ class PerspectiveCamera {
 public:
     // Looks from `eye` to `target`; `fovY` is the vertical angle of view in degrees. Throws InvalidArgument if the two
     // coincide, `up` is along the view, or the angle is not in (0, 180).
-    PerspectiveCamera(const Vec3& eye, const Vec3& target, const Vec3& up, float fovY) : eye_(eye)
+    PerspectiveCamera(const Vec3& eye, const Vec3& target, const Vec3& up, float fovY)
+        : PerspectiveCamera(Along(target - eye), eye, up, fovY)
     {
-        const Vec3 view = target - eye, right = cross(view, up);
-        if (!(dot(view, view) > 0.0f) || !(dot(right, right) > 0.0f) || !(fovY > 0.0f && fovY < 180.0f))
-            throw InvalidArgument("the camera's view, up vector or angle is degenerate");
-        forward_ = normalize(view);
-        right_ = normalize(right);
-        up_ = cross(right_, forward_);
-        tanHalfFov_ = std::tan(fovY * 3.14159265358979f / 360.0f);
+    }
+
+    // Looks along `view`, of any length: also where the eye is so far from the origin that no target near it is exact.
+    static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
+    {
+        return PerspectiveCamera(Along(view), eye, up, fovY);
     }
 
     const Vec3& eye() const noexcept { return eye_; }
@@ -82,6 +82,22 @@ public:
     }
 
 private:
+    struct Along { // tells the constructors apart, also where they are given braces
+        explicit Along(const Vec3& direction) : view(direction) {}
+        Vec3 view;
+    };
+
+    PerspectiveCamera(const Along& along, const Vec3& eye, const Vec3& up, float fovY) : eye_(eye)
+    {
+        const Vec3 right = cross(along.view, up);
+        if (!(dot(along.view, along.view) > 0.0f) || !(dot(right, right) > 0.0f) || !(fovY > 0.0f && fovY < 180.0f))
+            throw InvalidArgument("the camera's view, up vector or angle is degenerate");
+        forward_ = normalize(along.view);
+        right_ = normalize(right);
+        up_ = cross(right_, forward_);
+        tanHalfFov_ = std::tan(fovY * 3.14159265358979f / 360.0f);
+    }
+
     Vec3 eye_, forward_, right_, up_;
     float tanHalfFov_ = 1.0f;
 };

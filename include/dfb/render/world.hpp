@@ -4,10 +4,10 @@
 
 #include <dfb/error.hpp>
 
-#include <algorithm>
 #include <cmath>
 #include <cstdint>
 #include <string>
+#include <unordered_set>
 #include <vector>
 
 namespace dfb {
@@ -58,7 +58,7 @@ public:
         const Box3& b = brick.bounds;
         if (!ordered(b.lower.x, b.upper.x) || !ordered(b.lower.y, b.upper.y) || !ordered(b.lower.z, b.upper.z))
             throw InvalidArgument("the bounds of brick " + std::to_string(brick.id) + " are not a box");
-        if (std::any_of(bricks_.begin(), bricks_.end(), [&](const Brick& other) { return other.id == brick.id; }))
+        if (!ids_.insert(brick.id).second)
             throw InvalidArgument("brick " + std::to_string(brick.id) + " was added twice");
         bricks_.push_back(brick);
     }
@@ -67,6 +67,7 @@ public:
 
 private:
     std::vector<Brick> bricks_;
+    std::unordered_set<std::uint32_t> ids_;
 };
 
 } // namespace dfb
