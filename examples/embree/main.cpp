@@ -72,7 +72,7 @@ dfb::PerspectiveCamera cameraOf(const RankScene& scene, const RenderSettings& se
 {
     const Camera c = frameCamera(scene.info, settings, frame);
     const auto vec = [](const Vec3& v) { return dfb::Vec3{v.x, v.y, v.z}; };
-    return {vec(c.origin), vec(c.origin) + vec(c.forward), vec(c.up), settings.view.fieldOfView};
+    return dfb::PerspectiveCamera::along(vec(c.origin), vec(c.forward), vec(c.up), settings.view.fieldOfView);
 }
 
 void writeFiles(const Options& o, const dfb::Image& image, const RunStats& stats)
@@ -269,13 +269,13 @@ int report(const ParsedOptions& parsed)
 }
 
 #if defined(DFB_HAS_MPI)
-// True if a launcher has started this process as one of several.
-bool launchedWithOthers()
+// What a launcher (MPICH's or Open MPI's) has told this process, or `otherwise`.
+int fromLauncher(const char* mpich, const char* openMpi, int otherwise)
 {
-    for (const char* name : {"PMI_SIZE", "OMPI_COMM_WORLD_SIZE"})
+    for (const char* name : {mpich, openMpi})
         if (const char* value = std::getenv(name))
-            return std::atoi(value) > 1;
-    return false;
+            return std::atoi(value);
+    return otherwise;
 }
 
 int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
@@ -297,8 +297,11 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
             const WorkerLimit limit(threads);
             code = renderWith<dfb::MpiTransport>(MPI_COMM_WORLD, *parsed.options, threads);
         }
+    } catch (const dfb::InvalidArgument& e) { // this and the next are the same on all ranks
+        if (rank == 0)
+            std::fprintf(stderr, "dfb_render: %s\n", e.what());
     } catch (const dfb::FrameError& e) {
-        if (rank == 0) // the same on all ranks
+        if (rank == 0)
             std::fprintf(stderr, "dfb_render: %s\n", e.what());
     } catch (const std::exception& e) {
         std::fprintf(stderr, "dfb_render: rank %d: %s\n", rank, e.what());
@@ -320,9 +323,10 @@ int main(int argc, char** argv)
 #if defined(DFB_HAS_MPI)
         if (!parsed.options || parsed.options->ranks == 0)
             return runWithMpi(argc, argv, parsed);
-        if (launchedWithOthers()) {
-            std::fprintf(stderr,
-                         "dfb_render: --ranks makes ranks of threads; start it without mpirun, or leave --ranks out\n");
+        if (fromLauncher("PMI_SIZE", "OMPI_COMM_WORLD_SIZE", 1) > 1) {
+            if (fromLauncher("PMI_RANK", "OMPI_COMM_WORLD_RANK", 0) == 0)
+                std::fprintf(stderr, "dfb_render: --ranks makes ranks of threads; start it without mpirun, or leave "
+                                     "--ranks out\n");
             return 2;
         }
 #endif

@@ -273,7 +273,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     try {
         app.parse(argc, argv);
         options.fit = !noFit;
-        if (!size.empty())
+        if (app.count("--size") > 0)
             detail::parseSize(size, options);
         if (background.size() == 3)
             options.background = {{background[0], background[1], background[2]}};

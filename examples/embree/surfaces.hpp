@@ -14,6 +14,7 @@
 #endif
 
 #include <memory>
+#include <mutex>
 #include <stdexcept>
 #include <type_traits>
 
@@ -26,6 +27,24 @@ struct Hit {
     Vec3 color;
 };
 
+// One device for all bricks of the process, for as long as there are any: Embree can not make thousands.
+inline std::shared_ptr<std::remove_pointer_t<RTCDevice>> sharedDevice()
+{
+    static std::mutex mutex;
+    static std::weak_ptr<std::remove_pointer_t<RTCDevice>> current;
+    const std::lock_guard<std::mutex> lock(mutex);
+    auto device = current.lock();
+    if (!device) {
+        const RTCDevice made = rtcNewDevice(nullptr);
+        if (!made)
+            throw std::runtime_error("Embree can not create a device, error "
+                                     + std::to_string(rtcGetDeviceError(nullptr)));
+        device.reset(made, rtcReleaseDevice);
+        current = device;
+    }
+    return device;
+}
+
 class Surfaces {
 public:
     Surfaces(const Box& cell, std::vector<BrickMesh> meshes, std::vector<BrickSpheres> spheres)
@@ -33,10 +52,7 @@ public:
     {
         if (meshes_.empty() && spheres_.empty())
             return;
-        device_.reset(rtcNewDevice(nullptr));
-        if (!device_)
-            throw std::runtime_error("Embree can not create a device, error "
-                                     + std::to_string(rtcGetDeviceError(nullptr)));
+        device_ = sharedDevice();
         scene_.reset(rtcNewScene(device_.get()));
         // Robust: a ray through a shared edge does not slip between the triangles.
         rtcSetSceneFlags(scene_.get(), RTC_SCENE_FLAG_ROBUST);
@@ -117,10 +133,8 @@ private:
     };
 
     struct Release {
-        void operator()(RTCDevice device) const { rtcReleaseDevice(device); }
         void operator()(RTCScene scene) const { rtcReleaseScene(scene); }
     };
-    using Device = std::unique_ptr<std::remove_pointer_t<RTCDevice>, Release>;
     using EmbreeScene = std::unique_ptr<std::remove_pointer_t<RTCScene>, Release>;
 
     void attach(BrickMesh& part)
@@ -228,7 +242,7 @@ private:
     // Embree points into these two, and so they outlive its scene. Moving the vectors moves no element.
     std::vector<BrickMesh> meshes_;
     std::vector<BrickSpheres> spheres_;
-    Device device_;
+    std::shared_ptr<std::remove_pointer_t<RTCDevice>> device_;
     EmbreeScene scene_;
 };
 
