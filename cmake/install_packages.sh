@@ -48,7 +48,7 @@ END
 }
 
 if ! have apt-get || ! have dpkg-query; then
-    # shellcheck disable=SC2046 # one word per package
+    # shellcheck disable=SC2046,SC2116 # newlines to spaces
     missing=$(echo $(tools) $(missing_headers))
     [ -z "$missing" ] && exit 0
     say "please install, with your system's package manager: $missing"
@@ -60,11 +60,12 @@ missing=$(tools)
 for package in $libraries; do
     [ "$(dpkg-query -W -f '${db:Status-Status}' "$package" 2>/dev/null)" = installed ] || missing="$missing $package"
 done
+# shellcheck disable=SC2086,SC2116 # newlines to spaces
 missing=$(echo $missing)
 [ -z "$missing" ] && exit 0
 
 if [ "$(id -u)" -eq 0 ]; then
-    as_root=env
+    as_root="env"
 elif have sudo; then
     as_root="sudo env"
 else

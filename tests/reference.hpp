@@ -10,6 +10,7 @@
 #include <cstring>
 #include <limits>
 #include <tuple>
+#include <type_traits>
 #include <vector>
 
 namespace reference {
@@ -74,7 +75,8 @@ inline Pixel mean(const std::vector<Pixel>& passes)
 
 inline float toFloat(Exact value) { return static_cast<float>(value); }
 
-// To the nearest of 0..255, ties to even, clamped; NaN gives 0.
+// To the nearest of 0..255, ties to even, clamped; NaN gives 0. What is within the rounding of Exact of a tie is one: the
+// mean of 3 passes can be 1/6, that is 42.5 / 255, which no binary number is.
 inline std::uint8_t toUnorm8(Exact value)
 {
     if (!(value > 0))
@@ -83,9 +85,10 @@ inline std::uint8_t toUnorm8(Exact value)
         return 255;
     const Exact scaled = value * 255;
     const int below = static_cast<int>(scaled);
-    const Exact rest = scaled - below;
-    const Exact half = static_cast<Exact>(0.5);
-    return static_cast<std::uint8_t>(below + (rest > half || (rest == half && below % 2 == 1) ? 1 : 0));
+    const Exact overTie = scaled - below - static_cast<Exact>(0.5);
+    const Exact rounding = scaled * static_cast<Exact>(sizeof(Exact) == 16 && !std::is_same_v<Exact, long double> ? 0x1p-108 : 0x1p-60);
+    const bool isTie = overTie <= rounding && -overTie <= rounding;
+    return static_cast<std::uint8_t>(below + (isTie ? below % 2 : overTie > 0 ? 1 : 0));
 }
 
 // Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. With the

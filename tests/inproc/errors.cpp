@@ -51,7 +51,7 @@ public:
         dfb::InprocCommunicator inner;
         std::shared_ptr<Switchboard> board;
     };
-    static constexpr const char* name = "inspected";
+    [[maybe_unused]] static constexpr const char* name = "inspected";
 
     InspectedTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : board_(c.board), inner_(c.inner, std::move(pool), progress)
@@ -273,6 +273,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     std::vector<std::string> texts;
     std::int64_t sentMeanwhile = -1;
     std::size_t wrong = 1;
+    std::promise<void> over;
     const auto board = std::make_shared<Switchboard>();
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
@@ -280,13 +281,9 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
         using Fb = InspectedFrameBuffer<Blend>;
         Fb fb({communicator, board}, config);
         // The frame comes to rank 0 when the bad calls are over: what is sent meanwhile was sent by them.
-        static std::promise<void>* over = nullptr;
-        std::promise<void> promise;
-        if (fb.rank() == 1)
-            over = &promise;
         fb.allReduce({0}, Fb::Reduce::Sum);
         if (fb.rank() == 0)
-            over->get_future().wait();
+            over.get_future().wait();
         if (fb.rank() == 1) {
             auto frame = fb.begin(scene::paramsOf(s));
             auto tile = std::make_unique<Fb::Tile>();
@@ -314,7 +311,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
             texts.push_back(outcomeOf([&] { frame.declare({}); }));
             texts.push_back(outcomeOf([&] { fb.begin(); }));
             sentMeanwhile = board->sent - before;
-            promise.set_value();
+            over.set_value();
             // None of it has harmed the frame.
             for (int index = 0; index < 28; ++index)
                 for (const dfb::Brick& brick : s.bricks) {
@@ -441,6 +438,79 @@ TEST_CASE("A frame begun with different backgrounds fails on every rank", "[erro
     CHECK(allSame(bad.texts));
     CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
     CHECK(bad.wrongAfter == 0);
+}
+
+TEST_CASE("Ranks that wait for different things find out, and none waits for ever", "[errors]")
+{
+    // An empty scene: no input travels that could give the difference away.
+    const Scene s = scene::makeScene(0);
+    enum class What { Declared, NotDeclared, Key };
+    for (const What what : {What::Declared, What::NotDeclared, What::Key})
+        for (const int ranks : {2, 3, 5})
+            for (int odd = 0; odd < ranks; ++odd) {
+                const BadFrame bad = badFrame<FrameBuffer<Blend>>(ranks, s, configOf(s), [&](auto& fb) {
+                    const bool isOdd = fb.rank() == odd;
+                    dfb::FrameParams params;
+                    params.declared = what == What::Key || isOdd == (what == What::Declared);
+                    params.declarationKey = what == What::Key ? 5 : 0;
+                    if (what == What::Key) {
+                        auto frame = fb.begin(params);
+                        frame.declare({});
+                        frame.end();
+                        params.declarationKey = isOdd ? 6 : 5;
+                    }
+                    auto frame = fb.begin(params);
+                    if (frame.wantsDeclaration())
+                        frame.declare({});
+                    auto tile = std::make_unique<typename std::decay_t<decltype(fb)>::Tile>();
+                    for (int index : fb.ownedTiles())
+                        if (!params.declared) {
+                            frame.start(*tile, index);
+                            frame.setTile(*tile);
+                        }
+                    frame.end();
+                });
+                INFO("what " << static_cast<int>(what) << ", rank " << odd << joined(bad.texts));
+                CHECK(allSame(bad.texts));
+                CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
+                CHECK(bad.wrongAfter == 0);
+            }
+}
+
+namespace {
+
+struct FaultyNewFrame {
+    static constexpr bool pointwise = true;
+    struct FrameData {
+        bool broken = false;
+    };
+    void newFrame(const FrameData& data)
+    {
+        if (data.broken)
+            throw std::runtime_error("no such look-up table");
+    }
+    void process(dfb::PixelTile&) const {}
+};
+
+} // namespace
+
+TEST_CASE("An exception of a pixel operation's newFrame comes out of end() on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(0);
+    for (int culprit = 0; culprit < 3; ++culprit) {
+        const BadFrame bad = badFrame<FrameBuffer<Blend, FaultyNewFrame>>(3, s, configOf(s), [&](auto& fb) {
+            dfb::FrameParams params;
+            params.declared = true;
+            auto frame = fb.begin(params, {}, {fb.rank() == culprit});
+            frame.declare({});
+            frame.end();
+        });
+        INFO("rank " << culprit << joined(bad.texts));
+        CHECK(allSame(bad.texts));
+        CHECK(has(bad.texts[0], "FrameError: dfb: exception in user code: rank " + std::to_string(culprit)));
+        CHECK(has(bad.texts[0], "no such look-up table"));
+        CHECK(bad.wrongAfter == 0);
+    }
 }
 
 TEST_CASE("An exception in a renderer fails the frame on every rank", "[errors]")
@@ -621,7 +691,7 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
     for (const Mistake& mistake : mistakes)
         for (int culprit = 0; culprit < 3; ++culprit) {
             auto config = configOf(s);
-            config.ownerMap = [index](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
+            config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
             const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
                 auto frame = fb.begin();
                 auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
@@ -649,7 +719,13 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
 {
     // One too many, held back until the owner is done: an error, or at least counted as late.
     const auto board = std::make_shared<Switchboard>();
-    board->inspect = [](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+    std::promise<void> ownerVoted, mayBegin;
+    const auto mayBeginFuture = mayBegin.get_future().share();
+    std::atomic<bool> inFrame{false};
+    board->inspect = [&](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+        // The first reduction message of rank 2 in the frame is its vote.
+        if (from == 2 && header.kind == dfb::detail::MessageKind::ReduceUp && inFrame.exchange(false))
+            ownerVoted.set_value();
         const bool extra = header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
                            && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 99;
         return from == 1 && extra ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
@@ -657,7 +733,6 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
     const Scene s = scene::makeScene(0, 1, 16, 16);
     std::vector<std::string> texts(3);
     std::vector<std::int64_t> late(3);
-    std::promise<void> ownerVoted;
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
         using Fb = InspectedFrameBuffer<Blend>;
         auto config = configOf(s);
@@ -666,16 +741,11 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
         Fb fb({communicator, board}, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         fb.allReduce({0}, Fb::Reduce::Sum);
-        if (fb.rank() == 0) {
-            // The first reduction message of rank 2 in the frame is its vote.
-            auto inspect = board->inspect;
-            board->inspect = [&, inspect](int from, int to, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
-                if (from == 2 && header.kind == dfb::detail::MessageKind::ReduceUp && header.number == 1)
-                    ownerVoted.set_value();
-                return inspect(from, to, header, message);
-            };
+        if (fb.rank() == 1) {
+            inFrame = true;
+            mayBegin.set_value();
         }
-        fb.allReduce({0}, Fb::Reduce::Sum);
+        mayBeginFuture.wait();
         texts[rank] = outcomeOf([&] {
             auto frame = fb.begin();
             auto tile = std::make_unique<Fb::Tile>();

@@ -387,9 +387,10 @@ TEST_CASE("A tile operation that has enough ends its tile early", "[operations]"
                     open.setTile(*tile);
                 }
             const auto report = open.end();
-            if (fb.isDisplayRank())
+            if (fb.isDisplayRank()) {
                 wrong[frame] = isOpaque(Picture(fb.image(), report));
-            late[frame] = report.lateMessages;
+                late[frame] = report.lateMessages;
+            }
         }
     });
     CHECK(wrong == std::vector<std::size_t>(2));

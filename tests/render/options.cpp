@@ -1,0 +1,229 @@
+// The command line of the bundled renderer.
+#include "support.hpp"
+
+#include <options.hpp>
+
+#include <string>
+#include <vector>
+
+using namespace example;
+
+namespace {
+
+ParsedOptions parse(const std::vector<std::string>& words)
+{
+    std::vector<const char*> arguments{"dfb_render"};
+    for (const std::string& word : words)
+        arguments.push_back(word.c_str());
+    return parseOptions(static_cast<int>(arguments.size()), arguments.data());
+}
+
+Options options(const std::vector<std::string>& words)
+{
+    const ParsedOptions parsed = parse(words);
+    INFO(parsed.message);
+    REQUIRE(parsed.options);
+    CHECK(parsed.exitCode == 0);
+    return *parsed.options;
+}
+
+// Of the scene demo with these words behind.
+void checkRefused(std::vector<std::string> words)
+{
+    words.insert(words.begin(), "demo");
+    std::string line;
+    for (const std::string& word : words)
+        line += word + ' ';
+    INFO(line);
+    const ParsedOptions parsed = parse(words);
+    CHECK_FALSE(parsed.options);
+    CHECK(parsed.exitCode != 0);
+    CHECK(parsed.exitCode < 256); // or it may come out as 0
+    CHECK(parsed.exitCode % 256 != 0);
+    CHECK(test::isLineWith(parsed.message, "dfb_render: "));
+    CHECK(test::contains(parsed.message, words[1].substr(0, words[1].find('=')))); // names the option
+}
+
+} // namespace
+
+TEST_CASE("Without options they have the values that the help says", "[options]")
+{
+    const Options o = options({"demo"});
+    CHECK(o.scene == std::vector<std::string>{"demo"});
+    CHECK(o.fit);
+    CHECK(o.mode == Mode::Data);
+    CHECK(o.ranks == 0);
+    CHECK(o.bricks == 0);
+    CHECK(o.threads == 0);
+    CHECK(o.compression == Compression::None);
+    CHECK(o.ownerMap == OwnerMap::Lattice);
+    CHECK(o.width == 1024);
+    CHECK(o.height == 1024);
+    CHECK(o.frames == 1);
+    CHECK(o.spp == 1);
+    CHECK(o.seed == 1);
+    CHECK(o.earlyTermination == 0.0f);
+    CHECK_FALSE(o.background);
+    CHECK(o.output.empty());
+    CHECK(o.stats.empty());
+}
+
+TEST_CASE("Every option arrives", "[options]")
+{
+    const Options o = options({"a.ply",
+                               "--mode",
+                               "image",
+                               "b_2x2x2_uint8.raw",
+                               "--ranks",
+                               "7",
+                               "--bricks=9",
+                               "--threads",
+                               "3",
+                               "--compression",
+                               "snappy",
+                               "--owner-map",
+                               "hash",
+                               "--size",
+                               "1x65536",
+                               "--frames",
+                               "36",
+                               "--spp",
+                               "4",
+                               "--seed",
+                               "9007199254740991",
+                               "--azimuth",
+                               "-90",
+                               "--elevation",
+                               "45.5",
+                               "--fov",
+                               "60",
+                               "--camera-distance",
+                               "0.5",
+                               "--opacity",
+                               "1",
+                               "--early-termination",
+                               "0.01",
+                               "--background",
+                               "0,0.5,1",
+                               "--exposure",
+                               "2",
+                               "--output",
+                               "o.png",
+                               "--alpha",
+                               "a.pfm",
+                               "--depth",
+                               "d.pfm",
+                               "--stats",
+                               "s.json",
+                               "--no-fit",
+                               "c.obj",
+                               "d.xyz"});
+    CHECK(o.scene == std::vector<std::string>{"a.ply", "b_2x2x2_uint8.raw", "c.obj", "d.xyz"});
+    CHECK_FALSE(o.fit);
+    CHECK(o.mode == Mode::Image);
+    CHECK(o.ranks == 7);
+    CHECK(o.bricks == 9);
+    CHECK(o.threads == 3);
+    CHECK(o.compression == Compression::Snappy);
+    CHECK(o.ownerMap == OwnerMap::Hash);
+    CHECK(o.width == 1);
+    CHECK(o.height == 65536);
+    CHECK(o.frames == 36);
+    CHECK(o.spp == 4);
+    CHECK(o.seed == 9007199254740991u);
+    CHECK(o.view.azimuth == -90.0f);
+    CHECK(o.view.elevation == 45.5f);
+    CHECK(o.view.fieldOfView == 60.0f);
+    CHECK(o.view.distance == 0.5f);
+    CHECK(o.opacity == 1.0f);
+    CHECK(o.earlyTermination == 0.01f);
+    REQUIRE(o.background);
+    CHECK((*o.background)[1] == 0.5f);
+    CHECK(o.exposure == 2.0f);
+    CHECK(o.output == "o.png");
+    CHECK(o.alpha == "a.pfm");
+    CHECK(o.depth == "d.pfm");
+    CHECK(o.stats == "s.json");
+    CHECK(options({"synthetic", "--owner-map", "linear"}).ownerMap == OwnerMap::Linear);
+    CHECK(options({"synthetic", "--mode", "data", "--output", "dir.d/o.pfm"}).output == "dir.d/o.pfm");
+}
+
+TEST_CASE("What is wrong on the command line is refused in one line that names it", "[options]")
+{
+    for (const std::string size :
+         {"0x5",   "5x0",  "0x0",     "65537x5", "5x65537", "-5x5", "5x-5",         "5",
+          "x",     "5x",   "x5",      "5x5x5",   "5X5",     "5 x5", "4294967297x5", "99999999999999999999x5",
+          "1.5x5", "wide", "nanxnan", ""})
+        checkRefused({"--size", size});
+    for (const std::string option : {"--ranks", "--frames", "--spp"})
+        for (const std::string value :
+             {"0", "-1", "nan", "inf", "1.5", "", " ", "two", "3x", "2147483648", "99999999999999999999"})
+            checkRefused({option, value});
+    for (const std::string option : {"--bricks", "--threads", "--seed"})
+        for (const std::string value : {"-1", "nan", "inf", "-inf", "1.5", "two", "99999999999999999999"})
+            checkRefused({option, value});
+    for (const std::string option :
+         {"--azimuth", "--elevation", "--fov", "--camera-distance", "--opacity", "--early-termination", "--exposure"})
+        for (const std::string value : {"nan", "inf", "-inf", "1e30", "much", "1,5", ""})
+            checkRefused({option, value});
+    checkRefused({"--fov", "0"});
+    checkRefused({"--camera-distance", "-1"});
+    checkRefused({"--opacity", "1.01"});
+    checkRefused({"--opacity", "-0.01"});
+    checkRefused({"--background", "1,1"});
+    checkRefused({"--background", "1,nan,1"});
+    checkRefused({"--background", "1,1,2"});
+    for (const std::string option : {"--mode", "--compression", "--owner-map"})
+        for (const std::string value : {"best", "0", "", "Data"})
+            checkRefused({option, value});
+    for (const std::string value : {"o.jpg", "o", ".png", "o.PNG", "o.png.txt", ""})
+        checkRefused({"--output", value});
+    checkRefused({"--alpha", "a.png"});
+    checkRefused({"--depth", "d.png"});
+    checkRefused({"--stats", "s.txt"});
+    checkRefused({"--sizes", "5x5"});
+    checkRefused({"--size"});
+    checkRefused({"--stats"});
+    checkRefused({"-q"});
+}
+
+TEST_CASE("A scene must be named", "[options]")
+{
+    for (const std::vector<std::string>& words : std::vector<std::vector<std::string>>{{},
+                                                                                       {"--size", "5x5"},
+                                                                                       {""},
+                                                                                       {"demos"},
+                                                                                       {"a.stl"},
+                                                                                       {"bunny"},
+                                                                                       {"a.ply", "a.raw.gz"},
+                                                                                       {".raw"},
+                                                                                       {"a.ply", "synthetic"},
+                                                                                       {"demo", "synthetic"},
+                                                                                       {"demo", "a.ply"},
+                                                                                       {"a.ply", "a.stl"}}) {
+        const ParsedOptions parsed = parse(words);
+        INFO(parsed.message);
+        CHECK_FALSE(parsed.options);
+        CHECK(parsed.exitCode != 0);
+        CHECK(test::isLineWith(parsed.message, "dfb_render: "));
+    }
+}
+
+TEST_CASE("The help says it all", "[options]")
+{
+    for (const char* flag : {"--help", "-h"}) {
+        const ParsedOptions parsed = parse({flag});
+        CHECK_FALSE(parsed.options);
+        CHECK(parsed.exitCode == 0);
+        for (const std::string word :
+             {"--mode",    "--ranks",  "--size",    "--frames", "--spp",         "--bricks",    "--seed",
+              "--threads", "--output", "--stats",   "--no-fit", "--compression", "--owner-map", "--early-termination",
+              "--opacity", "--help",   "synthetic", "demo",     ".raw",          "_XxYxZ_",     "uint8",
+              "uint16",    "float32",  ".ply",      ".obj",     ".xyz",          ".png",        ".pfm",
+              "data",      "image",    "65536",     "mpiexec"}) {
+            INFO(word);
+            CHECK(test::contains(parsed.message, word));
+        }
+    }
+    CHECK(parse({"demo", "--size", "9x9", "--help"}).exitCode == 0);
+}

@@ -1,0 +1,239 @@
+// What the bundled renderer writes, read back.
+#include "support.hpp"
+
+#include <output.hpp>
+
+#include <dfb/image.hpp>
+
+#include <cmath>
+#include <cstdint>
+#include <limits>
+#include <random>
+#include <sstream>
+#include <string>
+#include <vector>
+
+using namespace example;
+using test::errorOf;
+using test::isLineWith;
+
+namespace {
+
+// Premultiplied RGBA with values that 8 bits can not tell apart, beyond 1, and the least there is.
+std::vector<float> pixels(int width, int height)
+{
+    std::mt19937 random(7);
+    std::vector<float> rgba(static_cast<std::size_t>(4 * width * height));
+    for (float& value : rgba)
+        value = static_cast<float>(random() >> 8) * 0x1.0p-24f;
+    rgba[0] = std::numeric_limits<float>::denorm_min();
+    rgba[1] = 1.5f;
+    rgba[2] = 0.0f;
+    return rgba;
+}
+
+struct Pfm {
+    std::string kind;
+    int width = 0, height = 0;
+    double scale = 0;
+    std::vector<float> values; // row 0 on top
+};
+
+Pfm readPfm(const std::string& path)
+{
+    std::ifstream stream(path, std::ios::binary);
+    Pfm pfm;
+    stream >> pfm.kind >> pfm.width >> pfm.height >> pfm.scale;
+    REQUIRE(stream);
+    REQUIRE(stream.get() == '\n');
+    const std::size_t row = static_cast<std::size_t>((pfm.kind == "PF" ? 3 : 1) * pfm.width);
+    pfm.values.resize(row * static_cast<std::size_t>(pfm.height));
+    for (int y = pfm.height - 1; y >= 0; --y)
+        stream.read(reinterpret_cast<char*>(pfm.values.data() + row * static_cast<std::size_t>(y)),
+                    static_cast<std::streamsize>(4 * row));
+    REQUIRE(stream);
+    CHECK(stream.get() == std::ifstream::traits_type::eof());
+    return pfm;
+}
+
+std::vector<std::uint8_t> readPng(const std::string& path, int& width, int& height)
+{
+    png_image image{};
+    image.version = PNG_IMAGE_VERSION;
+    REQUIRE(png_image_begin_read_from_file(&image, path.c_str()) != 0);
+    CHECK(image.format == PNG_FORMAT_RGB); // as it is in the file
+    std::vector<std::uint8_t> rgb(PNG_IMAGE_SIZE(image));
+    REQUIRE(png_image_finish_read(&image, nullptr, rgb.data(), 0, nullptr) != 0);
+    width = static_cast<int>(image.width);
+    height = static_cast<int>(image.height);
+    return rgb;
+}
+
+RunStats someStats()
+{
+    RunStats stats;
+    stats.ranks = 3;
+    stats.transport = "inproc";
+    stats.mode = "data";
+    stats.width = 640;
+    stats.height = 480;
+    stats.imageHash = "00ff00ff00ff00ff";
+    stats.meanAlpha = 0.25;
+    stats.frames.resize(2);
+    stats.frames[1].totalMs = 12.5;
+    stats.frames[1].renderMsMax = 10.25;
+    stats.frames[1].compositingOverheadMs = 1.125;
+    stats.frames[1].bytesSent = 5000000000u;
+    stats.frames[1].messagesSent = 77;
+    stats.frames[1].tilesTotal = 80;
+    stats.frames[1].tilesTouched = 70;
+    stats.frames[1].peakMemoryBytes = 6000000000u;
+    return stats;
+}
+
+} // namespace
+
+TEST_CASE("A PFM is read back equal", "[output]")
+{
+    const test::TemporaryFolder folder;
+    for (const auto& [width, height] : {std::pair{7, 5}, std::pair{1, 1}, std::pair{300, 2}}) {
+        const std::vector<float> rgba = pixels(width, height);
+        writePfm(folder / "color.pfm", width, height, rgba.data());
+        writeGreyPfm(folder / "alpha.pfm", width, height, rgba.data() + 3, 4);
+        const Pfm color = readPfm(folder / "color.pfm"), alpha = readPfm(folder / "alpha.pfm");
+        CHECK(color.kind == "PF");
+        CHECK(alpha.kind == "Pf");
+        CHECK(color.scale == -1.0); // little-endian
+        CHECK(alpha.scale == -1.0);
+        for (const Pfm* pfm : {&color, &alpha}) {
+            CHECK(pfm->width == width);
+            CHECK(pfm->height == height);
+        }
+        std::vector<float> expectedColor, expectedAlpha;
+        for (std::size_t i = 0; i < rgba.size(); ++i)
+            (i % 4 == 3 ? expectedAlpha : expectedColor).push_back(rgba[i]);
+        CHECK(color.values == expectedColor);
+        CHECK(alpha.values == expectedAlpha);
+    }
+    const std::vector<float> depth{1, 2, std::numeric_limits<float>::infinity(), 4, 5, 6};
+    writeGreyPfm(folder / "depth.pfm", 3, 2, depth.data(), 1);
+    CHECK(readPfm(folder / "depth.pfm").values == depth);
+}
+
+TEST_CASE("A PNG holds the pixels that the library converts to sRGB", "[output]")
+{
+    const test::TemporaryFolder folder;
+    const int width = 61, height = 33;
+    const std::vector<float> rgba = pixels(width, height);
+    std::vector<std::uint8_t> srgba(rgba.size());
+    dfb::convertPixels(rgba.data(), width * height, dfb::OutputFormat::SRGBA8,
+                       reinterpret_cast<std::byte*>(srgba.data()));
+    writePng(folder / "image.png", width, height, srgba.data());
+
+    int gotWidth = 0, gotHeight = 0;
+    const std::vector<std::uint8_t> rgb = readPng(folder / "image.png", gotWidth, gotHeight);
+    CHECK(gotWidth == width);
+    CHECK(gotHeight == height);
+    std::vector<std::uint8_t> expected;
+    for (std::size_t i = 0; i < srgba.size(); ++i)
+        if (i % 4 != 3)
+            expected.push_back(srgba[i]);
+    CHECK(rgb == expected);
+}
+
+TEST_CASE("The hash is that of the floats", "[output]")
+{
+    // XXH3 with 64 bits as its specification and xxhsum have it.
+    CHECK(hashPixels(nullptr, 0) == "2d06800538d394c2");
+    const std::vector<float> one{0.25f, 0.5f, 0.75f, 1.0f};
+    CHECK(hashPixels(one.data(), 1) == "4de916efb99ec738");
+    std::vector<float> many(4 * 1000);
+    for (std::size_t i = 0; i < many.size(); ++i)
+        many[i] = static_cast<float>(i) / 4096.0f;
+    const std::string hash = hashPixels(many.data(), 1000);
+    CHECK(hash == "84a6bbf09ce29fc9");
+
+    // Every bit of every channel counts, and so does the order.
+    for (const std::size_t i : {0, 1, 2, 3, 1999, 3999}) {
+        std::vector<float> other = many;
+        other[i] = std::nextafter(other[i], 2.0f);
+        CHECK(hashPixels(other.data(), 1000) != hash);
+    }
+    std::swap(many[40], many[44]);
+    CHECK(hashPixels(many.data(), 1000) != hash);
+    CHECK(hashPixels(many.data(), 999) != hash);
+}
+
+TEST_CASE("The mean of alpha", "[output]")
+{
+    const std::vector<float> rgba{9, 9, 9, 0.25f, 9, 9, 9, 0.75f, 0, 0, 0, 0.5f, 9, 9, 9, 0};
+    CHECK(meanAlpha(rgba.data(), 4) == 0.375);
+    CHECK(meanAlpha(nullptr, 0) == 0.0);
+}
+
+TEST_CASE("The statistics have every field that a reader of them looks for", "[output]")
+{
+    const test::TemporaryFolder folder;
+    writeStats(folder / "stats.json", someStats());
+    std::ifstream stream(folder / "stats.json");
+    const nlohmann::json json = nlohmann::json::parse(stream);
+    CHECK(json.at("ranks") == 3);
+    CHECK(json.at("transport") == "inproc");
+    CHECK(json.at("mode") == "data");
+    CHECK(json.at("width") == 640);
+    CHECK(json.at("height") == 480);
+    CHECK(json.at("image_hash") == "00ff00ff00ff00ff");
+    CHECK(json.at("mean_alpha") == 0.25);
+    REQUIRE(json.at("frames").is_array());
+    REQUIRE(json.at("frames").size() == 2);
+    for (const auto& frame : json.at("frames"))
+        for (const char* name : {"total_ms", "render_ms_max", "compositing_overhead_ms", "bytes_sent", "messages_sent",
+                                 "tiles_total", "tiles_touched", "peak_memory_bytes"})
+            CHECK(frame.at(name).is_number());
+    const auto& frame = json.at("frames").at(1);
+    CHECK(frame.at("total_ms") == 12.5);
+    CHECK(frame.at("render_ms_max") == 10.25);
+    CHECK(frame.at("compositing_overhead_ms") == 1.125);
+    CHECK(frame.at("bytes_sent") == 5000000000u);
+    CHECK(frame.at("messages_sent") == 77);
+    CHECK(frame.at("tiles_total") == 80);
+    CHECK(frame.at("tiles_touched") == 70);
+    CHECK(frame.at("peak_memory_bytes") == 6000000000u);
+}
+
+TEST_CASE("What can not be written is an error that names the file", "[output]")
+{
+    const test::TemporaryFolder folder;
+    std::filesystem::create_directory(folder / "folder");
+    const std::vector<float> rgba = pixels(64, 64);
+    const std::vector<std::uint8_t> srgba(rgba.size());
+    std::vector<std::string> paths{folder / "none/x", folder / "folder", ""};
+    const std::string full = "/dev/full"; // takes no byte, says so only when it is written to
+    if (std::filesystem::exists(full))
+        paths.push_back(full);
+    for (const std::string& path : paths) {
+        INFO(path);
+        const std::string why = path + ": cannot be written: ";
+        CHECK(isLineWith(errorOf([&] { writePfm(path, 64, 64, rgba.data()); }), why));
+        CHECK(isLineWith(errorOf([&] { writeGreyPfm(path, 64, 64, rgba.data(), 4); }), why));
+        CHECK(isLineWith(errorOf([&] { writePng(path, 64, 64, srgba.data()); }), why));
+        CHECK(isLineWith(errorOf([&] { writeStats(path, someStats()); }), why));
+        if (path != full)
+            CHECK(isLineWith(errorOf([&] { requireWritable(path); }), why));
+    }
+    CHECK(std::filesystem::is_directory(folder / "folder"));
+    if (paths.back() == full)
+        CHECK(std::filesystem::exists(full));
+}
+
+TEST_CASE("To ask whether a file can be written leaves all as it is", "[output]")
+{
+    const test::TemporaryFolder folder;
+    requireWritable(folder / "new");
+    CHECK_FALSE(std::filesystem::exists(folder / "new"));
+    const std::string old = folder.write("old", "text");
+    requireWritable(old);
+    std::string text;
+    std::ifstream(old) >> text;
+    CHECK(text == "text");
+}
