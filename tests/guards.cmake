@@ -17,6 +17,10 @@ add_test(NAME guard.layers
   COMMAND ${CMAKE_COMMAND} -DROOT=${_include} -P ${CMAKE_CURRENT_SOURCE_DIR}/layers.cmake)
 set_tests_properties(guard.layers PROPERTIES LABELS guard)
 
+add_test(NAME guard.readme
+  COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/readme.cmake)
+set_tests_properties(guard.readme PROPERTIES LABELS guard)
+
 # Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
 # with that component, the umbrella with each set of components, all others with nothing but our include folder.
 function(_dfb_flags_of out target)

@@ -767,7 +767,7 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
     });
     INFO(joined(texts) << "\n  late: " << late[0]);
     CHECK(allSame(texts));
-    CHECK((late[0] == 1 || has(texts[0], "FrameError: dfb: unannounced input")));
+    CHECK((late[0] >= 1 || has(texts[0], "FrameError: dfb: unannounced input")));
 }
 
 TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]")
