@@ -175,7 +175,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, most))
         ->option_text("N")
         ->group(how);
-    app.add_option("--threads", options.threads, "Threads per rank; default 0: one per hardware thread")
+    app.add_option("--threads", options.threads,
+                   "Threads per rank; default 0: the hardware threads of the machine, divided among its ranks")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(how);

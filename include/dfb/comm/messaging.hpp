@@ -8,6 +8,7 @@
 #include <dfb/comm/transport.hpp>
 #include <dfb/exec.hpp>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <condition_variable>
@@ -180,6 +181,21 @@ public:
         wait([&] { return result->there.load(); });
         expectMessages(false);
         return result->bytes;
+    }
+
+    // Collective: combines `values` element by element. Throws InvalidArgument on all ranks if their numbers differ.
+    template <class Operation>
+    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
+    {
+        const auto* first = reinterpret_cast<const std::byte*>(values.data());
+        const Bytes result = reduce(
+            Bytes(first, first + values.size() * sizeof(std::int64_t)),
+            [operation](const Bytes& a, const Bytes& b) { return ReductionTable::combineElements(a, b, operation); });
+        if (result.size() != values.size() * sizeof(std::int64_t))
+            throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
+        std::vector<std::int64_t> reduced(values.size());
+        std::copy(result.begin(), result.end(), reinterpret_cast<std::byte*>(reduced.data()));
+        return reduced;
     }
 
     void throwIfFailed()

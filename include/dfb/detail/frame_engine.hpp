@@ -179,14 +179,8 @@ public:
         report.totalMs = static_cast<double>(std::chrono::nanoseconds(Clock::now() - beginTime_).count()) / nsPerMs;
         report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
         report.compositingOverheadMs = report.totalMs - report.renderMs;
-        report.renderMsMax = static_cast<double>(verdict.maxima[1]) / nsPerMs;
-        report.bytesSent = verdict.sums[0];
-        report.messagesSent = verdict.sums[1];
         report.tilesTotal = layout().tileCount();
-        report.tilesTouched = verdict.sums[2];
-        report.nonFinitePixels = verdict.sums[3];
-        report.lateMessages = verdict.sums[4];
-        report.peakMemoryBytes = verdict.maxima[0];
+        verdict.addTo(report);
         return report;
     }
 
@@ -204,23 +198,10 @@ public:
         }
     }
 
-    // Element by element.
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
     {
-        ByteWriter out;
-        for (std::int64_t v : values)
-            out.put(v);
-        const Bytes result = messaging_->reduce(out.take(), [operation](const Bytes& a, const Bytes& b) {
-            return ReductionTable::combineElements(a, b, operation);
-        });
-        if (result.size() != values.size() * sizeof(std::int64_t))
-            throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
-        std::vector<std::int64_t> reduced(values.size());
-        ByteReader in(result);
-        for (std::int64_t& v : reduced)
-            v = in.get<std::int64_t>();
-        return reduced;
+        return messaging_->allReduce(values, operation);
     }
 
 private:

@@ -34,8 +34,8 @@ public:
     // The frame has failed on some rank, or the transport has. From any thread, as the rest.
     bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || messaging_.failed(); }
 
-    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if this
-    // rank has voted: then it is up to the others, and if they all have, it is too late.
+    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if
+    // this rank has voted: then it is up to the others, and if they all have, it is too late.
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);

@@ -100,6 +100,18 @@ struct Verdict {
         return v;
     }
 
+    // What is the same on all ranks.
+    void addTo(FrameReport& report) const
+    {
+        report.bytesSent = sums[0];
+        report.messagesSent = sums[1];
+        report.tilesTouched = sums[2];
+        report.nonFinitePixels = sums[3];
+        report.lateMessages = sums[4];
+        report.peakMemoryBytes = maxima[0];
+        report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
+    }
+
     static ErrorInfo disagreement()
     {
         ErrorInfo info;
