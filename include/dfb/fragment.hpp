@@ -60,7 +60,6 @@ public:
     std::uint32_t activePixels() const noexcept { return parts_.activePixels; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr; }
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
-    std::size_t storedBytes() const noexcept { return storage_.size(); }
 
 private:
     friend class FragmentCursor;

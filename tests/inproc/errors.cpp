@@ -19,7 +19,9 @@
 
 namespace {
 
+using scene::has;
 using scene::Loop;
+using scene::outcomeOf;
 using scene::Picture;
 using scene::Scene;
 
@@ -101,26 +103,6 @@ dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
     config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
     return config;
 }
-
-// What came out of a call, as text.
-template <class Call>
-std::string outcomeOf(const Call& call)
-{
-    try {
-        call();
-    } catch (const dfb::FrameError& e) {
-        return std::string("FrameError: ") + e.what();
-    } catch (const dfb::InvalidArgument& e) {
-        return std::string("InvalidArgument: ") + e.what();
-    } catch (const dfb::TransportError& e) {
-        return std::string("TransportError: ") + e.what();
-    } catch (const std::exception& e) {
-        return std::string("exception: ") + e.what();
-    }
-    return "fine";
-}
-
-bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 bool allSame(const std::vector<std::string>& texts)
 {
@@ -244,8 +226,8 @@ struct CopyCodec final : dfb::Codec {
     }
 };
 
-// What each rank got out of making a framebuffer when `change(rank, config)` was done to its configuration. A good one on the
-// same communicator follows.
+// What each rank got out of making a framebuffer when `change(rank, config)` was done to its configuration. A good one
+// on the same communicator follows.
 std::vector<std::string> constructed(int ranks, const std::function<void(int, dfb::FrameBufferConfig&)>& change)
 {
     std::vector<std::string> texts(static_cast<std::size_t>(ranks));
@@ -254,7 +236,8 @@ std::vector<std::string> constructed(int ranks, const std::function<void(int, df
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
         change(communicator.rank(), config);
-        texts[static_cast<std::size_t>(communicator.rank())] = outcomeOf([&] { FrameBuffer<Blend> fb(communicator, config); });
+        texts[static_cast<std::size_t>(communicator.rank())] =
+            outcomeOf([&] { FrameBuffer<Blend> fb(communicator, config); });
         FrameBuffer<Blend> fb(communicator, configOf(s));
         const auto report = scene::renderLoop(fb, s, Loop::Declared);
         if (fb.isDisplayRank())
@@ -399,11 +382,14 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
     // Different on one.
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.width += rank == 1; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.height += rank == 0; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.format = rank == 1 ? dfb::OutputFormat::RGBA8 : c.format; }));
+    CHECK(refused(
+        [](int rank, dfb::FrameBufferConfig& c) { c.format = rank == 1 ? dfb::OutputFormat::RGBA8 : c.format; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.depth = rank != 1; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.displayRank = rank == 1; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.ownerMap = rank == 1 ? dfb::hashOwner : dfb::linearOwner; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.codec = rank == 1 ? std::make_shared<CopyCodec>() : nullptr; }));
+    CHECK(refused(
+        [](int rank, dfb::FrameBufferConfig& c) { c.ownerMap = rank == 1 ? dfb::hashOwner : dfb::linearOwner; }));
+    CHECK(refused(
+        [](int rank, dfb::FrameBufferConfig& c) { c.codec = rank == 1 ? std::make_shared<CopyCodec>() : nullptr; }));
 
     std::vector<std::string> texts(3);
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
@@ -524,8 +510,9 @@ TEST_CASE("An exception in a renderer fails the frame on every rank", "[errors]"
                         throw std::runtime_error("the renderer broke");
                 };
                 if (declared)
-                    dfb::renderDataParallel(fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {97, 61, 1}}}}),
-                                            scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) { render(tile); });
+                    dfb::renderDataParallel(
+                        fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {97, 61, 1}}}}),
+                        scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) { render(tile); });
                 else
                     dfb::renderImageParallel(fb, render);
             });
@@ -675,17 +662,22 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
     const int index = 5;
     struct Mistake {
         const char* name;
-        std::function<void(const std::function<void(int, std::uint32_t, std::uint16_t, int)>&)> inputs; // generation, source, part, children
+        std::function<void(const std::function<void(int, std::uint32_t, std::uint16_t, int)>&)>
+            inputs; // generation, source, part, children
         std::vector<std::string> parts;
     };
     const std::vector<Mistake> mistakes{
-        {"too many", [](const auto& in) { in(1, 50, 0, 0), in(1, 51, 0, 0), in(1, 52, 0, 0), in(0, 9, 0, 2); },
+        {"too many",
+         [](const auto& in) { in(1, 50, 0, 0), in(1, 51, 0, 0), in(1, 52, 0, 0), in(0, 9, 0, 2); },
          {"too many inputs", "generation 1", "expected 2, got 3", "source 5"}},
-        {"too many roots", [](const auto& in) { in(0, 9, 0, 1), in(0, 8, 0, 1); },
+        {"too many roots",
+         [](const auto& in) { in(0, 9, 0, 1), in(0, 8, 0, 1); },
          {"too many inputs", "generation 0", "source 8", "expected 1, got 2"}},
-        {"duplicate", [](const auto& in) { in(1, 50, 3, 0), in(1, 50, 3, 0), in(0, 9, 0, 2); },
+        {"duplicate",
+         [](const auto& in) { in(1, 50, 3, 0), in(1, 50, 3, 0), in(0, 9, 0, 2); },
          {"duplicate input", "generation 1", "source 50", "expected 1, got 2"}},
-        {"unannounced", [](const auto& in) { in(2, 50, 0, 0), in(1, 51, 0, 0), in(0, 9, 0, 1); },
+        {"unannounced",
+         [](const auto& in) { in(2, 50, 0, 0), in(1, 51, 0, 0), in(0, 9, 0, 1); },
          {"unannounced input", "generation 2", "source 50", "expected 0, got 1"}},
     };
     for (const Mistake& mistake : mistakes)
@@ -726,8 +718,9 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
         // The first reduction message of rank 2 in the frame is its vote.
         if (from == 2 && header.kind == dfb::detail::MessageKind::ReduceUp && inFrame.exchange(false))
             ownerVoted.set_value();
-        const bool extra = header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
-                           && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 99;
+        const bool extra =
+            header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
+            && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 99;
         return from == 1 && extra ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
     };
     const Scene s = scene::makeScene(0, 1, 16, 16);
@@ -780,11 +773,26 @@ TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]"
         std::vector<std::string> parts;
     };
     const std::vector<Mistake> mistakes{
-        {"another source", {{5, 50, 0}}, {{5, 51, 0}, {5, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
-        {"another part", {{5, 50, 0}}, {{5, 50, 1}, {5, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 50", "expected 0, got 1"}},
-        {"a tile that nobody declared", {{4, 50, 0}}, {{5, 51, 0}, {4, 50, 0}}, {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
-        {"declared twice", {{5, 50, 0}, {5, 50, 0}}, {{5, 50, 0}}, {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
-        {"sent twice", {{5, 50, 0}, {5, 51, 0}}, {{5, 50, 0}, {5, 50, 0}, {5, 51, 0}}, {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
+        {"another source",
+         {{5, 50, 0}},
+         {{5, 51, 0}, {5, 50, 0}},
+         {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
+        {"another part",
+         {{5, 50, 0}},
+         {{5, 50, 1}, {5, 50, 0}},
+         {"unannounced input", "tile 5", "generation 1", "source 50", "expected 0, got 1"}},
+        {"a tile that nobody declared",
+         {{4, 50, 0}},
+         {{5, 51, 0}, {4, 50, 0}},
+         {"unannounced input", "tile 5", "generation 1", "source 51", "expected 0, got 1"}},
+        {"declared twice",
+         {{5, 50, 0}, {5, 50, 0}},
+         {{5, 50, 0}},
+         {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
+        {"sent twice",
+         {{5, 50, 0}, {5, 51, 0}},
+         {{5, 50, 0}, {5, 50, 0}, {5, 51, 0}},
+         {"duplicate input", "tile 5", "generation 1", "source 50", "expected 1, got 2"}},
     };
     for (const Mistake& mistake : mistakes)
         for (int culprit = 0; culprit < 3; ++culprit)
@@ -808,7 +816,8 @@ TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]"
                         sendAll();
                     frame.end();
                 });
-                INFO(mistake.name << " on rank " << culprit << (sendFirst ? ", sent before" : ", sent after") << joined(bad.texts));
+                INFO(mistake.name << " on rank " << culprit << (sendFirst ? ", sent before" : ", sent after")
+                                  << joined(bad.texts));
                 CHECK(allSame(bad.texts));
                 CHECK(has(bad.texts[0], "FrameError"));
                 CHECK(has(bad.texts[0], "rank 1"));
@@ -872,8 +881,9 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
     const Scene s = scene::makeScene(0, 1, 97, 61);
     const auto board = std::make_shared<Switchboard>();
     board->inspect = [](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer&) {
-        return from == 1 && header.kind == dfb::detail::MessageKind::Fragment && header.number == 1 ? Switchboard::Verdict::Hold
-                                                                                                  : Switchboard::Verdict::Pass;
+        return from == 1 && header.kind == dfb::detail::MessageKind::Fragment && header.number == 1
+                   ? Switchboard::Verdict::Hold
+                   : Switchboard::Verdict::Pass;
     };
     std::string first;
     std::vector<std::int64_t> late;

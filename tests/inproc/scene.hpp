@@ -1,5 +1,6 @@
-// Scene: bricks whose pixels are a pure function of (seed, brick, pass, pixel), the loops that render them on any number
-// of ranks, and the reference image of the same scene. For the tests with ranks in one process and those with MPI.
+// Scene: bricks whose pixels are a pure function of (seed, brick, pass, pixel), the loops that render them on any
+// number of ranks, and the reference image of the same scene. For the tests with ranks in one process and those with
+// MPI.
 #pragma once
 
 #include "../reference.hpp"
@@ -25,7 +26,8 @@ namespace scene {
 struct FlatCamera {
     dfb::Region project(const dfb::Box3& b, int, int) const
     {
-        return {static_cast<int>(b.lower.x), static_cast<int>(b.lower.y), static_cast<int>(b.upper.x), static_cast<int>(b.upper.y)};
+        return {static_cast<int>(b.lower.x), static_cast<int>(b.lower.y), static_cast<int>(b.upper.x),
+                static_cast<int>(b.upper.y)};
     }
 };
 
@@ -57,9 +59,10 @@ inline Scene makeScene(int brickCount, std::uint64_t seed = 1, int width = 97, i
         const int v = std::max(1, static_cast<int>((h >> 16) % static_cast<std::uint64_t>(height)) / 2 + height / 8);
         const int x = static_cast<int>((h >> 32) % static_cast<std::uint64_t>(width));
         const int y = static_cast<int>((h >> 48) % static_cast<std::uint64_t>(height));
-        s.bricks.push_back({static_cast<std::uint32_t>(10 + 3 * i),
-                            {{static_cast<float>(x), static_cast<float>(y), 0},
-                             {static_cast<float>(std::min(width, x + w)), static_cast<float>(std::min(height, y + v)), 1}}});
+        s.bricks.push_back(
+            {static_cast<std::uint32_t>(10 + 3 * i),
+             {{static_cast<float>(x), static_cast<float>(y), 0},
+              {static_cast<float>(std::min(width, x + w)), static_cast<float>(std::min(height, y + v)), 1}}});
     }
     return s;
 }
@@ -69,8 +72,8 @@ inline std::optional<reference::Sample> sampleOf(const Scene& s, const dfb::Bric
 {
     if (!FlatCamera().project(brick.bounds, s.width, s.height).contains(x, y))
         return std::nullopt;
-    const std::uint64_t h = mix(mix(mix(s.seed ^ mix(brick.id)) + static_cast<std::uint64_t>(pass)) + static_cast<std::uint64_t>(y) * 65536
-                                + static_cast<std::uint64_t>(x));
+    const std::uint64_t h = mix(mix(mix(s.seed ^ mix(brick.id)) + static_cast<std::uint64_t>(pass))
+                                + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
     if (h % 8 == 0)
         return std::nullopt;
     reference::Sample sample;
@@ -110,7 +113,9 @@ inline std::vector<dfb::Brick> bricksOf(const Scene& s, int rank, int rankCount,
     std::vector<dfb::Brick> mine;
     for (std::size_t i = 0; i < s.bricks.size(); ++i) {
         const auto n = static_cast<std::uint64_t>(rankCount);
-        const std::uint64_t owner = deal < 0 ? n - 1 : deal == 0 ? i % n : mix(i * 7 + static_cast<std::uint64_t>(deal)) % n;
+        const std::uint64_t owner = deal < 0    ? n - 1
+                                    : deal == 0 ? i % n
+                                                : mix(i * 7 + static_cast<std::uint64_t>(deal)) % n;
         if (static_cast<int>(owner) == rank)
             mine.push_back(s.bricks[i]);
     }
@@ -118,10 +123,10 @@ inline std::vector<dfb::Brick> bricksOf(const Scene& s, int rank, int rankCount,
 }
 
 enum class Loop {
-    Listing3,    // by hand, as in the paper: the owner sends a background tile that announces the bricks
-    Declared,    // renderDataParallel
-    ImageOwned,  // renderImageParallel of owned tiles; the scene has one brick
-    ImageDealt   // renderImageParallel of tiles dealt out otherwise
+    Listing3,   // by hand, as in the paper: the owner sends a background tile that announces the bricks
+    Declared,   // renderDataParallel
+    ImageOwned, // renderImageParallel of owned tiles; the scene has one brick
+    ImageDealt  // renderImageParallel of tiles dealt out otherwise
 };
 
 inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
@@ -133,7 +138,8 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
     auto frame = fb.begin(paramsOf(s));
     const auto tile = std::make_unique<typename FrameBuffer::Tile>();
     const auto meets = [&](const dfb::Brick& brick, int index) {
-        return !dfb::intersection(FlatCamera().project(brick.bounds, s.width, s.height), fb.layout().region(index)).empty();
+        return !dfb::intersection(FlatCamera().project(brick.bounds, s.width, s.height), fb.layout().region(index))
+                    .empty();
     };
     for (int pass = 0; pass < s.passes; ++pass) {
         for (int index : fb.ownedTiles()) {
@@ -174,8 +180,9 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
     }
     dfb::FrameParams params = paramsOf(s);
     params.declarationKey = declarationKey;
-    return dfb::renderDataParallel(fb, dfb::World(mine), FlatCamera(),
-                                   [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); }, params);
+    return dfb::renderDataParallel(
+        fb, dfb::World(mine), FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); },
+        params);
 }
 
 // What the display rank had after a frame.
@@ -198,7 +205,8 @@ struct Picture {
 
     std::uint64_t hash() const
     {
-        return reference::hashOf(bytes.data(), bytes.size()) ^ 3 * reference::hashOf(depth.data(), depth.size() * sizeof(float));
+        return reference::hashOf(bytes.data(), bytes.size())
+               ^ 3 * reference::hashOf(depth.data(), depth.size() * sizeof(float));
     }
     float value(std::size_t i) const
     {
@@ -249,5 +257,25 @@ inline std::size_t wrongValues(const Picture& picture, const std::vector<referen
     }
     return wrong;
 }
+
+// What came out of a call, as text.
+template <class Call>
+std::string outcomeOf(const Call& call)
+{
+    try {
+        call();
+    } catch (const dfb::FrameError& e) {
+        return std::string("FrameError: ") + e.what();
+    } catch (const dfb::InvalidArgument& e) {
+        return std::string("InvalidArgument: ") + e.what();
+    } catch (const dfb::TransportError& e) {
+        return std::string("TransportError: ") + e.what();
+    } catch (const std::exception& e) {
+        return std::string("exception: ") + e.what();
+    }
+    return "fine";
+}
+
+inline bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 } // namespace scene

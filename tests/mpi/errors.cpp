@@ -1,8 +1,7 @@
 // What goes wrong, over MPI: the same error on every rank, no hang, and the next frame is right.
-#include "catch.hpp"
 #include "../inproc/scene.hpp"
-
-#include <mpi.h>
+#include "catch.hpp"
+#include "ranks.hpp"
 
 #include <algorithm>
 #include <functional>
@@ -13,7 +12,9 @@
 
 namespace {
 
+using scene::has;
 using scene::Loop;
+using scene::outcomeOf;
 using scene::Scene;
 
 // Throws on one rank, in add or finish.
@@ -61,20 +62,6 @@ struct FaultyPixelOp {
 
 using FrameBuffer = dfb::DistributedFrameBuffer<Faulty, FaultyPixelOp>;
 
-int worldRank()
-{
-    int rank = 0;
-    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
-    return rank;
-}
-
-int worldSize()
-{
-    int size = 0;
-    MPI_Comm_size(MPI_COMM_WORLD, &size);
-    return size;
-}
-
 dfb::FrameBufferConfig configOf(const Scene& s)
 {
     dfb::FrameBufferConfig config;
@@ -84,23 +71,6 @@ dfb::FrameBufferConfig configOf(const Scene& s)
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
     return config;
 }
-
-template <class Call>
-std::string outcomeOf(const Call& call)
-{
-    try {
-        call();
-    } catch (const dfb::FrameError& e) {
-        return std::string("FrameError: ") + e.what();
-    } catch (const dfb::InvalidArgument& e) {
-        return std::string("InvalidArgument: ") + e.what();
-    } catch (const std::exception& e) {
-        return std::string("exception: ") + e.what();
-    }
-    return "fine";
-}
-
-bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 // Whether all ranks have the same text.
 bool sameEverywhere(const std::string& text)
@@ -122,7 +92,7 @@ bool goodFrame(Fb& fb, const Scene& s)
 // The ranks that are to blame in turn: the first, one in the middle, the last.
 std::vector<int> culprits()
 {
-    std::vector<int> ranks{0, worldSize() / 2, worldSize() - 1};
+    std::vector<int> ranks{0, sizeOf(MPI_COMM_WORLD) / 2, sizeOf(MPI_COMM_WORLD) - 1};
     ranks.erase(std::unique(ranks.begin(), ranks.end()), ranks.end());
     return ranks;
 }
@@ -132,7 +102,7 @@ std::vector<int> culprits()
 TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
 {
     const Scene s = scene::makeScene(9);
-    FrameBuffer fb(MPI_COMM_WORLD, configOf(s), {worldRank(), {}});
+    FrameBuffer fb(MPI_COMM_WORLD, configOf(s), {rankIn(MPI_COMM_WORLD), {}});
     const dfb::World world(scene::bricksOf(s, fb.rank(), fb.size()));
     enum class In { Renderer, Add, Finish, PixelOp };
     for (const int culprit : culprits())
@@ -166,7 +136,9 @@ TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
             INFO("rank " << culprit << ", in " << static_cast<int>(in) << ": " << text);
             CHECK(same);
             CHECK(has(text, "FrameError: dfb: exception in user code: rank " + std::to_string(culprit)));
-            CHECK(has(text, in == In::Renderer ? "the renderer broke" : in == In::PixelOp ? "the pixel op broke" : "the op broke"));
+            CHECK(has(text, in == In::Renderer  ? "the renderer broke"
+                            : in == In::PixelOp ? "the pixel op broke"
+                                                : "the op broke"));
             CHECK(good);
         }
 }
@@ -187,7 +159,8 @@ TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
         });
         const bool good = goodFrame(fb, s);
         INFO(text);
-        CHECK((fb.rank() == culprit ? text == "fine" : has(text, "FrameError: dfb: frame cancelled: rank " + std::to_string(culprit))));
+        CHECK((fb.rank() == culprit ? text == "fine"
+                                    : has(text, "FrameError: dfb: frame cancelled: rank " + std::to_string(culprit))));
         CHECK(good);
     }
 }
@@ -196,7 +169,7 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
 {
     const Scene s = scene::makeScene(6);
     auto config = configOf(s);
-    const int size = worldSize(), owner = size - 1;
+    const int size = sizeOf(MPI_COMM_WORLD), owner = size - 1;
     config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config);
     struct Input {
@@ -244,13 +217,17 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
 {
     const Scene s = scene::makeScene(3);
     const std::vector<std::function<void(dfb::FrameBufferConfig&)>> changes{
-        [](dfb::FrameBufferConfig& c) { c.width = 0; }, [](dfb::FrameBufferConfig& c) { c.displayRank = worldSize(); },
-        [](dfb::FrameBufferConfig& c) { c.height += worldSize() > 1 ? worldRank() : 70000; },
-        [](dfb::FrameBufferConfig& c) { c.width = worldRank() == worldSize() - 1 ? -1 : c.width; }};
+        [](dfb::FrameBufferConfig& c) { c.width = 0; },
+        [](dfb::FrameBufferConfig& c) { c.displayRank = sizeOf(MPI_COMM_WORLD); },
+        [](dfb::FrameBufferConfig& c) { c.height += sizeOf(MPI_COMM_WORLD) > 1 ? rankIn(MPI_COMM_WORLD) : 70000; },
+        [](dfb::FrameBufferConfig& c) {
+            c.width = rankIn(MPI_COMM_WORLD) == sizeOf(MPI_COMM_WORLD) - 1 ? -1 : c.width;
+        }};
     for (const auto& change : changes) {
         auto config = configOf(s);
         change(config);
-        const std::string text = outcomeOf([&] { dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config); });
+        const std::string text =
+            outcomeOf([&] { dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config); });
         const bool same = sameEverywhere(text);
         INFO(text);
         CHECK(same);

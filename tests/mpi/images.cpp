@@ -1,8 +1,7 @@
 // The image over MPI: right by the serial reference, and bit for bit that of ranks in one process.
-#include "catch.hpp"
 #include "../inproc/scene.hpp"
-
-#include <mpi.h>
+#include "catch.hpp"
+#include "ranks.hpp"
 
 #include <cstdint>
 #include <functional>
@@ -20,20 +19,6 @@ using scene::Scene;
 using Blend = dfb::BasicAlphaBlend<16>;
 using Single = dfb::BasicImageParallel<16>;
 
-int rankIn(MPI_Comm communicator)
-{
-    int rank = 0;
-    MPI_Comm_rank(communicator, &rank);
-    return rank;
-}
-
-int sizeOf(MPI_Comm communicator)
-{
-    int size = 0;
-    MPI_Comm_size(communicator, &size);
-    return size;
-}
-
 dfb::FrameBufferConfig configOf(const Scene& s)
 {
     dfb::FrameBufferConfig config;
@@ -47,8 +32,8 @@ dfb::FrameBufferConfig configOf(const Scene& s)
 
 // On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
 template <class TileOp, class Transport, class Communicator>
-Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config, int deal = 0,
-                  int frames = 2)
+Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
+                  int deal = 0, int frames = 2)
 {
     dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(communicator, config);
     Picture result;
@@ -124,8 +109,10 @@ TEST_CASE("The image does not depend on configuration", "[images]")
         INFO(what);
         CHECK((rankIn(MPI_COMM_WORLD) == config.displayRank ? p.hash() == expected : p.bytes.empty()));
     };
-    check("bricks dealt out otherwise", [](auto&) {}, 3);
-    check("all bricks on the last rank", [](auto&) {}, -1);
+    check(
+        "bricks dealt out otherwise", [](auto&) {}, 3);
+    check(
+        "all bricks on the last rank", [](auto&) {}, -1);
     check("another display rank", [&](auto& c) { c.displayRank = size - 1; });
     check("linear owners", [](auto& c) { c.ownerMap = dfb::linearOwner; });
     check("progress by the caller", [](auto& c) { c.progress = dfb::Progress::Caller; });
@@ -187,7 +174,8 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
     const int rank = rankIn(MPI_COMM_WORLD);
     MPI_Comm half = MPI_COMM_NULL;
     MPI_Comm_split(MPI_COMM_WORLD, rank % 2, -rank, &half); // in reverse order
-    const Scene all = sceneFor(Loop::Declared, 8), part = sceneFor(Loop::ImageOwned, 9 + static_cast<std::uint64_t>(rank % 2));
+    const Scene all = sceneFor(Loop::Declared, 8),
+                part = sceneFor(Loop::ImageOwned, 9 + static_cast<std::uint64_t>(rank % 2));
     {
         dfb::DistributedFrameBuffer<Blend> fbAll(MPI_COMM_WORLD, configOf(all));
         dfb::DistributedFrameBuffer<Single> fbPart(half, configOf(part));

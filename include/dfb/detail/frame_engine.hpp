@@ -9,7 +9,6 @@
 #include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/frame.hpp>
 
-#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>

@@ -24,7 +24,6 @@ public:
 
     // The last frame that was opened; 0 before the first.
     std::int64_t frame() const noexcept { return frame_; }
-    bool isOpen() const noexcept { return open_; }
     void countLate() noexcept { ++late_; }
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
@@ -82,7 +81,7 @@ private:
     std::mutex mutex_;
     std::condition_variable empty_;
     std::atomic<std::int64_t> frame_{0}, late_{0};
-    std::atomic<bool> open_{false};
+    bool open_ = false;
     int inside_ = 0;
     std::vector<Message> early_;
 };

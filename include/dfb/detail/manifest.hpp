@@ -27,10 +27,11 @@ struct TileInput {
 
 namespace dfb::detail {
 
+// Per tile the (source, part) of what will come.
+using ExpectedInputs = std::map<int, std::vector<std::pair<std::uint32_t, std::uint16_t>>>;
+
 class ManifestExchange {
 public:
-    using Inputs = std::vector<std::pair<std::uint32_t, std::uint16_t>>;
-
     void reset()
     {
         std::lock_guard<std::mutex> lock(mutex_);
@@ -99,11 +100,11 @@ public:
     }
 
     // Per owned tile what will come. To be read when the exchange is complete.
-    const std::map<int, Inputs>& expected() const { return expected_; }
+    const ExpectedInputs& expected() const { return expected_; }
 
 private:
     mutable std::mutex mutex_;
-    std::map<int, Inputs> expected_;
+    ExpectedInputs expected_;
     std::size_t acksMissing_ = 0;
     bool declared_ = false;
 };

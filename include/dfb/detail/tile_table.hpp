@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/dependency_tracker.hpp>
+#include <dfb/detail/manifest.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
 
@@ -10,7 +11,6 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
-#include <map>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -47,9 +47,6 @@ inline void checkTile(const TileHeader& tile, const TileLayout& layout, const Ti
     info.message = std::move(wrong);
     throw InvalidArgument(std::move(info));
 }
-
-// Per tile the (source, part) of what will come.
-using ExpectedInputs = std::map<int, std::vector<std::pair<std::uint32_t, std::uint16_t>>>;
 
 // arrive() and declare() may be called from any thread, for one frame at a time.
 template <class TileOp>

@@ -69,8 +69,6 @@ public:
         fragments_.clear();
     }
 
-    std::size_t size() const noexcept { return fragments_.size(); }
-
 private:
     struct Scratch {
         std::vector<const Fragment*> pointers;
