@@ -62,6 +62,10 @@ public:
     int rank() const { return inner_.rank(); }
     int size() const { return inner_.size(); }
     bool needsPolling() const { return inner_.needsPolling(); }
+    bool mayPoll() const { return inner_.mayPoll(); }
+    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
+    void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
+    void interrupt() { inner_.interrupt(); }
     void start(dfb::TransportHandler& handler) { inner_.start(handler); }
     void send(int destination, dfb::Buffer&& message)
     {

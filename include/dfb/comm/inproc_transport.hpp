@@ -4,6 +4,7 @@
 
 #include <dfb/comm/transport.hpp>
 
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <deque>
@@ -33,6 +34,7 @@ public:
         std::vector<std::pair<int, Buffer>> waiting; // came before start(), or are held back to be shuffled
         std::mt19937_64 random;
         int patience = 0; // polls without an arrival
+        NapSignal signal;
     };
     using Channel = std::vector<Endpoint>;
 
@@ -120,7 +122,11 @@ public:
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return hub_->size(); }
     bool needsPolling() const noexcept { return hub_->shuffles(); }
+    bool mayPoll() const noexcept { return true; }
+    bool wakesOnArrival() const noexcept { return true; }
     bool quiet() const noexcept { return true; }
+    void nap(std::chrono::nanoseconds limit) { endpoint(rank_).signal.nap(limit); }
+    void interrupt() { endpoint(rank_).signal.interrupt(); }
 
     void start(TransportHandler& handler)
     {
@@ -147,8 +153,7 @@ public:
         if (!peer.handler || hub_->shuffles()) {
             peer.waiting.emplace_back(rank_, std::move(message));
             peer.patience = 0;
-            if (peer.handler)
-                peer.handler->wake();
+            peer.signal.interrupt();
         } else {
             peer.handler->receive(rank_, std::move(message));
         }

@@ -136,8 +136,12 @@ public:
     // Wakes those in wait(), to ask again.
     void notify()
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        changed_.notify_all();
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            changed_.notify_all();
+        }
+        if (!progress_.running())
+            transport_.interrupt();
     }
 
     // Waits until `ready()`, which must not lock what is held while calling notify(); makes progress if that is the
@@ -155,8 +159,11 @@ public:
                 lock.unlock();
                 const bool moved = transport_.poll();
                 lock.lock();
-                if (!moved)
-                    changed_.wait_for(lock, std::chrono::microseconds(50), over);
+                if (!moved && !over()) {
+                    lock.unlock();
+                    transport_.nap(std::chrono::microseconds(50));
+                    lock.lock();
+                }
             }
         }
         lock.unlock();
@@ -263,8 +270,6 @@ private:
         changed_.notify_all();
     }
 
-    void wake() override { progress_.wake(); }
-
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
     Progress mode_;
@@ -282,7 +287,7 @@ private:
     std::optional<ErrorInfo> failure_;
     std::atomic<bool> failed_{false};
 
-    ProgressThread progress_{[this] { return transport_.poll(); }, [this] { return transport_.quiet(); }};
+    ProgressThread<Transport> progress_{transport_};
 };
 
 } // namespace dfb::detail

@@ -62,6 +62,10 @@ public:
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     bool needsPolling() const noexcept { return true; }
+    bool mayPoll() const noexcept { return true; }
+    bool wakesOnArrival() const noexcept { return false; }
+    void nap(std::chrono::nanoseconds limit) { signal_.nap(limit); }
+    void interrupt() { signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
 
@@ -71,7 +75,7 @@ public:
             std::lock_guard<std::mutex> lock(mutex_);
             outbox_.emplace_back(destination, std::move(message));
         }
-        handler_->wake();
+        signal_.interrupt();
     }
 
     bool quiet() const
@@ -243,6 +247,7 @@ private:
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1;
 
+    NapSignal signal_;
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> outbox_; // under mutex_
     std::size_t pendingSends_ = 0;               // under mutex_

@@ -1,15 +1,13 @@
 // ProgressThread: calls poll() of a transport so that messages move while the renderer works. It polls for a
-// few microseconds after the last message, then naps; with nothing in flight it sleeps until it is woken.
+// few microseconds after the last message, then naps, the longer the less comes.
 #pragma once
 
 #include <dfb/version.hpp>
 
+#include <algorithm>
+#include <atomic>
 #include <chrono>
-#include <condition_variable>
-#include <functional>
-#include <mutex>
 #include <thread>
-#include <utility>
 
 #if defined(__linux__)
 #include <sys/prctl.h>
@@ -17,14 +15,11 @@
 
 namespace dfb {
 
+template <class Transport>
 class ProgressThread {
 public:
-    // `poll`: true if something moved. `quiet`: nothing waits to be sent. Neither may throw or block. Does not start
-    // yet.
-    ProgressThread(std::function<bool()> poll, std::function<bool()> quiet)
-        : poll_(std::move(poll)), quiet_(std::move(quiet))
-    {
-    }
+    // Does not start yet. `transport` must live until stop().
+    explicit ProgressThread(Transport& transport) : transport_(transport) {}
     ProgressThread(const ProgressThread&) = delete;
     ProgressThread& operator=(const ProgressThread&) = delete;
     ~ProgressThread() { stop(); }
@@ -37,41 +32,25 @@ public:
     // After this poll() is not called any more; the other members may be.
     void stop()
     {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            stop_ = true;
-        }
-        changed_.notify_one();
+        stop_ = true;
+        transport_.interrupt();
         if (thread_.joinable())
             thread_.join();
     }
 
     bool running() const noexcept { return thread_.joinable(); }
 
-    // There is something to send. From any thread.
-    void wake()
-    {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            awake_ = true;
-        }
-        changed_.notify_one();
-    }
-
     // Whether messages may come in: if not, and nothing waits to be sent, the thread sleeps. From any thread.
     void expectMessages(bool expect)
     {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            expecting_ = expect;
-        }
-        changed_.notify_one();
+        expecting_ = expect;
+        if (expect)
+            transport_.interrupt();
     }
 
 private:
     using Clock = std::chrono::steady_clock;
-    static constexpr std::chrono::microseconds pollTime{5};
-    static constexpr std::chrono::microseconds napTime{50};
+    static constexpr std::chrono::microseconds pollTime{5}, shortestNap{50}, longestNap{200}, longestRungNap{2000};
 
     void run()
     {
@@ -79,30 +58,25 @@ private:
         prctl(PR_SET_TIMERSLACK, 1000, 0, 0, 0); // in ns: the default would double the nap
 #endif
         auto last = Clock::now();
-        for (;;) {
-            if (poll_()) {
+        while (!stop_) {
+            if (transport_.poll()) {
                 last = Clock::now();
                 continue;
             }
-            if (Clock::now() - last < pollTime)
+            const Clock::duration idle = Clock::now() - last;
+            if (idle < pollTime)
                 continue;
-            std::unique_lock<std::mutex> lock(mutex_);
-            if (stop_)
-                return;
-            if (!awake_) {
-                if (expecting_ || !quiet_())
-                    changed_.wait_for(lock, napTime);
-                else
-                    changed_.wait(lock, [this] { return stop_ || awake_ || expecting_; });
-            }
-            awake_ = false;
+            if (!expecting_ && transport_.quiet())
+                transport_.nap(std::chrono::seconds(1));
+            else if (transport_.wakesOnArrival())
+                transport_.nap(std::clamp<Clock::duration>(idle / 8, shortestNap, longestRungNap));
+            else
+                transport_.nap(std::clamp<Clock::duration>(idle / 8, shortestNap, longestNap));
         }
     }
 
-    std::function<bool()> poll_, quiet_;
-    std::mutex mutex_;
-    std::condition_variable changed_;
-    bool awake_ = false, expecting_ = false, stop_ = false;
+    Transport& transport_;
+    std::atomic<bool> stop_{false}, expecting_{false};
     std::thread thread_;
 };
 

@@ -8,22 +8,31 @@
 //                                                communicator do not mix; throws TransportError
 //   int rank() const; int size() const;
 //   bool needsPolling() const;                   false: messages are delivered without poll()
+//   bool mayPoll() const;                        whether the calling thread may call poll()
+//   bool wakesOnArrival() const;                 nap() ends by itself when a message comes, from whichever rank
 //   void start(TransportHandler&);               from here on the handler is called
 //   void send(int destination, Buffer&&);        any thread; never blocks; destination is another rank; reliable,
-//                                                in any order
+//                                                in any order; of any size
 //   bool poll();                                 one thread at a time; never blocks; moves what can be moved; true if
 //                                                something was; calls the handler
-//   bool quiet() const;                          nothing waits to be sent
+//   bool quiet() const;                          any thread; nothing waits to be sent
+//   void nap(std::chrono::nanoseconds limit);    the thread that polls; sleeps until poll() has something to send,
+//                                                interrupt() is called, or `limit` has passed
+//   void interrupt();                            any thread; ends the nap under way, else the next one
 //   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects
-//   anything
-//                                                more; collective where the transport needs it. Else (it has
-//                                                failed): waits for nobody
+//                                                anything more; collective where the transport needs it. Else (it
+//                                                has failed): waits for nobody
+//
+// testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
 
 #include <dfb/buffer.hpp>
 #include <dfb/error.hpp>
 
+#include <chrono>
+#include <condition_variable>
 #include <memory>
+#include <mutex>
 #include <type_traits>
 #include <utility>
 
@@ -31,9 +40,10 @@ namespace dfb {
 
 // Who calls poll() of a transport that needs it.
 enum class Progress {
-    Thread, // a thread of the framebuffer's own; MPI must have been initialised with MPI_THREAD_MULTIPLE
-    Caller  // the calls that wait (the constructor, Frame::end(), ...), made by one thread: MPI_THREAD_FUNNELED is
-            // enough, but messages move only in those calls
+    Thread, // a thread of the library's own; MPI must have been initialised with MPI_THREAD_MULTIPLE
+    Caller // the calls of the user: DistributedFrameBuffer::poll(), and those that wait (the constructor, Frame::end(),
+           // ...). At MPI_THREAD_FUNNELED all of them belong to the thread that initialised MPI; at
+           // MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile. Messages move only in those calls
 };
 
 // Where a transport delivers. The calls are quick, never block, and may come from any thread.
@@ -41,10 +51,34 @@ class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;
     virtual void fail(const ErrorInfo& error) = 0; // the transport can not go on
-    virtual void wake() = 0;                       // poll() has something to do
 
 protected:
     ~TransportHandler() = default;
+};
+
+// nap() and interrupt() for transports that have nothing better to sleep on.
+class NapSignal {
+public:
+    void nap(std::chrono::nanoseconds limit)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        changed_.wait_for(lock, limit, [this] { return interrupted_; });
+        interrupted_ = false;
+    }
+
+    void interrupt()
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            interrupted_ = true;
+        }
+        changed_.notify_one();
+    }
+
+private:
+    std::mutex mutex_;
+    std::condition_variable changed_;
+    bool interrupted_ = false;
 };
 
 namespace detail {
@@ -78,8 +112,18 @@ struct HasPoll : std::false_type {
 };
 template <class T>
 struct HasPoll<T, std::void_t<decltype(std::declval<T&>().poll()), decltype(std::declval<const T&>().needsPolling()),
-                              decltype(std::declval<const T&>().quiet())>>
+                              decltype(std::declval<const T&>().mayPoll()), decltype(std::declval<const T&>().quiet())>>
     : std::is_same<bool, decltype(std::declval<T&>().poll())> {
+};
+
+template <class T, class = void>
+struct HasNap : std::false_type {
+};
+template <class T>
+struct HasNap<
+    T, std::void_t<decltype(std::declval<T&>().nap(std::chrono::nanoseconds())),
+                   decltype(std::declval<T&>().interrupt()), decltype(std::declval<const T&>().wakesOnArrival())>>
+    : std::true_type {
 };
 
 template <class T, class = void>
@@ -93,8 +137,9 @@ struct HasStartAndStop<T, std::void_t<decltype(std::declval<T&>().start(std::dec
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_transport_v = detail::HasCommunicator<T>::value&& detail::HasRankAndSize<T>::value&&
-    detail::HasSend<T>::value&& detail::HasPoll<T>::value&& detail::HasStartAndStop<T>::value;
+inline constexpr bool is_transport_v =
+    detail::HasCommunicator<T>::value&& detail::HasRankAndSize<T>::value&& detail::HasSend<T>::value&&
+        detail::HasPoll<T>::value&& detail::HasNap<T>::value&& detail::HasStartAndStop<T>::value;
 
 namespace detail {
 
@@ -105,8 +150,10 @@ constexpr bool checkTransport()
                                              "(const Communicator&, std::shared_ptr<MemoryPool>, Progress)");
     static_assert(HasRankAndSize<T>::value, "dfb: Transport must provide int rank() const and int size() const");
     static_assert(HasSend<T>::value, "dfb: Transport must provide void send(int destination, Buffer&&)");
-    static_assert(HasPoll<T>::value, "dfb: Transport must provide bool poll(), bool needsPolling() const "
-                                     "and bool quiet() const");
+    static_assert(HasPoll<T>::value, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
+                                     "bool mayPoll() const and bool quiet() const");
+    static_assert(HasNap<T>::value, "dfb: Transport must provide void nap(std::chrono::nanoseconds), void interrupt() "
+                                    "and bool wakesOnArrival() const");
     static_assert(HasStartAndStop<T>::value,
                   "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     return is_transport_v<T>;
