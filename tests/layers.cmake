@@ -4,12 +4,13 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp fwd.hpp)
-set(level_1 error.hpp buffer.hpp exec.hpp comm/compression.hpp comm/progress.hpp detail/float_environment.hpp)
+set(level_1 error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
+            detail/float_environment.hpp)
 set(level_2 comm/message.hpp comm/reduction.hpp comm/snappy_codec.hpp comm/transport.hpp detail/byte_io.hpp
             tbb_executor.hpp)
-set(level_3 comm/inproc_transport.hpp comm/messaging.hpp comm/mpi_transport.hpp
+set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/manifest.hpp)
-set(level_4 image.hpp render/world.hpp)
+set(level_4 comm/messaging.hpp image.hpp render/world.hpp)
 set(level_5 tile.hpp)
 set(level_6 dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/wire.hpp render/visibility.hpp)

@@ -11,6 +11,7 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -87,23 +88,32 @@ public:
     bool complete() const noexcept { return closed_; }
     int arrivedCount() const noexcept { return static_cast<int>(inputs_.size()); }
 
-    // What the first incomplete generation still waits for, in words; empty when complete.
-    std::string missing() const
+    // What the first incomplete generation still waits for.
+    struct Missing {
+        int generation = 0;
+        std::int64_t expected = 0, got = 0;
+        // Those that are known by name, because they were declared.
+        std::vector<std::pair<std::uint32_t, std::uint16_t>> inputs;
+
+        std::string text() const
+        {
+            return "generation " + std::to_string(generation) + " has " + std::to_string(got) + " of "
+                   + std::to_string(expected) + " inputs";
+        }
+    };
+
+    // Empty if nothing is missing.
+    std::optional<Missing> missing() const
     {
         if (closed_)
-            return {};
+            return std::nullopt;
         const Generation& g = generations_[static_cast<std::size_t>(current_)];
-        std::string text = "generation " + std::to_string(current_) + " has " + std::to_string(g.arrived) + " of "
-                           + std::to_string(g.expected) + " inputs";
-        if (hasDeclaration_ && current_ == 1) {
-            const char* separator = "; missing source ";
+        Missing m{current_, g.expected, g.arrived, {}};
+        if (hasDeclaration_ && current_ == 1)
             for (const auto& [source, part] : declared_)
-                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part})) {
-                    text += separator + std::to_string(source);
-                    separator = ", ";
-                }
-        }
-        return text;
+                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part}))
+                    m.inputs.emplace_back(source, part);
+        return m;
     }
 
     static constexpr int maxGenerations = 1 << 16;

@@ -11,6 +11,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <exception>
+#include <memory>
 #include <utility>
 #include <vector>
 
@@ -51,9 +52,11 @@ public:
         void start(Tile& tile, int tileIndex, int pass = 0) const { engine_->start(tile, tileIndex, pass); }
 
         // Hands over a rendered tile; the active pixels leave for the owner at once, and `tile` can be used again.
-        // From any thread. Waits for nothing. Throws InvalidArgument, with nothing sent, for a tile of another frame,
-        // an index, region or pass that the frame does not have, a negative generation or number of children. What is
-        // wrong with it as an input comes out of end(). In a frame that has failed: does nothing.
+        // From any thread. Waits only while this rank has more under way than messagePoolBytes, and meanwhile runs
+        // tasks of the executor (with Progress::Caller it waits only on a thread that may poll). Throws
+        // InvalidArgument, with nothing sent, for a tile of another frame, an index, region or pass that the frame does
+        // not have, a negative generation or number of children. What is wrong with it as an input comes out of end().
+        // In a frame that has failed: does nothing.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
 
         // Only with FrameParams::declared: each rank says once which inputs it will send, in each pass, all of
@@ -83,7 +86,15 @@ public:
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
-        : engine_(communicator, std::move(config), std::move(pixelOp))
+        : DistributedFrameBuffer(
+            std::make_shared<Messenger<Transport>>(communicator, MessengerOptions{config.progress, config.checksums}),
+            std::move(config), std::move(pixelOp))
+    {
+    }
+
+    // The same over a messenger that several framebuffers share; they are made in the same order on all ranks.
+    DistributedFrameBuffer(std::shared_ptr<Messenger<Transport>> messenger, Config config, PixelOp pixelOp = {})
+        : engine_(std::move(messenger), std::move(config), std::move(pixelOp))
     {
     }
 
@@ -104,6 +115,10 @@ public:
 
     // On the display rank: the image of the last frame that ended well; valid until the next begin(). Empty elsewhere.
     const Image& image() const noexcept { return engine_.image(); }
+
+    // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
+    // compositing goes on meanwhile; otherwise there is no need to. Waits for nothing.
+    bool poll() { return engine_.poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
     // InvalidArgument, with nothing sent, if a frame is open or `params` can not be.

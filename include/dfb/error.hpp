@@ -23,6 +23,7 @@ enum class ErrorKind : std::uint32_t {
     Disagreement,     // ranks were given different configurations or frame parameters
     UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
     Cancelled,        // a frame was left without end()
+    TimedOut,         // a frame was not complete in time
     Transport         // the transport reported a failure
 };
 
@@ -38,6 +39,7 @@ inline const char* toString(ErrorKind kind)
     case ErrorKind::Disagreement: return "ranks disagree";
     case ErrorKind::UserCode: return "exception in user code";
     case ErrorKind::Cancelled: return "frame cancelled";
+    case ErrorKind::TimedOut: return "timed out";
     case ErrorKind::Transport: return "transport failure";
     }
     return "unknown error";

@@ -42,6 +42,10 @@ public:
         wake();
     }
 
+    // Runs one task that waits, on the calling thread, so that it does something useful while it waits. False if there
+    // is none.
+    bool help() { return runOne(); }
+
     // Calls body(i) for i in [0, count), in no particular order, from several workers at once. The calling thread
     // waits; called from inside a task the loop runs right there. Rethrows the first exception of a body, after
     // which bodies not yet begun are not run.

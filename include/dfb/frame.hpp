@@ -7,10 +7,17 @@
 #include <dfb/tile_layout.hpp>
 
 #include <array>
+#include <cstddef>
 #include <cstdint>
 #include <memory>
 
 namespace dfb {
+
+// When finished tiles leave for the display rank.
+enum class GatherMode : std::uint8_t {
+    Batches, // as soon as enough of them are finished, while others still render
+    AtEnd    // when all tiles of a rank are finished
+};
 
 // What a framebuffer is made with. Everything but executor and progress must be the same on all ranks, which is
 // checked when it is made.
@@ -21,9 +28,14 @@ struct FrameBufferConfig {
     int displayRank = 0;
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
-    std::uint32_t id = 0;                 // stands in every message
+    GatherMode gather = GatherMode::Batches;
+    // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
+    // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
+    std::size_t messagePoolBytes = std::size_t{64} << 20;
     std::shared_ptr<Executor> executor{}; // null: a ThreadExecutor with one thread per core
+    // Of the messenger; a framebuffer that is given one goes by that one's.
     Progress progress = Progress::Thread;
+    bool checksums = false; // a CRC-32C in each message: whoever does not trust the network pays for it
 };
 
 // What a frame begins with; the same on all ranks, which is checked in the verdict.
@@ -36,23 +48,29 @@ struct FrameParams {
     // Not 0 and the same as in the last frame, which succeeded: what was declared then still holds, and declare() must
     // not be called. Change it when bricks or camera change.
     std::uint64_t declarationKey = 0;
+    // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
+    // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
+    // TransportError. The same on all ranks.
+    int timeoutMs = 0;
 };
 
 // Figures of a finished frame. "All" are sums or maxima over the ranks and the same everywhere, up to the moment when
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    double totalMs = 0;               // begin() to the return of end(), this rank
-    double renderMs = 0;              // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0; // the call of end() to its return, this rank
-    double renderMsMax = 0;           // all: the longest renderMs
-    std::int64_t bytesSent = 0;       // all: message bytes to other ranks, without the transport's own
-    std::int64_t messagesSent = 0;    // all
-    std::int64_t tilesTotal = 0;      // in the image
-    std::int64_t tilesTouched = 0;    // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0; // all: input pixels with an infinity or NaN (see detail/wire.hpp)
-    std::int64_t lateMessages = 0;    // all: of cancelled or failed frames, dropped since the last verdict
-    std::int64_t peakMemoryBytes = 0; // all: most that one rank's framebuffer ever held in message and image memory
+    double totalMs = 0;                // begin() to the return of end(), this rank
+    double renderMs = 0;               // begin() to the call of end(), this rank
+    double compositingOverheadMs = 0;  // the call of end() to its return, this rank
+    double renderMsMax = 0;            // all: the longest renderMs
+    std::int64_t bytesSent = 0;        // all: message bytes to other ranks, without the transport's own
+    std::int64_t messagesSent = 0;     // all
+    std::int64_t tilesTotal = 0;       // in the image
+    std::int64_t tilesTouched = 0;     // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0;  // all: input pixels with an infinity or NaN (see detail/wire.hpp)
+    std::int64_t lateMessages = 0;     // all: of cancelled or failed frames, dropped since the last verdict
+    std::int64_t repeatedMessages = 0; // all: came twice from the transport, and were dropped
+    std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messagePoolBytes
+    std::int64_t peakMemoryBytes = 0;  // all: most that one rank's framebuffer ever held in message and image memory
 };
 
 } // namespace dfb

@@ -9,6 +9,9 @@ class InprocTransport; // comm/inproc_transport.hpp
 class Executor;        // exec.hpp
 class Image;           // image.hpp
 
+template <class Transport>
+class Messenger; // comm/messenger.hpp
+
 template <class TileOp, class PixelOp = NoPixelOp, class Transport = MpiTransport>
 class DistributedFrameBuffer; // distributed_framebuffer.hpp
 

@@ -409,9 +409,10 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
     CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
 }
 
-TEST_CASE("Different framebuffer ids are refused on every rank", "[errors]")
+TEST_CASE("Different message pools are refused on every rank", "[errors]")
 {
-    const auto texts = constructed(3, [](int rank, dfb::FrameBufferConfig& c) { c.id = rank == 1 ? 8 : 7; });
+    const auto texts = constructed(
+        3, [](int rank, dfb::FrameBufferConfig& c) { c.messagePoolBytes = rank == 1 ? 1 << 28 : 1 << 27; });
     INFO(joined(texts));
     CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
 }

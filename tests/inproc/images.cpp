@@ -57,7 +57,6 @@ dfb::FrameBufferConfig configOf(const Scene& s, const Options& o)
     config.displayRank = o.displayRank;
     config.ownerMap = o.ownerMap;
     config.codec = o.codec;
-    config.id = 42;
     config.executor = makeExecutor(o);
     return config;
 }

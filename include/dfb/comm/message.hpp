@@ -21,20 +21,25 @@ enum class MessageKind : std::uint8_t {
     ManifestAck,   // the owner has it
     FinishedTiles, // a batch, to the display rank
     TilesDone,     // how many finished tiles a rank has sent to the display rank
-    Abort          // the frame has failed on the sender
+    Abort,         // the frame has failed on the sender
+    CreditRequest, // the sender has more for this rank than it may send
+    Credit,        // how much the receiver of this may send
+    Failure        // the sender's messenger can not go on, nor can anybody who waits for it
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb;
-    static constexpr std::uint8_t formatVersion = 1;
+    static constexpr std::uint8_t formatVersion = 2;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
     MessageKind kind = MessageKind::Fragment;
-    std::uint32_t framebuffer = 0; // id of the receiving object
-    std::int64_t number = 0;       // of the frame; of the reduction
+    std::uint32_t receiver = 0; // address of the receiving object
+    std::int64_t number = 0;    // of the frame; of the reduction
+    std::uint32_t sequence = 0; // running, per sender and destination; set by the messenger, as is the next
+    std::uint32_t checksum = 0; // CRC-32C of the message with 0 in this place; 0: there is none
 };
-static_assert(sizeof(MessageHeader) == 16 && std::is_trivially_copyable_v<MessageHeader>);
+static_assert(sizeof(MessageHeader) == 24 && std::is_trivially_copyable_v<MessageHeader>);
 
 template <class T>
 T loadAs(const std::byte* bytes)
@@ -56,7 +61,7 @@ T loadAs(const std::byte* bytes)
 }
 
 // Checks and returns the header of a message. Throws Error (MalformedMessage).
-inline MessageHeader readMessageHeader(const Buffer& message, std::uint32_t framebuffer)
+inline MessageHeader readMessageHeader(const Buffer& message)
 {
     if (message.size() < sizeof(MessageHeader))
         failMalformed("shorter than a header", sizeof(MessageHeader), static_cast<std::int64_t>(message.size()));
@@ -67,11 +72,8 @@ inline MessageHeader readMessageHeader(const Buffer& message, std::uint32_t fram
         failMalformed("not a message of dfb");
     if (header.version != MessageHeader::formatVersion)
         failMalformed("wire format version", MessageHeader::formatVersion, header.version);
-    if (header.kind > MessageKind::Abort)
+    if (header.kind > MessageKind::Failure)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
-    // Not of reductions: in the first one ranks find out that their ids differ.
-    if (header.framebuffer != framebuffer && header.kind > MessageKind::ReduceDown)
-        failMalformed("for another framebuffer", framebuffer, header.framebuffer);
     return header;
 }
 

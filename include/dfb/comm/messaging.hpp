@@ -1,11 +1,10 @@
-// Messaging: the asynchronous messaging layer (section 3.2 of the paper): an inbox that is emptied by tasks,
-// progress of the transport, reductions, and waiting without spinning.
+// Messaging: the messages of one object on all ranks: an inbox that is emptied by tasks, messages with and without
+// credit, reductions, and waiting without spinning.
 #pragma once
 
-#include <dfb/comm/message.hpp>
-#include <dfb/comm/progress.hpp>
+#include <dfb/comm/flow_control.hpp>
+#include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
-#include <dfb/comm/transport.hpp>
 #include <dfb/exec.hpp>
 
 #include <algorithm>
@@ -13,6 +12,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstdint>
+#include <cstring>
 #include <deque>
 #include <exception>
 #include <memory>
@@ -23,74 +23,122 @@
 
 namespace dfb::detail {
 
-// What receives the messages; it knows what they mean.
-class MessageReceiver {
+// What the messages are handed to; it knows what they mean.
+class MessageHandler {
 public:
     // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
     // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    virtual void malformed(int source, const std::exception_ptr& error) = 0;
+    virtual void undecodable(int source, const std::exception_ptr& error) = 0;
 
 protected:
-    ~MessageReceiver() = default;
+    ~MessageHandler() = default;
 };
 
 template <class Transport>
-class Messaging final : private TransportHandler {
+class Messaging final : private MessageReceiver {
 public:
     using Bytes = ReductionTable::Bytes;
-    static constexpr std::uint32_t ownScope = 0; // of reduce(); the receiver uses others
+    using Clock = std::chrono::steady_clock;
+    static constexpr std::uint32_t ownScope = 0; // of reduce(); the handler uses others
 
-    Messaging(const typename Transport::Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress mode,
-              std::shared_ptr<Executor> executor, std::uint32_t id, MessageReceiver& receiver)
-        : pool_(pool), transport_(communicator, std::move(pool), mode), mode_(mode), executor_(std::move(executor)),
-          id_(id), receiver_(receiver), reductions_(transport_.rank(), transport_.size(),
-                                                    [this](int to, const ReductionKey& key, bool up,
-                                                           const Bytes& bytes) { sendReduction(to, key, up, bytes); })
+    // `poolBytes`: see FlowControl.
+    Messaging(std::shared_ptr<Messenger<Transport>> messenger, std::shared_ptr<Executor> executor,
+              std::size_t poolBytes, MessageHandler& handler)
+        : messenger_(std::move(messenger)), executor_(std::move(executor)), handler_(handler),
+          flow_(messenger_->size(), poolBytes,
+                {[this](int to, Buffer&& message) { send(to, std::move(message)); },
+                 [this](int to, const FlowControl::Request& request) {
+                     sendStruct(to, MessageKind::CreditRequest, request);
+                 },
+                 [this](int to, const FlowControl::Credit& credit) { sendStruct(to, MessageKind::Credit, credit); }}),
+          reductions_(messenger_->rank(), messenger_->size(),
+                      [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) {
+                          sendReduction(to, key, up, bytes);
+                      })
     {
     }
 
-    // From here on the receiver is called.
-    void start()
-    {
-        transport_.start(*this);
-        if (transport_.needsPolling() && mode_ == Progress::Thread)
-            progress_.start();
-    }
+    // From here on the handler is called. Collective, in the same order for all objects of a messenger.
+    void start() { messenger_->attach(*this, address_); }
 
-    // Collective where the transport's stop() is.
     ~Messaging()
     {
-        progress_.stop();
-        transport_.stop(!failed_);
+        messenger_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
         changed_.wait(lock, [this] { return tasks_ == 0; });
     }
 
-    int rank() const noexcept { return transport_.rank(); }
-    int size() const noexcept { return transport_.size(); }
-    bool failed() const noexcept { return failed_; }
+    int rank() const noexcept { return messenger_->rank(); }
+    int size() const noexcept { return messenger_->size(); }
+    bool failed() const noexcept { return messenger_->failed(); }
+    std::uint32_t address() const noexcept { return address_; }
+    Messenger<Transport>& messenger() noexcept { return *messenger_; }
     Executor& executor() const noexcept { return *executor_; }
 
-    // From any thread; to this rank as well.
+    // Credits are counted from here again; see FlowControl. No message with credit may be in a task.
+    void newEpoch(std::int64_t number)
+    {
+        epoch_ = number;
+        flow_.newEpoch();
+    }
+    FlowControl& flow() noexcept { return flow_; }
+
+    // Messages that say little pass at once; from any thread; to this rank as well.
     void send(int destination, Buffer&& message)
     {
         if (destination == rank()) {
-            receive(destination, std::move(message));
+            enqueue(destination, loadAs<MessageHeader>(message.data()), std::move(message));
             return;
         }
         bytesSent_ += static_cast<std::int64_t>(message.size());
         ++messagesSent_;
-        transport_.send(destination, std::move(message));
+        messenger_->send(destination, std::move(message));
     }
 
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
     {
         MessageHeader header;
         header.kind = kind;
-        header.framebuffer = id_;
+        header.receiver = address_;
         header.number = number;
-        send(destination, makeMessage(*pool_, header, body.data(), body.size()));
+        send(destination, makeMessage(*messenger_->pool(), header, body.data(), body.size()));
+    }
+
+    // Messages that carry pixels need credit of their receiver, and are kept until they have it. Never blocks.
+    void sendWithCredit(int destination, Buffer&& message)
+    {
+        if (destination == rank())
+            send(destination, std::move(message));
+        else
+            flow_.send(destination, std::move(message));
+    }
+    static bool needsCredit(MessageKind kind)
+    {
+        return kind == MessageKind::Fragment || kind == MessageKind::FinishedTiles;
+    }
+
+    // Returns when what this rank has sent, and nobody has taken out of an inbox yet, is no more than a pool, or
+    // `over()`. Runs waiting tasks meanwhile, so that ranks that wait for each other's inboxes get on. On a thread that
+    // could not make progress it returns at once.
+    template <class Over>
+    void waitForRoom(const Over& over)
+    {
+        const auto roomy = [this] { return flow_.underWay() <= flow_.poolBytes(); };
+        const auto done = [&] { return roomy() || failed() || over(); };
+        while (!done()) {
+            if (executor_->help())
+                continue;
+            if (messenger_->needsCaller()) {
+                if (!messenger_->mayPoll())
+                    return;
+                if (!messenger_->poll() && !done())
+                    messenger_->nap(std::chrono::microseconds(50));
+            } else {
+                std::unique_lock<std::mutex> lock(mutex_);
+                changed_.wait_for(lock, std::chrono::microseconds(200), [&] { return !inbox_.empty() || roomy(); });
+            }
+        }
     }
 
     // Message bytes and messages to other ranks since the start.
@@ -130,9 +178,6 @@ public:
         reductions_.receive(source, keyOf(header, message), header.kind == MessageKind::ReduceUp, bytesOf(message));
     }
 
-    // Between ranks that may have messages for each other: as long as this is so, they are looked for.
-    void expectMessages(bool expect) { progress_.expectMessages(expect); }
-
     // Wakes those in wait(), to ask again.
     void notify()
     {
@@ -140,34 +185,36 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             changed_.notify_all();
         }
-        if (!progress_.running())
-            transport_.interrupt();
+        messenger_->interrupt();
     }
 
     // Waits until `ready()`, which must not lock what is held while calling notify(); makes progress if that is the
-    // caller's business. Throws TransportError.
+    // caller's business. False if `deadline` has passed before. Throws TransportError.
     template <class Ready>
-    void wait(const Ready& ready)
+    bool wait(const Ready& ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
         std::unique_lock<std::mutex> lock(mutex_);
-        const auto over = [&] { return failed_ || ready(); };
-        if (progress_.running() || !transport_.needsPolling()) {
-            changed_.wait(lock, over);
+        const auto over = [&] { return failed() || ready(); };
+        const auto late = [&] { return deadline && Clock::now() >= *deadline; };
+        if (!messenger_->needsCaller()) {
+            if (deadline)
+                changed_.wait_until(lock, *deadline, over);
+            else
+                changed_.wait(lock, over);
         } else {
             // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
-            while (!over() || (!failed_ && !transport_.quiet())) {
+            while ((!over() || (!failed() && !messenger_->quiet())) && !late()) {
                 lock.unlock();
-                const bool moved = transport_.poll();
+                if (!messenger_->poll() && !over())
+                    messenger_->nap(std::chrono::microseconds(50));
                 lock.lock();
-                if (!moved && !over()) {
-                    lock.unlock();
-                    transport_.nap(std::chrono::microseconds(50));
-                    lock.lock();
-                }
             }
         }
+        const bool isReady = ready();
         lock.unlock();
-        throwIfFailed();
+        if (!isReady)
+            messenger_->throwIfFailed();
+        return isReady;
     }
 
     // Collective: combines `own` over all ranks and waits for the result.
@@ -178,15 +225,20 @@ public:
             Bytes bytes;
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
-        expectMessages(true);
+        messenger_->expectMessages(true);
         reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
                           [this, result](const Bytes& bytes) {
                               result->bytes = bytes;
                               result->there = true;
                               notify();
                           });
-        wait([&] { return result->there.load(); });
-        expectMessages(false);
+        try {
+            wait([&] { return result->there.load(); });
+        } catch (...) {
+            messenger_->expectMessages(false);
+            throw;
+        }
+        messenger_->expectMessages(false);
         return result->bytes;
     }
 
@@ -205,14 +257,20 @@ public:
         return reduced;
     }
 
-    void throwIfFailed()
+private:
+    struct Arrival {
+        int source;
+        MessageHeader header;
+        Buffer message;
+    };
+
+    template <class Body>
+    void sendStruct(int destination, MessageKind kind, const Body& body)
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (failed_)
-            throw TransportError(*failure_);
+        const auto* first = reinterpret_cast<const std::byte*>(&body);
+        send(destination, kind, epoch_, Bytes(first, first + sizeof body));
     }
 
-private:
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
         Bytes body(sizeof key.scope + bytes.size());
@@ -221,73 +279,70 @@ private:
         send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
     }
 
+    void receive(int source, const MessageHeader& header, Buffer&& message) override
+    {
+        if (needsCredit(header.kind))
+            flow_.arrived(message.size());
+        enqueue(source, header, std::move(message));
+    }
+
     // A message only goes into the inbox here; a task takes it out.
-    void receive(int source, Buffer&& message) override
+    void enqueue(int source, const MessageHeader& header, Buffer&& message)
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            inbox_.emplace_back(source, std::move(message));
+            inbox_.push_back({source, header, std::move(message)});
         }
         submit([this] {
-            std::pair<int, Buffer> next;
+            std::optional<Arrival> next;
             {
                 const std::lock_guard<std::mutex> lock(mutex_);
                 next = std::move(inbox_.front());
                 inbox_.pop_front();
             }
-            dispatch(next.first, std::move(next.second));
+            dispatch(std::move(*next));
         });
     }
 
-    void dispatch(int source, Buffer&& message)
+    void dispatch(Arrival&& a)
     {
-        MessageHeader header;
         try {
-            header = readMessageHeader(message, id_);
-            if (header.kind == MessageKind::ReduceUp || header.kind == MessageKind::ReduceDown) {
-                if (message.size() < sizeof header + sizeof(std::uint32_t))
+            if (a.header.kind == MessageKind::ReduceUp || a.header.kind == MessageKind::ReduceDown) {
+                if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
-                const std::byte* body = std::as_const(message).data() + sizeof header;
-                if (loadAs<std::uint32_t>(body) == ownScope) {
-                    receiveReduction(source, header, message);
+                if (keyOf(a.header, a.message).scope == ownScope) {
+                    receiveReduction(a.source, a.header, a.message);
                     return;
                 }
             }
         } catch (...) {
-            receiver_.malformed(source, std::current_exception());
+            handler_.undecodable(a.source, std::current_exception());
             return;
         }
-        receiver_.incoming(source, header, std::move(message));
+        handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
-    void fail(const ErrorInfo& error) override
+    void malformed(int source, const std::exception_ptr& error) override
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (failed_)
-            return;
-        failure_ = error;
-        failed_ = true;
-        changed_.notify_all();
+        submit([this, source, error] { handler_.undecodable(source, error); });
     }
 
-    std::shared_ptr<MemoryPool> pool_;
-    Transport transport_;
-    Progress mode_;
+    void messengerFailed() override { notify(); }
+
+    std::shared_ptr<Messenger<Transport>> messenger_;
     std::shared_ptr<Executor> executor_;
-    std::uint32_t id_;
-    MessageReceiver& receiver_;
+    MessageHandler& handler_;
+    std::uint32_t address_ = 0;
+    std::atomic<std::int64_t> epoch_{0};
+    FlowControl flow_;
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
     std::int64_t reductionCount_ = 0; // of reduce()
 
     std::mutex mutex_;
     std::condition_variable changed_;
-    std::deque<std::pair<int, Buffer>> inbox_;
+    std::deque<Arrival> inbox_;
     int tasks_ = 0; // submitted and not yet done
-    std::optional<ErrorInfo> failure_;
-    std::atomic<bool> failed_{false};
-
-    ProgressThread<Transport> progress_{transport_};
 };
 
 } // namespace dfb::detail

@@ -86,6 +86,23 @@ public:
         }
     }
 
+    // The neighbours in the tree that this rank waits for: children whose parts have not come, or else its parent.
+    std::vector<int> missing(const ReductionKey& key)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const auto place = states_.find(key);
+        if (place == states_.end())
+            return {};
+        std::vector<int> ranks;
+        for (int child : children_)
+            if (std::none_of(place->second.parts.begin(), place->second.parts.end(),
+                             [child](const auto& part) { return part.first == child; }))
+                ranks.push_back(child);
+        if (ranks.empty() && rank_ != 0)
+            ranks.push_back(rank_ & (rank_ - 1));
+        return ranks;
+    }
+
     // Drops what is known of this scope up to `number`, now and when it comes later.
     void forget(std::uint32_t scope, std::int64_t number)
     {

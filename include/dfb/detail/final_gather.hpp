@@ -15,6 +15,7 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -24,8 +25,9 @@ namespace dfb::detail {
 struct GatherSettings {
     OutputFormat format = OutputFormat::None;
     bool depth = false;
-    std::uint32_t framebuffer = 0;
+    std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
+    bool atEnd = false; // nothing leaves before flush()
 };
 
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
@@ -49,11 +51,14 @@ public:
         std::shared_ptr<Batch> batch;
     };
 
-    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay,
-                int otherRanks, Send send)
-        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay),
-          otherRanks_(otherRanks), send_(std::move(send))
+    // `send`: to the display rank, batches and the count of them.
+    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay, int rank,
+                int rankCount, Send send)
+        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay), rank_(rank),
+          rankCount_(rankCount), send_(std::move(send))
     {
+        if (isDisplay_ && enabled())
+            tilesOf_ = std::vector<TilesOf>(static_cast<std::size_t>(rankCount_));
         if (isDisplay_ && settings_.format != OutputFormat::None) {
             image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.depth);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
@@ -70,12 +75,24 @@ public:
         frame_ = frame;
         batch_.reset();
         tilesSent_ = 0;
+        held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
         ranksDone_ = 0;
+        for (TilesOf& t : tilesOf_) {
+            t.received = 0;
+            t.announced = -1;
+        }
         for (auto& s : state_)
             if (s == TileState::Received)
                 s = TileState::Old;
+    }
+
+    // The most that a message to the display rank can have.
+    static std::size_t largestMessage(int tileSize, OutputFormat format, bool depth)
+    {
+        const auto pixels = static_cast<std::size_t>(tileSize) * static_cast<std::size_t>(tileSize);
+        return std::max(batchBytes, prefix + recordBytes(pixels, format, depth));
     }
 
     // Room for a finished tile. write() it, then commit().
@@ -149,6 +166,7 @@ public:
         if (!enabled() || isDisplay_)
             return;
         std::shared_ptr<Batch> last;
+        std::vector<Buffer> held;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             last = std::move(batch_);
@@ -156,12 +174,18 @@ public:
         }
         if (last)
             sendBatch(*last);
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            held.swap(held_);
+        }
+        for (Buffer& message : held)
+            send_(std::move(message));
         const MessageHeader header = messageHeader(MessageKind::TilesDone);
         send_(makeMessage(*pool_, header, reinterpret_cast<const std::byte*>(&tilesSent_), sizeof tilesSent_));
     }
 
     // The display rank's side of a FinishedTiles message. Throws Error (MalformedMessage).
-    void receiveTiles(Buffer&& message)
+    void receiveTiles(int source, Buffer&& message)
     {
         requireDisplay();
         if (message.size() < prefix)
@@ -195,23 +219,40 @@ public:
             store(tile, region, in + recordPrefix);
             in += bytes;
             left -= bytes;
+            ++tilesOf_[static_cast<std::size_t>(source)].received;
             ++tilesReceived_;
         }
     }
 
-    void receiveDone(const Buffer& message)
+    void receiveDone(int source, const Buffer& message)
     {
         requireDisplay();
         if (message.size() != sizeof(MessageHeader) + sizeof(std::int64_t))
             failMalformed("a count of tiles has the wrong size");
-        tilesAnnounced_ += loadAs<std::int64_t>(message.data() + sizeof(MessageHeader));
+        const auto count = loadAs<std::int64_t>(message.data() + sizeof(MessageHeader));
+        tilesOf_[static_cast<std::size_t>(source)].announced = count;
+        tilesAnnounced_ += count;
         ++ranksDone_; // after the count: who sees all ranks done sees all counts
     }
 
     // All tiles of the other ranks are in the image.
     bool complete() const
     {
-        return !isDisplay_ || !enabled() || (ranksDone_ == otherRanks_ && tilesReceived_ == tilesAnnounced_);
+        return !isDisplay_ || !enabled() || (ranksDone_ == rankCount_ - 1 && tilesReceived_ == tilesAnnounced_);
+    }
+
+    // In words: whose finished tiles have not come.
+    std::string missing() const
+    {
+        std::string text;
+        for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
+            const std::int64_t announced = tilesOf_[r].announced, received = tilesOf_[r].received;
+            if (static_cast<int>(r) == rank_ || received == announced)
+                continue;
+            text += (text.empty() ? "finished tiles have not come from rank " : ", rank ") + std::to_string(r) + " ("
+                    + std::to_string(received) + " of " + (announced < 0 ? "all" : std::to_string(announced)) + ")";
+        }
+        return text;
     }
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
@@ -252,6 +293,11 @@ public:
 
 private:
     enum class TileState : std::uint8_t { Undefined, Background, Old, Received };
+    struct TilesOf {
+        std::atomic<std::int64_t> received{0}, announced{-1};
+        TilesOf() = default;
+        TilesOf(const TilesOf&) {} // for the vector, which never copies a used one
+    };
     struct BatchHeader {
         std::uint64_t rawBytes = 0;
         std::uint32_t codec = 0;
@@ -261,11 +307,15 @@ private:
     static constexpr std::size_t recordPrefix = 16;
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
+    static std::size_t recordBytes(std::size_t pixels, OutputFormat format, bool depth)
+    {
+        return recordPrefix + alignedTo16(pixels * bytesPerPixel(format))
+               + (depth ? alignedTo16(pixels * sizeof(float)) : 0);
+    }
     std::size_t recordBytes(const Region& region) const
     {
-        const auto pixels = static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
-        return recordPrefix + alignedTo16(pixels * bytesPerPixel(settings_.format))
-               + (settings_.depth ? alignedTo16(pixels * sizeof(float)) : 0);
+        return recordBytes(static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height()),
+                           settings_.format, settings_.depth);
     }
     std::size_t maxBatchBytes() const
     {
@@ -327,14 +377,19 @@ private:
         const MessageHeader m = messageHeader(MessageKind::FinishedTiles);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
-        send_(std::move(message));
+        if (settings_.atEnd) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            held_.push_back(std::move(message));
+        } else {
+            send_(std::move(message));
+        }
     }
 
     MessageHeader messageHeader(MessageKind kind) const
     {
         MessageHeader header;
         header.kind = kind;
-        header.framebuffer = settings_.framebuffer;
+        header.receiver = settings_.receiver;
         header.number = frame_;
         return header;
     }
@@ -349,12 +404,13 @@ private:
     TileLayout layout_;
     Settings settings_;
     bool isDisplay_;
-    int otherRanks_;
+    int rank_, rankCount_;
     Send send_;
     std::int64_t frame_ = 0;
 
     std::mutex mutex_;
     std::shared_ptr<Batch> batch_; // under mutex_
+    std::vector<Buffer> held_;     // under mutex_
     std::int64_t tilesSent_ = 0;   // under mutex_
 
     Image image_;
@@ -362,6 +418,7 @@ private:
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};
     std::atomic<int> ranksDone_{0};
+    std::vector<TilesOf> tilesOf_; // per rank, on the display rank
 };
 
 } // namespace dfb::detail

@@ -9,11 +9,14 @@
 #include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/frame.hpp>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cstddef>
 #include <cstdint>
 #include <exception>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -22,7 +25,7 @@ namespace dfb::detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
 template <class TileOp, class PixelOp, class Transport>
-class FrameEngine final : private MessageReceiver {
+class FrameEngine final : private MessageHandler {
 public:
     using Pipeline = TilePipeline<TileOp, PixelOp>;
     using Tile = typename Pipeline::Tile;
@@ -30,14 +33,17 @@ public:
     using PixelFrameData = typename FrameDataOf<PixelOp>::type;
     using Bytes = ReductionTable::Bytes;
 
-    FrameEngine(const typename Transport::Communicator& communicator, FrameBufferConfig config, PixelOp pixelOp)
-        : pool_(MemoryPool::create()), config_(std::move(config))
+    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp)
+        : pool_(messenger->pool()), config_(std::move(config))
     {
         if (!config_.executor)
             config_.executor = std::make_shared<ThreadExecutor>();
-        MessageReceiver& self = *this;
-        messaging_ = std::make_unique<Messaging<Transport>>(communicator, pool_, config_.progress, config_.executor,
-                                                            config_.id, self);
+        config_.progress = messenger->options().progress;
+        config_.checksums = messenger->options().checksums;
+        config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
+        MessageHandler& self = *this;
+        messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
+                                                            config_.messagePoolBytes, self);
         outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
         messaging_->start();
         Agreement mine;
@@ -45,15 +51,15 @@ public:
             if (config_.displayRank < 0 || config_.displayRank >= size())
                 throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
                                       + std::to_string(size()));
-            pipeline_ = std::make_unique<Pipeline>(
-                pool_, config_, std::move(pixelOp), rank(), size(),
-                [this](Buffer&& message) { messaging_->send(config_.displayRank, std::move(message)); });
+            pipeline_ =
+                std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
+                                           [this](Buffer&& message) { sendToDisplay(std::move(message)); });
             mine = Agreement::of(config_, Tile::size, Tile::channels, layout().tileCount(),
                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
-        } catch (
-            const std::exception& e) { // no memory, or out of the owner map: the others must not wait for this rank
+        } catch (const std::exception& e) {
+            // No memory, or out of the owner map: the others must not wait for this rank.
             mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};
         }
         const auto all = Agreement::from(messaging_->reduce(mine.bytes(), Agreement::combine));
@@ -84,7 +90,9 @@ public:
             throw InvalidArgument("a frame has at least 1 pass, not " + std::to_string(params.passes));
         if (params.declarationKey != 0 && !params.declared)
             throw InvalidArgument("a declarationKey without declared inputs");
-        messaging_->throwIfFailed();
+        if (params.timeoutMs < 0)
+            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
+        messaging_->messenger().throwIfFailed();
         const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
         params_ = params;
         lastKey_ = 0;
@@ -108,11 +116,13 @@ public:
         ownTilesDone_ = endCalled_ = false;
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
+        repeatedBefore_ = messaging_->messenger().duplicates();
         renderNs_ = 0;
         tilesLeft_ = countUnknown + (params.declared ? 0 : static_cast<std::int64_t>(ownedTiles().size()));
         beginTime_ = Clock::now();
         frameOpen_ = true;
-        messaging_->expectMessages(true);
+        messaging_->newEpoch(info.frame);
+        messaging_->messenger().expectMessages(true);
         for (auto& early : gate_.open())
             incoming(early.source, early.header, std::move(early.bytes));
         if (userError)
@@ -133,7 +143,8 @@ public:
         Buffer message = pipeline_->encode(tile);
         const int owner = tileOwner(tile.tile);
         if (owner != rank()) {
-            messaging_->send(owner, std::move(message));
+            messaging_->sendWithCredit(owner, std::move(message));
+            messaging_->waitForRoom([this] { return outcome_->failed(); });
         } else if (gate_.enter(tile.frame)) {
             arrive(std::move(message), {});
             gate_.leave();
@@ -159,6 +170,8 @@ public:
     }
 
     void abort(const std::exception_ptr& reason) { failWith(reason); }
+
+    bool poll() { return messaging_->messenger().poll(); }
 
     FrameReport end()
     {
@@ -214,13 +227,31 @@ private:
 
     void incoming(int source, const MessageHeader& header, Buffer&& message) override
     {
-        if (!gate_.enter(source, header, message))
+        const std::size_t byteCount = message.size();
+        const bool hasCredit = source != rank() && messaging_->needsCredit(header.kind);
+        switch (gate_.enter(source, header, message)) {
+        case FrameGate::Entry::Kept: return;
+        case FrameGate::Entry::Late:
+            if (hasCredit)
+                messaging_->flow().discarded(byteCount);
             return;
+        case FrameGate::Entry::Inside: break;
+        }
+        if (hasCredit)
+            messaging_->flow().consumed(source, byteCount);
         guarded([&] { handle(source, header, std::move(message)); }, messageFrom(source));
         gate_.leave();
     }
 
-    void malformed(int source, const std::exception_ptr& error) override { failWith(error, messageFrom(source)); }
+    void sendToDisplay(Buffer&& message)
+    {
+        if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind))
+            messaging_->sendWithCredit(config_.displayRank, std::move(message));
+        else
+            messaging_->send(config_.displayRank, std::move(message));
+    }
+
+    void undecodable(int source, const std::exception_ptr& error) override { failWith(error, messageFrom(source)); }
 
     static ErrorInfo messageFrom(int source)
     {
@@ -234,8 +265,15 @@ private:
         const MessageKind kind = header.kind;
         if (kind == MessageKind::Abort) {
             ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
-            outcome_->failElsewhere(getErrorInfo(body));
-            tryVote();
+            failElsewhere(getErrorInfo(body));
+            return;
+        }
+        if (kind == MessageKind::CreditRequest) {
+            messaging_->flow().requested(source, bodyAs<FlowControl::Request>(message));
+            return;
+        }
+        if (kind == MessageKind::Credit) {
+            messaging_->flow().credited(source, bodyAs<FlowControl::Credit>(message));
             return;
         }
         if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown) {
@@ -254,7 +292,7 @@ private:
                 throw Error(std::move(info));
             }
             manifests_.receive(
-                ByteReader(message.data() + sizeof(MessageHeader), message.size() - sizeof(MessageHeader)),
+                source, ByteReader(message.data() + sizeof(MessageHeader), message.size() - sizeof(MessageHeader)),
                 [this](int tile) { return pipeline_->table().isMine(tile); });
             messaging_->send(source, MessageKind::ManifestAck, gate_.frame());
             break;
@@ -263,15 +301,24 @@ private:
                 enterAllDeclared();
             break;
         case MessageKind::FinishedTiles:
-            pipeline_->gather().receiveTiles(std::move(message));
+            pipeline_->gather().receiveTiles(source, std::move(message));
             tryVote();
             break;
         case MessageKind::TilesDone:
-            pipeline_->gather().receiveDone(message);
+            pipeline_->gather().receiveDone(source, message);
             tryVote();
             break;
         default: break;
         }
+    }
+
+    template <class Body>
+    static Body bodyAs(const Buffer& message)
+    {
+        if (message.size() != sizeof(MessageHeader) + sizeof(Body))
+            failMalformed("wrong message size", sizeof(MessageHeader) + sizeof(Body),
+                          static_cast<std::int64_t>(message.size()));
+        return loadAs<Body>(message.data() + sizeof(MessageHeader));
     }
 
     // Ranks that were given different parameters may wait for different things, so that none of them would ever be
@@ -381,7 +428,46 @@ private:
     {
         if (!outcome_->fail(reason, where))
             gate_.countLate(); // too late to matter to this frame
+        messaging_->flow().drop();
         tryVote();
+    }
+
+    void failElsewhere(const ErrorInfo& info)
+    {
+        std::optional<ErrorInfo> mine;
+        if (info.kind == ErrorKind::TimedOut && !outcome_->failed())
+            mine = missing(); // this rank's part of what is missing
+        outcome_->failElsewhere(mine && mine->tile >= 0 ? *mine : info);
+        messaging_->flow().drop();
+        tryVote();
+    }
+
+    // What this rank waits for, if it does.
+    std::optional<ErrorInfo> missing()
+    {
+        std::optional<ErrorInfo> info;
+        if (!ownTilesDone_ && wantsDeclaration_ && tilesLeft_ >= countUnknown / 2) {
+            info.emplace();
+            info->message = "not all ranks have declared their inputs";
+            for (const int other : messaging_->reductions().missing({AllDeclared, gate_.frame()}))
+                info->message += ", no word from rank " + std::to_string(other);
+        } else if (!ownTilesDone_) {
+            info = pipeline_->table().missing(params_.declared);
+        } else if (!pipeline_->gather().complete()) {
+            info.emplace();
+            info->message = pipeline_->gather().missing();
+        } else {
+            info.emplace();
+            info->message = outcome_->waitsFor();
+        }
+        if (info) {
+            info->kind = ErrorKind::TimedOut;
+            info->rank = rank();
+            info->frame = gate_.frame();
+            if (const std::string lost = messaging_->messenger().lost(); !lost.empty())
+                info->message += (info->message.empty() ? "" : "; ") + lost;
+        }
+        return info;
     }
 
     // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
@@ -394,8 +480,11 @@ private:
                            v.sums = {messaging_->bytesSent() - bytesBefore_,
                                      messaging_->messagesSent() - messagesBefore_,
                                      ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
-                                     pipeline_->nonFinitePixels(), gate_.takeLateCount()};
-                           v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_};
+                                     pipeline_->nonFinitePixels(),
+                                     gate_.takeLateCount(),
+                                     messaging_->messenger().duplicates() - repeatedBefore_};
+                           v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
+                                       static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
                            return v;
                        });
     }
@@ -409,19 +498,41 @@ private:
         Verdict verdict;
         try {
             tryVote();
-            verdict = outcome_->wait();
+            verdict = params_.timeoutMs > 0 ? waitInTime() : *outcome_->wait();
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
         gate_.close();
         messaging_->reductions().forget(AllDeclared, gate_.frame());
-        messaging_->expectMessages(false);
+        messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
         if (transportError || verdict.error)
             pipeline_->gather().invalidate();
         if (transportError)
             std::rethrow_exception(transportError);
         return verdict;
+    }
+
+    // The verdict, or a frame that fails for what is missing, or, if even that can not be agreed on, TransportError.
+    Verdict waitInTime()
+    {
+        const auto limit = std::chrono::milliseconds(params_.timeoutMs);
+        const auto start = Clock::now();
+        if (const Verdict* verdict = outcome_->wait(start + limit))
+            return *verdict;
+        if (const auto what = missing(); what && !outcome_->failed())
+            failWith(std::make_exception_ptr(Error(*what)));
+        if (const Verdict* verdict = outcome_->wait(start + 2 * limit))
+            return *verdict;
+        ErrorInfo info;
+        info.kind = ErrorKind::Transport;
+        info.rank = rank();
+        info.frame = gate_.frame();
+        info.message = "no verdict after " + std::to_string(2 * params_.timeoutMs) + " ms";
+        for (const std::string& more : {outcome_->waitsFor(), messaging_->messenger().lost()})
+            info.message += (more.empty() ? "" : ": ") + more;
+        messaging_->messenger().giveUp(info);
+        throw TransportError(std::move(info));
     }
 
     std::shared_ptr<MemoryPool> pool_;
@@ -439,7 +550,7 @@ private:
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};
     std::atomic<std::int64_t> renderNs_{0};
-    std::int64_t bytesBefore_ = 0, messagesBefore_ = 0;
+    std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
 
     std::unique_ptr<Messaging<Transport>> messaging_; // last: its tasks use the others

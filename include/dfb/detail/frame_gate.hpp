@@ -36,23 +36,29 @@ public:
         return std::move(early_);
     }
 
-    // Whether the message may be worked on now: then leave() must follow. If not, it has been taken care of.
-    bool enter(int source, const MessageHeader& header, Buffer& message)
+    enum class Entry {
+        Inside, // it may be worked on now; leave() must follow
+        Kept,   // it belongs to a frame to come
+        Late    // it is of no use any more, and has been counted
+    };
+
+    Entry enter(int source, const MessageHeader& header, Buffer& message)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (header.number > frame_) {
             early_.push_back({source, header, std::move(message)});
-            return false;
+            return Entry::Kept;
         }
         if (header.number < frame_ || !open_) {
-            ++late_;
-            return false;
+            // Credit for what nobody sends any more is no sign of anything.
+            late_ += header.kind != MessageKind::Credit && header.kind != MessageKind::CreditRequest;
+            return Entry::Late;
         }
         ++inside_;
-        return true;
+        return Entry::Inside;
     }
 
-    // The same for work that is no message.
+    // The same for work that is no message: whether it may go on.
     bool enter(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);

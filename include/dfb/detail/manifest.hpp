@@ -27,8 +27,13 @@ struct TileInput {
 
 namespace dfb::detail {
 
-// Per tile the (source, part) of what will come.
-using ExpectedInputs = std::map<int, std::vector<std::pair<std::uint32_t, std::uint16_t>>>;
+// Something that will come for a tile.
+struct ExpectedInput {
+    std::uint32_t source = 0;
+    std::uint16_t part = 0;
+    int rank = 0; // that has said so
+};
+using ExpectedInputs = std::map<int, std::vector<ExpectedInput>>; // per tile
 
 class ManifestExchange {
 public:
@@ -50,7 +55,7 @@ public:
         for (const TileInput& input : inputs) {
             const int owner = ownerOf(input.tile);
             if (owner == rank) {
-                expected_[input.tile].emplace_back(input.source, input.part);
+                expected_[input.tile].push_back({input.source, input.part, rank});
                 continue;
             }
             ByteWriter& out = writers[owner];
@@ -65,9 +70,10 @@ public:
         return result;
     }
 
-    // The owner's side. Throws Error (MalformedMessage); `isMine(tile)` tells which tiles can be meant.
+    // The owner's side, with a manifest of rank `from`. Throws Error (MalformedMessage); `isMine(tile)` tells which
+    // tiles can be meant.
     template <class IsMine>
-    void receive(ByteReader in, const IsMine& isMine)
+    void receive(int from, ByteReader in, const IsMine& isMine)
     {
         std::lock_guard<std::mutex> lock(mutex_);
         while (in.left() > 0) {
@@ -82,7 +88,7 @@ public:
                 info.message = "a manifest names a tile of another owner";
                 throw Error(std::move(info));
             }
-            expected_[tile].emplace_back(source, part);
+            expected_[tile].push_back({source, part, from});
         }
     }
 

@@ -7,10 +7,12 @@
 #include <dfb/detail/verdict.hpp>
 
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <exception>
 #include <mutex>
 #include <optional>
+#include <string>
 #include <utility>
 
 namespace dfb::detail {
@@ -92,11 +94,19 @@ public:
                                       });
     }
 
-    // Waits for the verdict of all ranks. Throws TransportError.
-    const Verdict& wait()
+    // Waits for the verdict of all ranks: null if it has not come before `deadline`. Throws TransportError.
+    const Verdict* wait(std::optional<std::chrono::steady_clock::time_point> deadline = std::nullopt)
     {
-        messaging_.wait([this] { return hasVerdict_.load(); });
-        return *verdict_;
+        return messaging_.wait([this] { return hasVerdict_.load(); }, deadline) ? &*verdict_ : nullptr;
+    }
+
+    // The ranks whose votes, or whose word of the verdict, this rank waits for.
+    std::string waitsFor()
+    {
+        std::string text;
+        for (const int rank : messaging_.reductions().missing({scope_, gate_.frame()}))
+            text += (text.empty() ? "no verdict from rank " : ", ") + std::to_string(rank);
+        return text;
     }
 
 private:

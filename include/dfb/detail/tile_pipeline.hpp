@@ -29,13 +29,21 @@ public:
 
     // Throws InvalidArgument for a configuration that can not be.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, PixelOp pixelOp, int rank,
-                 int rankCount, FinalGather::Send sendToDisplay)
-        : pool_(std::move(pool)), config_(config), pixelOp_(std::move(pixelOp)),
+                 int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay)
+        : pool_(std::move(pool)), config_(config), address_(address), pixelOp_(std::move(pixelOp)),
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
-          gather_(pool_, table_.layout(), {config.format, config.depth, config.id, config.codec},
-                  rank == config.displayRank, rankCount - 1, std::move(sendToDisplay))
+          gather_(pool_, table_.layout(),
+                  {config.format, config.depth, address, config.codec, config.gather == GatherMode::AtEnd},
+                  rank == config.displayRank, rank, rankCount, std::move(sendToDisplay))
     {
+    }
+
+    // The most that one message with pixels can have.
+    static std::size_t largestMessage(const FrameBufferConfig& config)
+    {
+        return std::max(largestFragment(Tile::size),
+                        FinalGather::largestMessage(Tile::size, config.format, config.depth));
     }
 
     TileTable<TileOp>& table() noexcept { return table_; }
@@ -77,7 +85,7 @@ public:
         const auto wanted =
             static_cast<ChannelMask>(NeededChannelsOf<TileOp>::value | (config_.depth ? depthChannel : 0));
         std::uint64_t nonFinite = 0;
-        Buffer message = encodeFragment(*pool_, tile, wanted, config_.id,
+        Buffer message = encodeFragment(*pool_, tile, wanted, address_,
                                         table_.isMine(tile.tile) ? nullptr : config_.codec.get(), nonFinite);
         if (nonFinite)
             nonFinite_ += static_cast<std::int64_t>(nonFinite);
@@ -152,6 +160,7 @@ public:
 private:
     std::shared_ptr<MemoryPool> pool_;
     const FrameBufferConfig& config_;
+    std::uint32_t address_; // of the framebuffer
     PixelOp pixelOp_;
     TileTable<TileOp> table_;
     FinalGather gather_;

@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -125,7 +126,7 @@ public:
                     continue;
                 Slot& slot = slotFor(owned_[i]);
                 if (!slot.declared)
-                    declareSlot(slot, named ? inputs->second : ExpectedInputs::mapped_type{});
+                    declareSlot(slot, named ? &inputs->second : nullptr);
                 complete = becomesReady(slot, allComplete(slot));
             }
             counted(owned_[i]);
@@ -136,6 +137,55 @@ public:
 
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
+
+    // What the tiles that are not complete wait for: the first of them, and all in words. `declared`: tiles that nobody
+    // named wait for nothing.
+    std::optional<ErrorInfo> missing(bool declared)
+    {
+        constexpr int mostTiles = 8; // in the text
+        const ExpectedInputs* expected = expected_;
+        std::optional<ErrorInfo> first;
+        int tiles = 0;
+        std::string text;
+        for (std::size_t i = 0; i < owned_.size(); ++i) {
+            const int tile = owned_[i];
+            const std::vector<ExpectedInput>* inputs = nullptr;
+            if (expected)
+                if (const auto named = expected->find(tile); named != expected->end())
+                    inputs = &named->second;
+            const std::lock_guard<std::mutex> lock(mutexOf(tile));
+            const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
+            if (touched ? slots_[i]->ready : declared && !inputs)
+                continue;
+            const DependencyTracker untouched;
+            for (int pass = 0; pass < info_.passes; ++pass) {
+                const DependencyTracker& tree = touched ? slots_[i]->trees[static_cast<std::size_t>(pass)] : untouched;
+                const auto m = tree.missing();
+                if (!m)
+                    continue;
+                if (!first) {
+                    first.emplace();
+                    first->kind = ErrorKind::TimedOut;
+                    first->tile = tile;
+                    first->pass = pass;
+                    first->generation = m->generation;
+                    first->source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().first);
+                    first->expected = m->expected;
+                    first->got = m->got;
+                }
+                if (++tiles <= mostTiles)
+                    text += (tiles > 1 ? "; tile " : "tile ") + std::to_string(tile)
+                            + (info_.passes > 1 ? " pass " + std::to_string(pass) : "") + ": " + m->text()
+                            + namesOf(*m, inputs);
+                break;
+            }
+        }
+        if (tiles > mostTiles)
+            text += "; and " + std::to_string(tiles - mostTiles) + " more tiles";
+        if (first)
+            first->message = std::move(text);
+        return first;
+    }
 
     // How many tiles have had an input in this frame.
     int touchedCount()
@@ -178,16 +228,37 @@ private:
                 slot->op.newFrame(info);
             const ExpectedInputs* expected = expected_;
             if (expected && !expected->count(tile))
-                declareSlot(*slot, {});
+                declareSlot(*slot, nullptr);
         }
         return *slot;
     }
 
-    static void declareSlot(Slot& slot, const ExpectedInputs::mapped_type& inputs)
+    // `inputs`: null where none will come.
+    static void declareSlot(Slot& slot, const std::vector<ExpectedInput>* inputs)
     {
         slot.declared = true;
+        std::vector<std::pair<std::uint32_t, std::uint16_t>> names;
+        if (inputs)
+            for (const ExpectedInput& input : *inputs)
+                names.emplace_back(input.source, input.part);
         for (DependencyTracker& tree : slot.trees)
-            tree.declare(inputs);
+            tree.declare(names);
+    }
+
+    // In words: which of the inputs are missing, and from whom.
+    static std::string namesOf(const DependencyTracker::Missing& missing, const std::vector<ExpectedInput>* expected)
+    {
+        std::string text;
+        for (const auto& [source, part] : missing.inputs) {
+            text += (text.empty() ? "; missing source " : ", ") + std::to_string(source);
+            if (part > 0)
+                text += " part " + std::to_string(part);
+            if (expected)
+                for (const ExpectedInput& input : *expected)
+                    if (input.source == source && input.part == part)
+                        text += " of rank " + std::to_string(input.rank);
+        }
+        return text;
     }
 
     static bool allComplete(const Slot& slot)

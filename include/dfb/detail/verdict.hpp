@@ -67,14 +67,16 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
     f.add(static_cast<std::uint64_t>(p.passes));
     f.add(p.declared);
     f.add(p.declarationKey);
+    f.add(static_cast<std::uint64_t>(p.timeoutMs));
     return f.value();
 }
 
 struct Verdict {
     std::optional<ErrorInfo> error;
-    std::uint64_t paramsHash = 0;         // of what begin() was given; the same on all ranks
-    std::array<std::int64_t, 5> sums{};   // bytes, messages, tiles touched, non-finite pixels, late messages
-    std::array<std::int64_t, 2> maxima{}; // peak memory in bytes, rendering in ns
+    std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
+    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages.
+    std::array<std::int64_t, 6> sums{};
+    std::array<std::int64_t, 3> maxima{}; // peak memory in bytes, rendering in ns, peak of the inbox in bytes
 
     std::vector<std::byte> bytes() const
     {
@@ -108,31 +110,47 @@ struct Verdict {
         report.tilesTouched = sums[2];
         report.nonFinitePixels = sums[3];
         report.lateMessages = sums[4];
+        report.repeatedMessages = sums[5];
         report.peakMemoryBytes = maxima[0];
         report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
+        report.peakInboxBytes = maxima[2];
     }
 
     static ErrorInfo disagreement()
     {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
-        info.message = "the frame was begun with different parameters (background, passes, declared, declarationKey)";
+        info.message =
+            "the frame was begun with different parameters (background, passes, declared, declarationKey, timeoutMs)";
         return info;
     }
 
-    // Of several errors, the one of the lowest rank; one that says why before one that only says "cancelled".
-    static bool outranks(const ErrorInfo& a, const ErrorInfo& b)
+    // How much an error says about why the frame failed.
+    static int weight(const ErrorInfo& e)
     {
-        const bool cancelledA = a.kind == ErrorKind::Cancelled, cancelledB = b.kind == ErrorKind::Cancelled;
-        return cancelledA != cancelledB ? cancelledB : a.rank < b.rank;
+        if (e.kind == ErrorKind::Cancelled)
+            return 0;
+        return e.kind != ErrorKind::TimedOut ? 3 : e.tile >= 0 ? 2 : 1;
+    }
+
+    // Of several errors, one that says most, and the one of the lowest rank; of what is missing, all.
+    static ErrorInfo chosen(const ErrorInfo& a, const ErrorInfo& b)
+    {
+        constexpr std::size_t mostText = 2000;
+        const bool second = weight(a) != weight(b) ? weight(b) > weight(a) : b.rank < a.rank;
+        ErrorInfo info = second ? b : a;
+        const ErrorInfo& other = second ? a : b;
+        if (weight(a) == 2 && weight(b) == 2 && a.rank != b.rank && info.message.size() < mostText)
+            info.message += "; on rank " + std::to_string(other.rank) + ": " + other.message;
+        return info;
     }
 
     static std::vector<std::byte> combine(const std::vector<std::byte>& first, const std::vector<std::byte>& second)
     {
         Verdict a = from(first);
         const Verdict b = from(second);
-        if (b.error && (!a.error || outranks(*b.error, *a.error)))
-            a.error = b.error;
+        if (b.error)
+            a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
         if (!a.error && a.paramsHash != b.paramsHash)
             a.error = disagreement();
         for (std::size_t i = 0; i < a.sums.size(); ++i)
@@ -160,8 +178,8 @@ struct Agreement {
         return {true, "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width)
                           + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
                           + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth)
-                          + ", display rank " + text(c.displayRank) + ", id " + text(c.id) + ", codec "
-                          + text(c.codec ? c.codec->id() : 0) + ", owner map " + text(owners.value())};
+                          + ", display rank " + text(c.displayRank) + ", codec " + text(c.codec ? c.codec->id() : 0)
+                          + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};
     }
 
     std::vector<std::byte> bytes() const

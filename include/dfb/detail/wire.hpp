@@ -26,25 +26,35 @@ namespace dfb::detail {
 struct FragmentHeader {
     std::int32_t tile = 0;
     std::int32_t pass = 0;
-    std::int32_t generation = 0;
     std::int32_t children = 0;
     std::uint32_t source = 0;
-    std::uint16_t part = 0;
-    ChannelMask channels = 0;
     std::uint32_t activePixels = 0;
-    std::uint32_t spanCount = 0;
+    std::uint32_t rawPayloadBytes = 0; // before compression
+    std::uint16_t generation = 0;
+    std::uint16_t part = 0;
+    std::uint16_t spanCount = 0;
     std::uint16_t rowBegin = 0, rowEnd = 0;
+    ChannelMask channels = 0;
     FragmentEncoding encoding = FragmentEncoding::Empty;
     std::uint8_t codec = 0; // 0: the payload is raw
     std::uint16_t reserved = 0;
-    std::uint32_t rawPayloadBytes = 0; // before compression
-    std::uint32_t reserved2 = 0;
 };
-static_assert(sizeof(FragmentHeader) == 48 && std::is_trivially_copyable_v<FragmentHeader>);
+static_assert(sizeof(FragmentHeader) == 40 && std::is_trivially_copyable_v<FragmentHeader>);
 
 inline constexpr std::size_t fragmentPrefix = sizeof(MessageHeader) + sizeof(FragmentHeader);
+static_assert(fragmentPrefix % 16 == 0, "pixels are read in place");
 
 inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
+
+// The most that a fragment message can have. A row's second span costs less than the pixel that parts it from the
+// first.
+inline std::size_t largestFragment(int tileSize)
+{
+    const auto side = static_cast<std::size_t>(tileSize), pixels = side * side;
+    const std::size_t perPixel = sizeof(float) * static_cast<std::size_t>(floatsPerPixel(colorChannel | depthChannel));
+    static_assert(sizeof(Span) <= 5 * sizeof(float));
+    return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * side) + pixels * perPixel;
+}
 
 // The active pixels of a tile: those with any colour channel that is not 0. A pixel of colour 0 and alpha 0
 // contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does.
@@ -115,7 +125,7 @@ inline float canonicalDepth(float depth)
 // Makes the message for a tile, with the channels of `wanted` that the tile has. Adds to `nonFinite` the number of
 // pixels that have an infinity or a NaN in the colour, or a NaN for a depth. `codec` may be null.
 template <class TileType>
-Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t framebuffer,
+Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t receiver,
                       const Codec* codec, std::uint64_t& nonFinite)
 {
     static thread_local ActiveSpans active;
@@ -126,7 +136,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     FragmentHeader h;
     h.tile = tile.tile;
     h.pass = tile.pass;
-    h.generation = tile.generation;
+    h.generation = static_cast<std::uint16_t>(tile.generation); // checked: it is below 2^16
     h.children = tile.children;
     h.source = tile.source;
     h.part = tile.part;
@@ -143,7 +153,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
             stored = 1;
     } else {
         h.encoding = FragmentEncoding::Sparse;
-        h.spanCount = static_cast<std::uint32_t>(active.spans.size());
+        h.spanCount = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
     const std::size_t payload =
@@ -153,7 +163,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     Buffer message = pool.acquire(fragmentPrefix + payload);
     MessageHeader m;
     m.kind = MessageKind::Fragment;
-    m.framebuffer = framebuffer;
+    m.receiver = receiver;
     m.number = tile.frame;
     std::byte* out = message.data() + fragmentPrefix;
     if (h.encoding == FragmentEncoding::Sparse) {

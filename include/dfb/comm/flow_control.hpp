@@ -1,0 +1,301 @@
+// FlowControl: how much a rank may send to another before that one has room again: credit in bytes, from one
+// pool per receiver.
+//
+// Each sender has a part of half the pool without asking. What is more it asks for (CreditRequest) and gets from the
+// other half, in the order of asking and always for whole messages, so that what is granted is used and comes back. A
+// credit returns when the receiver has taken the message out of its inbox. Thus the messages on the way to a rank and
+// in its inbox never exceed its pool, however many senders there are. Counts are running totals within an epoch (a
+// frame): a Credit that overtakes another does no harm, and nothing that got lost outlives its epoch.
+#pragma once
+
+#include <dfb/comm/message.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <deque>
+#include <functional>
+#include <mutex>
+#include <unordered_map>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+// All members may be called from any thread. The callbacks are called without a lock held.
+class FlowControl {
+public:
+    // What CreditRequest and Credit messages carry.
+    struct Request {
+        std::uint64_t first = 0; // the total that is needed for the first message that waits
+        std::uint64_t all = 0;   // and for as many as should come at once
+    };
+    struct Credit {
+        std::uint64_t granted = 0;  // the total that may be sent
+        std::uint64_t consumed = 0; // the total that has left the inbox
+    };
+
+    struct Callbacks {
+        std::function<void(int destination, Buffer&& message)> transmit;
+        std::function<void(int destination, const Request&)> request;
+        std::function<void(int source, const Credit&)> credit;
+    };
+
+    // `poolBytes` is the same on all ranks, and at least 4 times the largest message.
+    FlowControl(int rankCount, std::size_t poolBytes, Callbacks callbacks)
+        : pool_(poolBytes), allowance_(rankCount > 1 ? poolBytes / 2 / static_cast<std::size_t>(rankCount - 1) : 0),
+          free_(poolBytes - allowance_ * static_cast<std::size_t>(rankCount - 1)), callbacks_(std::move(callbacks))
+    {
+    }
+
+    std::size_t poolBytes() const noexcept { return pool_; }
+
+    // Forgets everything: all that was sent before has arrived or does not matter any more.
+    void newEpoch()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        free_ += extraInUse_;
+        extraInUse_ = 0;
+        outgoing_.clear();
+        incoming_.clear();
+        asking_.clear();
+        underWay_ = 0;
+        peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
+        dropping_ = false;
+    }
+
+    // From now on nothing of this epoch matters: forgets what waits, and does not keep what comes.
+    void drop()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        dropping_ = true;
+        for (auto& [destination, out] : outgoing_) {
+            underWay_ -= out.queuedBytes;
+            out.queue.clear();
+            out.queuedBytes = 0;
+        }
+    }
+
+    // ---- the sender's side
+
+    // Transmits the message, or keeps it until there is credit. Never blocks.
+    void send(int destination, Buffer&& message)
+    {
+        Request request;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (dropping_)
+                return;
+            Outgoing& out = outgoingTo(destination);
+            underWay_ += message.size();
+            if (!out.queue.empty() || out.sent + message.size() > out.granted) {
+                out.queuedBytes += message.size();
+                out.queue.push_back(std::move(message));
+                if (out.asked)
+                    return;
+                request = requestOf(out);
+            } else {
+                out.sent += message.size();
+            }
+        }
+        if (request.first > 0)
+            callbacks_.request(destination, request);
+        else
+            callbacks_.transmit(destination, std::move(message));
+    }
+
+    // Bytes that were given to send() and that no receiver has taken out of its inbox as far as is known.
+    std::size_t underWay() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return underWay_;
+    }
+
+    void credited(int from, const Credit& credit)
+    {
+        std::vector<Buffer> ready;
+        Request request;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            Outgoing& out = outgoingTo(from);
+            out.granted = std::max(out.granted, credit.granted);
+            if (credit.consumed > out.consumed) {
+                const std::uint64_t more = std::min(credit.consumed, out.sent) - out.consumed;
+                out.consumed += more;
+                underWay_ -= more;
+            }
+            out.asked = false;
+            while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
+                out.sent += out.queue.front().size();
+                out.queuedBytes -= out.queue.front().size();
+                ready.push_back(std::move(out.queue.front()));
+                out.queue.pop_front();
+            }
+            if (!out.queue.empty())
+                request = requestOf(out);
+        }
+        for (Buffer& message : ready)
+            callbacks_.transmit(from, std::move(message));
+        if (request.first > 0)
+            callbacks_.request(from, request);
+    }
+
+    // ---- the receiver's side
+
+    // A message with credit, of whichever epoch, is in the inbox.
+    void arrived(std::size_t byteCount)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        inboxBytes_ += byteCount;
+        peakInboxBytes_ = std::max(peakInboxBytes_, inboxBytes_);
+    }
+
+    // It is of another epoch, and has been thrown away.
+    void discarded(std::size_t byteCount)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        inboxBytes_ -= byteCount;
+    }
+
+    // It has been taken out.
+    void consumed(int source, std::size_t byteCount)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        Incoming& in = incomingFrom(source);
+        in.consumed += byteCount;
+        inboxBytes_ -= byteCount;
+        updateExtra(in);
+        // Not for each message; but what no sender is told of must stay below a part of its pool, as it may be waiting.
+        if (in.consumed - in.told >= allowance_ / 2)
+            grant(source, in, in.consumed + allowance_);
+        serve(lock);
+    }
+
+    void requested(int source, const Request& request)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        Incoming& in = incomingFrom(source);
+        in.request = request;
+        if (!in.asks)
+            asking_.push_back(source);
+        in.asks = true;
+        serve(lock);
+    }
+
+    // The most that was in the inbox at one time in this epoch.
+    std::size_t peakInboxBytes() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return peakInboxBytes_;
+    }
+
+private:
+    struct Outgoing {
+        std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
+        std::deque<Buffer> queue;
+        std::size_t queuedBytes = 0;
+        bool asked = false;
+    };
+    struct Incoming {
+        std::uint64_t granted = 0, consumed = 0; // totals
+        std::uint64_t told = 0;                  // of consumed
+        std::uint64_t extra = 0;                 // of what is granted and not consumed, that beyond the allowance
+        Request request;
+        bool asks = false;
+    };
+
+    Outgoing& outgoingTo(int rank)
+    {
+        const auto [place, isNew] = outgoing_.try_emplace(rank);
+        if (isNew)
+            place->second.granted = allowance_;
+        return place->second;
+    }
+
+    Incoming& incomingFrom(int rank)
+    {
+        const auto [place, isNew] = incoming_.try_emplace(rank);
+        if (isNew)
+            place->second.granted = allowance_;
+        return place->second;
+    }
+
+    // For the first message that waits, and as many of the next as fit in a quarter of the pool.
+    Request requestOf(Outgoing& out) const
+    {
+        out.asked = true;
+        Request request;
+        std::uint64_t total = out.sent;
+        for (const Buffer& message : out.queue) {
+            if (request.first > 0 && total + message.size() - out.sent > pool_ / 4)
+                break;
+            total += message.size();
+            if (request.first == 0)
+                request.first = total;
+            request.all = total;
+        }
+        return request;
+    }
+
+    std::uint64_t extraOf(const Incoming& in, std::uint64_t granted) const
+    {
+        const std::uint64_t covered = in.consumed + allowance_;
+        return granted > covered ? granted - covered : 0;
+    }
+
+    void updateExtra(Incoming& in)
+    {
+        const std::uint64_t now = extraOf(in, in.granted);
+        extraInUse_ = extraInUse_ + now - in.extra;
+        free_ = free_ + in.extra - now;
+        in.extra = now;
+    }
+
+    void grant(int source, Incoming& in, std::uint64_t total)
+    {
+        in.granted = std::max(in.granted, total);
+        updateExtra(in);
+        if (in.asks && in.granted >= in.request.first)
+            in.asks = false; // it will ask again if it wants more
+        in.told = in.consumed;
+        grants_.push_back({source, {in.granted, in.consumed}});
+    }
+
+    // Answers who has asked, the first one first, as far as the pool reaches; then tells what was granted.
+    void serve(std::unique_lock<std::mutex>& lock)
+    {
+        while (!asking_.empty()) {
+            const int source = asking_.front();
+            Incoming& in = incomingFrom(source);
+            if (in.asks) {
+                const auto fits = [&](std::uint64_t total) { return extraOf(in, total) <= free_ + in.extra; };
+                if (fits(in.request.all))
+                    grant(source, in, in.request.all);
+                else if (fits(in.request.first))
+                    grant(source, in, in.request.first);
+                else
+                    break;
+            }
+            asking_.pop_front();
+        }
+        std::vector<std::pair<int, Credit>> grants;
+        grants.swap(grants_);
+        lock.unlock();
+        for (const auto& [source, credit] : grants)
+            callbacks_.credit(source, credit);
+    }
+
+    const std::size_t pool_, allowance_;
+    mutable std::mutex mutex_;
+    std::size_t free_;           // of the half that is granted on request
+    std::size_t extraInUse_ = 0; // the rest of it
+    std::unordered_map<int, Outgoing> outgoing_;
+    std::unordered_map<int, Incoming> incoming_;
+    std::deque<int> asking_;
+    std::vector<std::pair<int, Credit>> grants_; // to be told
+    std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;
+    bool dropping_ = false;
+    Callbacks callbacks_;
+};
+
+} // namespace dfb::detail

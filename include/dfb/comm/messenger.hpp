@@ -1,0 +1,344 @@
+// Messenger: a communicator's messages for any number of framebuffers: which object a message is for, that it
+// comes once and whole, and progress of the transport (section 3.2 of the paper).
+#pragma once
+
+#include <dfb/comm/checksum.hpp>
+#include <dfb/comm/message.hpp>
+#include <dfb/comm/progress.hpp>
+#include <dfb/comm/transport.hpp>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <set>
+#include <string>
+#include <thread>
+#include <unordered_map>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+struct MessengerOptions {
+    Progress progress = Progress::Thread;
+    bool checksums = false; // each message carries a CRC-32C; must be the same on all ranks
+};
+
+namespace detail {
+
+// An object that messages are for. The calls are quick, never block, and come from any thread, several at once.
+class MessageReceiver {
+public:
+    virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
+    virtual void malformed(int source, const std::exception_ptr& error) = 0; // may have been for this one
+    virtual void messengerFailed() = 0;
+
+protected:
+    ~MessageReceiver() = default;
+};
+
+// Which messages of one sender have come: each number once, in any order.
+class SequenceWindow {
+public:
+    enum class Result { New, Duplicate, Absurd };
+
+    Result arrive(std::uint32_t sequence)
+    {
+        const auto ahead = static_cast<std::int32_t>(sequence - next_);
+        if (ahead >= 0) {
+            if (ahead > maxHoles)
+                return Result::Absurd;
+            for (; next_ != sequence; ++next_)
+                holes_.insert(next_);
+            ++next_;
+            return Result::New;
+        }
+        return holes_.erase(sequence) == 1 ? Result::New : Result::Duplicate;
+    }
+
+    // Messages that later ones have overtaken, or that are lost.
+    std::size_t missing() const noexcept { return holes_.size(); }
+
+private:
+    static constexpr std::int32_t maxHoles = 1 << 20;
+    std::uint32_t next_ = 0;
+    std::set<std::uint32_t> holes_;
+};
+
+} // namespace detail
+
+// A framebuffer makes one of its own unless it is given one; framebuffers that share it share its progress thread and
+// its buffers. They must be made in the same order on all ranks, and gone before it. All members may be called from
+// any thread unless they say otherwise.
+template <class Transport>
+class Messenger final : private TransportHandler {
+    static_assert(detail::checkTransport<Transport>());
+
+public:
+    // Collective, like the destructor. Throws TransportError.
+    explicit Messenger(const typename Transport::Communicator& communicator, MessengerOptions options = {})
+        : options_(options), pool_(MemoryPool::create()), transport_(communicator, pool_, options.progress)
+    {
+        transport_.start(*this);
+        if (transport_.needsPolling() && options_.progress == Progress::Thread)
+            progress_.start();
+    }
+
+    ~Messenger()
+    {
+        progress_.stop();
+        if (failed_) // what tells the others of it should still leave, but not at any cost
+            for (int tries = 0; tries < 100 && transport_.mayPoll() && !transport_.quiet(); ++tries) {
+                transport_.poll();
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+            }
+        transport_.stop(!failed_);
+    }
+
+    int rank() const noexcept { return transport_.rank(); }
+    int size() const noexcept { return transport_.size(); }
+    const MessengerOptions& options() const noexcept { return options_; }
+    const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
+
+    // Moves messages; true if any moved. With Progress::Thread there is no need to call it. Never blocks.
+    bool poll()
+    {
+        if (progress_.running())
+            return false;
+        const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
+        return lock.owns_lock() && transport_.poll();
+    }
+
+    // ---- for the objects that it serves
+
+    // Gives the receiver an address, which is the same on all ranks, and then what has come for it already.
+    void attach(detail::MessageReceiver& receiver, std::uint32_t& address)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        address = addresses_++;
+        receivers_.emplace(address, &receiver);
+        if (const auto early = early_.find(address); early != early_.end()) {
+            for (Early& e : early->second)
+                receiver.receive(e.source, e.header, std::move(e.message));
+            early_.erase(early);
+        }
+    }
+
+    // Afterwards the receiver is not called any more; what comes for it is dropped.
+    void detach(std::uint32_t address)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        receivers_.erase(address);
+    }
+
+    // `message` starts with a MessageHeader; `destination` is another rank. Never blocks.
+    void send(int destination, Buffer&& message)
+    {
+        auto header = detail::loadAs<detail::MessageHeader>(message.data());
+        {
+            const std::lock_guard<std::mutex> lock(peersMutex_);
+            header.sequence = peers_[destination].sent++;
+        }
+        header.checksum = 0;
+        std::memcpy(message.data(), &header, sizeof header);
+        if (options_.checksums) {
+            header.checksum = checksumOf(message);
+            std::memcpy(message.data(), &header, sizeof header);
+        }
+        transport_.send(destination, std::move(message));
+    }
+
+    // Messages that came twice, since the start; they are dropped.
+    std::int64_t duplicates() const noexcept { return duplicates_; }
+
+    // In words, which ranks have sent messages that did not arrive although later ones did; may be empty.
+    std::string lost() const
+    {
+        const std::lock_guard<std::mutex> lock(peersMutex_);
+        std::map<int, std::size_t> missing;
+        for (const auto& [source, peer] : peers_)
+            if (peer.received.missing() > 0)
+                missing[source] = peer.received.missing();
+        std::string text;
+        for (const auto& [source, count] : missing)
+            text += (text.empty() ? "messages on the way or lost: " : ", ") + std::to_string(count) + " from rank "
+                    + std::to_string(source);
+        return text;
+    }
+
+    // Messages may come from now on, or no more; as often false as true.
+    void expectMessages(bool expect)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        expecting_ += expect ? 1 : -1;
+        progress_.expectMessages(expecting_ > 0);
+    }
+
+    // Whether poll() is what the calling thread must do while it waits, and whether somebody else does so.
+    bool needsCaller() const noexcept { return transport_.needsPolling() && !progress_.running(); }
+    bool mayPoll() const noexcept { return transport_.mayPoll(); }
+    bool quiet() const { return transport_.quiet(); }
+    void nap(std::chrono::nanoseconds limit) { transport_.nap(limit); }
+    void interrupt()
+    {
+        if (needsCaller())
+            transport_.interrupt();
+    }
+
+    bool failed() const noexcept { return failed_; }
+    void throwIfFailed() const
+    {
+        if (!failed_)
+            return;
+        const std::lock_guard<std::mutex> lock(failureMutex_);
+        throw TransportError(*failure_);
+    }
+
+    // This rank can not go on: says so to the others, so that nobody waits for it.
+    void giveUp(const ErrorInfo& error)
+    {
+        if (!setFailure(error))
+            return;
+        const std::string text = error.describe();
+        for (int other = 0; other < size(); ++other)
+            if (other != rank()) {
+                detail::MessageHeader header;
+                header.kind = detail::MessageKind::Failure;
+                send(other,
+                     detail::makeMessage(*pool_, header, reinterpret_cast<const std::byte*>(text.data()), text.size()));
+            }
+        tellReceivers();
+    }
+
+private:
+    struct Peer {
+        std::uint32_t sent = 0;
+        detail::SequenceWindow received;
+    };
+    struct Early {
+        int source;
+        detail::MessageHeader header;
+        Buffer message;
+    };
+
+    static std::uint32_t checksumOf(const Buffer& message)
+    {
+        const std::uint32_t crc = crc32c(message.data(), message.size());
+        return crc == 0 ? 1 : crc;
+    }
+
+    void checkChecksum(detail::MessageHeader header, Buffer& message) const
+    {
+        const std::uint32_t got = header.checksum;
+        if ((got != 0) != options_.checksums)
+            detail::failMalformed(got != 0 ? "with a checksum; this rank uses none" : "without a checksum");
+        if (got == 0)
+            return;
+        header.checksum = 0;
+        std::memcpy(message.data(), &header, sizeof header);
+        if (checksumOf(message) != got)
+            detail::failMalformed("the checksum is wrong", got, checksumOf(message));
+    }
+
+    void receive(int source, Buffer&& message) override
+    {
+        detail::MessageHeader header;
+        try {
+            header = detail::readMessageHeader(message);
+            checkChecksum(header, message);
+            if (!isNew(source, header.sequence))
+                return;
+        } catch (const Error&) {
+            const auto error = std::current_exception();
+            const std::lock_guard<std::mutex> lock(mutex_);
+            for (const auto& [address, receiver] : receivers_)
+                receiver->malformed(source, error);
+            return;
+        }
+        if (header.kind == detail::MessageKind::Failure) {
+            const std::byte* text = std::as_const(message).data() + sizeof header;
+            fail(failureOf(source, std::string(reinterpret_cast<const char*>(text), message.size() - sizeof header)));
+            return;
+        }
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const auto receiver = receivers_.find(header.receiver);
+        if (receiver != receivers_.end())
+            receiver->second->receive(source, header, std::move(message));
+        else if (header.receiver >= addresses_)
+            early_[header.receiver].push_back({source, header, std::move(message)});
+    }
+
+    bool isNew(int source, std::uint32_t sequence)
+    {
+        const std::lock_guard<std::mutex> lock(peersMutex_);
+        const auto result = peers_[source].received.arrive(sequence);
+        if (result == detail::SequenceWindow::Result::Absurd)
+            detail::failMalformed("a running number far from the others");
+        duplicates_ += result == detail::SequenceWindow::Result::Duplicate;
+        return result == detail::SequenceWindow::Result::New;
+    }
+
+    static ErrorInfo failureOf(int rank, std::string text)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Transport;
+        info.rank = rank;
+        info.message = "this rank can not go on: " + std::move(text);
+        return info;
+    }
+
+    bool setFailure(const ErrorInfo& error)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(failureMutex_);
+            if (failure_)
+                return false;
+            failure_ = error;
+        }
+        failed_ = true;
+        return true;
+    }
+
+    void fail(const ErrorInfo& error) override
+    {
+        if (setFailure(error))
+            tellReceivers();
+    }
+
+    void tellReceivers()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        for (const auto& [address, receiver] : receivers_)
+            receiver->messengerFailed();
+    }
+
+    const MessengerOptions options_;
+    std::shared_ptr<MemoryPool> pool_;
+    Transport transport_;
+    std::mutex pollMutex_;
+    std::atomic<std::int64_t> duplicates_{0};
+
+    mutable std::mutex peersMutex_;
+    std::unordered_map<int, Peer> peers_; // made when first needed; under peersMutex_
+
+    std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
+    std::map<std::uint32_t, detail::MessageReceiver*> receivers_;
+    std::map<std::uint32_t, std::vector<Early>> early_; // for receivers to come
+    std::uint32_t addresses_ = 0;
+    int expecting_ = 0;
+
+    mutable std::mutex failureMutex_;
+    std::optional<ErrorInfo> failure_;
+    std::atomic<bool> failed_{false};
+
+    ProgressThread<Transport> progress_{transport_};
+};
+
+} // namespace dfb
