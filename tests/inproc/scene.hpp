@@ -34,6 +34,7 @@ struct FlatCamera {
 struct Scene {
     int width = 97, height = 61; // primes
     int passes = 1;
+    int timeoutMs = 0;
     std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
     std::uint64_t seed = 1;
     std::vector<dfb::Brick> bricks;
@@ -104,6 +105,7 @@ inline dfb::FrameParams paramsOf(const Scene& s)
     dfb::FrameParams params;
     params.background = s.background;
     params.passes = s.passes;
+    params.timeoutMs = s.timeoutMs;
     return params;
 }
 

@@ -14,7 +14,6 @@
 #include <cstdint>
 #include <cstring>
 #include <deque>
-#include <exception>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -29,7 +28,7 @@ public:
     // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
     // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    virtual void undecodable(int source, const std::exception_ptr& error) = 0;
+    virtual void undecodable(int source, const ErrorInfo& error) = 0;
 
 protected:
     ~MessageHandler() = default;
@@ -315,14 +314,14 @@ private:
                     return;
                 }
             }
-        } catch (...) {
-            handler_.undecodable(a.source, std::current_exception());
+        } catch (const Error& e) {
+            handler_.undecodable(a.source, e.info());
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
-    void malformed(int source, const std::exception_ptr& error) override
+    void malformed(int source, const ErrorInfo& error) override
     {
         submit([this, source, error] { handler_.undecodable(source, error); });
     }

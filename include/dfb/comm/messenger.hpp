@@ -12,7 +12,6 @@
 #include <chrono>
 #include <cstdint>
 #include <cstring>
-#include <exception>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -37,7 +36,7 @@ namespace detail {
 class MessageReceiver {
 public:
     virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
-    virtual void malformed(int source, const std::exception_ptr& error) = 0; // may have been for this one
+    virtual void malformed(int source, const ErrorInfo& error) = 0; // may have been for this one
     virtual void messengerFailed() = 0;
 
 protected:
@@ -192,7 +191,7 @@ public:
             transport_.interrupt();
     }
 
-    bool failed() const noexcept { return failed_; }
+    bool failed() const noexcept override { return failed_; }
     void throwIfFailed() const
     {
         if (!failed_)
@@ -255,11 +254,10 @@ private:
             checkChecksum(header, message);
             if (!isNew(source, header.sequence))
                 return;
-        } catch (const Error&) {
-            const auto error = std::current_exception();
+        } catch (const Error& e) {
             const std::lock_guard<std::mutex> lock(mutex_);
             for (const auto& [address, receiver] : receivers_)
-                receiver->malformed(source, error);
+                receiver->malformed(source, e.info());
             return;
         }
         if (header.kind == detail::MessageKind::Failure) {

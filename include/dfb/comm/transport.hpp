@@ -20,8 +20,9 @@
 //                                                interrupt() is called, or `limit` has passed
 //   void interrupt();                            any thread; ends the nap under way, else the next one
 //   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects
-//                                                anything more; collective where the transport needs it. Else (it
-//                                                has failed): waits for nobody
+//                                                anything more; collective where the transport needs it, and goes
+//                                                on delivering while it waits, until the handler has failed(). Else:
+//                                                waits for nobody
 //
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
@@ -51,6 +52,7 @@ class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;
     virtual void fail(const ErrorInfo& error) = 0; // the transport can not go on
+    virtual bool failed() const = 0;               // it can not, or another rank has said that it can not
 
 protected:
     ~TransportHandler() = default;

@@ -16,6 +16,7 @@
 #include <cstdint>
 #include <exception>
 #include <memory>
+#include <mutex>
 #include <optional>
 #include <string>
 #include <utility>
@@ -127,6 +128,7 @@ public:
             incoming(early.source, early.header, std::move(early.bytes));
         if (userError)
             failWith(userError); // comes out of end(), on all ranks
+        failForStray();
         if (!params.declared)
             tilesLess(countUnknown);
         else if (reuse)
@@ -243,6 +245,17 @@ private:
         gate_.leave();
     }
 
+    void failForStray()
+    {
+        std::optional<ErrorInfo> stray;
+        {
+            const std::lock_guard<std::mutex> lock(strayMutex_);
+            stray.swap(stray_);
+        }
+        if (stray)
+            failWith(std::make_exception_ptr(Error(std::move(*stray))));
+    }
+
     void sendToDisplay(Buffer&& message)
     {
         if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind))
@@ -251,7 +264,18 @@ private:
             messaging_->send(config_.displayRank, std::move(message));
     }
 
-    void undecodable(int source, const std::exception_ptr& error) override { failWith(error, messageFrom(source)); }
+    // Nobody knows which frame it was for: if none is open, the next one can not do without it.
+    void undecodable(int source, const ErrorInfo& error) override
+    {
+        const std::exception_ptr reason = std::make_exception_ptr(Error(error));
+        if (gate_.enterAny()) {
+            failWith(reason, messageFrom(source));
+            gate_.leave();
+            return;
+        }
+        const std::lock_guard<std::mutex> lock(strayMutex_);
+        stray_ = errorInfoOf(reason, messageFrom(source));
+    }
 
     static ErrorInfo messageFrom(int source)
     {
@@ -546,6 +570,8 @@ private:
     FrameParams params_;
     std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
     bool frameOpen_ = false;
+    std::mutex strayMutex_;
+    std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};

@@ -68,6 +68,14 @@ public:
         return true;
     }
 
+    // The same for work of whichever frame is open.
+    bool enterAny()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        inside_ += open_;
+        return open_;
+    }
+
     void leave()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
