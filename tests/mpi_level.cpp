@@ -1,14 +1,16 @@
 // What the constructor says of MPI that is not initialised, of a thread level that is too low, and of MPI that is over; and
-// that Progress::Caller works at MPI_THREAD_FUNNELED. MPI can be initialised once a process:
-//   mpirun -n 2 mpi_level single      mpirun -n 2 mpi_level funneled
+// that Progress::Caller works from MPI_THREAD_FUNNELED on. MPI can be initialised once a process:
+//   mpirun -n 2 mpi_level single|funneled|serialized
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
 #include <mpi.h>
 
 #include <cstdio>
+#include <cstdint>
 #include <memory>
 #include <string>
+#include <vector>
 
 namespace {
 
@@ -52,13 +54,19 @@ std::string transportErrorOf(dfb::Progress progress)
 
 int main(int argc, char** argv)
 {
-    const bool single = argc > 1 && std::string(argv[1]) == "single";
+    const std::string argument = argc > 1 ? argv[1] : "";
+    const bool single = argument == "single";
     for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
         const std::string text = transportErrorOf(progress);
         check(has(text, "transport failure") && has(text, "not initialised"), "before MPI_Init", text);
     }
 
-    const int wanted = single ? MPI_THREAD_SINGLE : MPI_THREAD_FUNNELED;
+    const int wanted = single                     ? MPI_THREAD_SINGLE
+                       : argument == "serialized" ? MPI_THREAD_SERIALIZED
+                                                  : MPI_THREAD_FUNNELED;
+    const char* name = single                     ? "MPI_THREAD_SINGLE"
+                       : argument == "serialized" ? "MPI_THREAD_SERIALIZED"
+                                                  : "MPI_THREAD_FUNNELED";
     int level = 0;
     MPI_Init_thread(&argc, &argv, wanted, &level);
     if (level != wanted) {
@@ -67,7 +75,7 @@ int main(int argc, char** argv)
         return failures;
     }
     const std::string thread = transportErrorOf(dfb::Progress::Thread);
-    check(has(thread, "transport failure") && has(thread, single ? "MPI_THREAD_SINGLE" : "MPI_THREAD_FUNNELED")
+    check(has(thread, "transport failure") && has(thread, name)
               && has(thread, "MPI_THREAD_MULTIPLE"),
           "Progress::Thread", thread);
     if (single) {
@@ -76,18 +84,30 @@ int main(int argc, char** argv)
               "Progress::Caller", caller);
     } else {
         try {
-            FrameBuffer fb(MPI_COMM_WORLD, configWith(dfb::Progress::Caller));
+            auto config = configWith(dfb::Progress::Caller);
+            config.messagePoolBytes = 1; // so that workers have to wait in setTile(), and may have to poll
+            config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
+            FrameBuffer fb(MPI_COMM_WORLD, config);
+            std::vector<int> mine;
+            for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
+                mine.push_back(tile);
             for (int frame = 0; frame < 3; ++frame) {
-                dfb::renderImageParallel(fb, [frame](auto& tile) { tile.fill({frame * 0.2f, 0, 0, 1}); });
+                dfb::renderImageParallel(fb, mine, [&](auto& tile) {
+                    tile.fill({0, frame * 0.2f, tile.tile % 6 * 0.2f, 1});
+                    fb.poll();
+                });
                 if (!fb.isDisplayRank())
                     continue;
                 int wrong = 0;
-                for (std::size_t i = 0; i < fb.image().pixelCount(); ++i)
-                    wrong += fb.image().rgba8()[4 * i] != 51 * frame || fb.image().rgba8()[4 * i + 3] != 255;
+                for (int y = 0; y < 40; ++y)
+                    for (int x = 0; x < 50; ++x) {
+                        const std::uint8_t* p = fb.image().rgba8() + 4 * (50 * y + x);
+                        wrong += p[1] != 51 * frame || p[2] != fb.layout().tileAt(x / 16, y / 16) % 6 * 51 || p[3] != 255;
+                    }
                 check(wrong == 0, "pixels that are wrong", std::to_string(wrong));
             }
         } catch (const std::exception& e) {
-            check(false, "Progress::Caller at MPI_THREAD_FUNNELED", e.what());
+            check(false, "Progress::Caller", e.what());
         }
     }
 

@@ -117,7 +117,8 @@ public:
     const Image& image() const noexcept { return engine_.image(); }
 
     // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
-    // compositing goes on meanwhile; otherwise there is no need to. Waits for nothing.
+    // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI. Waits
+    // for nothing.
     bool poll() { return engine_.poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws

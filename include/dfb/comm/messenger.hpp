@@ -106,10 +106,11 @@ public:
     const MessengerOptions& options() const noexcept { return options_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
-    // Moves messages; true if any moved. With Progress::Thread there is no need to call it. Never blocks.
+    // Moves messages; true if any moved. With Progress::Thread there is no need to call it, and on a thread that may
+    // not be in MPI it does nothing. Never blocks.
     bool poll()
     {
-        if (progress_.running())
+        if (progress_.running() || !transport_.mayPoll())
             return false;
         const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
         return lock.owns_lock() && transport_.poll();

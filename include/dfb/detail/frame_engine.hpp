@@ -93,6 +93,8 @@ public:
             throw InvalidArgument("a declarationKey without declared inputs");
         if (params.timeoutMs < 0)
             throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
+        if (messaging_->messenger().needsCaller() && !messaging_->messenger().mayPoll())
+            throw InvalidArgument("at this thread level of MPI frames belong to the thread that initialised it");
         messaging_->messenger().throwIfFailed();
         const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
         params_ = params;
