@@ -124,14 +124,15 @@ public:
                 out.consumed += more;
                 underWay_ -= more;
             }
-            out.asked = false;
+            if (out.granted >= out.askedFor)
+                out.asked = false;
             while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
                 out.sent += out.queue.front().size();
                 out.queuedBytes -= out.queue.front().size();
                 ready.push_back(std::move(out.queue.front()));
                 out.queue.pop_front();
             }
-            if (!out.queue.empty())
+            if (!out.queue.empty() && !out.asked)
                 request = requestOf(out);
         }
         for (Buffer& message : ready)
@@ -175,6 +176,8 @@ public:
     {
         std::unique_lock<std::mutex> lock(mutex_);
         Incoming& in = incomingFrom(source);
+        if (request.first <= in.granted || (in.asks && request.first <= in.request.first))
+            return; // it has its answer, or a later one has overtaken it
         in.request = request;
         if (!in.asks)
             asking_.push_back(source);
@@ -194,6 +197,7 @@ private:
         std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
         std::deque<Buffer> queue;
         std::size_t queuedBytes = 0;
+        std::uint64_t askedFor = 0; // Request::first, as long as `asked`
         bool asked = false;
     };
     struct Incoming {
@@ -234,6 +238,7 @@ private:
                 request.first = total;
             request.all = total;
         }
+        out.askedFor = request.first;
         return request;
     }
 
