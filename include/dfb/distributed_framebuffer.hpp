@@ -72,9 +72,10 @@ public:
         // Makes the frame fail on all ranks, with the text of this exception. From any thread.
         void abort(const std::exception_ptr& reason) { engine_->abort(reason); }
 
-        // Collective. Waits until all tiles of all ranks are finished and the image is complete on the display rank, or
-        // the frame has failed. Throws FrameError, the same on every rank, or TransportError; in both cases the frame
-        // is over, and after a FrameError the framebuffer can begin the next.
+        // Collective; for several framebuffers, in the same order on all ranks. Waits until all tiles of all ranks are
+        // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
+        // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
+        // begin the next.
         FrameReport end() { return std::exchange(engine_, nullptr)->end(); }
 
     private:
@@ -117,8 +118,8 @@ public:
     const Image& image() const noexcept { return engine_.image(); }
 
     // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
-    // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI. Waits
-    // for nothing.
+    // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI.
+    // Waits for nothing.
     bool poll() { return engine_.poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws

@@ -50,7 +50,7 @@ struct FrameParams {
     std::uint64_t declarationKey = 0;
     // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
-    // TransportError. The same on all ranks.
+    // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
     int timeoutMs = 0;
 };
 
@@ -67,8 +67,8 @@ struct FrameReport {
     std::int64_t tilesTotal = 0;       // in the image
     std::int64_t tilesTouched = 0;     // all: tiles that had an input
     std::int64_t nonFinitePixels = 0;  // all: input pixels with an infinity or NaN (see detail/wire.hpp)
-    std::int64_t lateMessages = 0;     // all: of cancelled or failed frames, dropped since the last verdict
-    std::int64_t repeatedMessages = 0; // all: came twice from the transport, and were dropped
+    std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict
+    std::int64_t repeatedMessages = 0; // all: came twice, dropped since the last verdict
     std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messagePoolBytes
     std::int64_t peakMemoryBytes = 0;  // all: most that one rank's framebuffer ever held in message and image memory
 };

@@ -970,7 +970,8 @@ TEST_CASE("A rank that leaves by an exception outside frames: the others get a T
                     if (rank != culprit) {
                         const std::string& text = texts[static_cast<std::size_t>(rank)];
                         CHECK(has(text, "TransportError: dfb: transport failure: rank " + std::to_string(culprit)));
-                        CHECK(has(text, "out of disk"));
+                        // From runRanks(), or from the messenger that the exception passes on its way there.
+                        CHECK((has(text, "out of disk") || has(text, "an exception has ended its messenger")));
                     }
             }
 }

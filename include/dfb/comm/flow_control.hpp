@@ -16,6 +16,7 @@
 #include <deque>
 #include <functional>
 #include <mutex>
+#include <string>
 #include <unordered_map>
 #include <utility>
 #include <vector>
@@ -109,6 +110,18 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         return underWay_;
+    }
+
+    // In words: who has not taken how much.
+    std::string notTaken() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        std::string text;
+        for (const auto& [destination, out] : outgoing_)
+            if (const std::uint64_t bytes = out.sent - out.consumed + out.queuedBytes; bytes > 0)
+                text += (text.empty() ? "rank " : ", rank ") + std::to_string(destination) + " has not taken "
+                        + std::to_string(bytes) + " bytes";
+        return text;
     }
 
     void credited(int from, const Credit& credit)

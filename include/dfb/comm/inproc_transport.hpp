@@ -119,6 +119,10 @@ public:
     {
     }
 
+    InprocTransport(const InprocTransport&) = delete;
+    InprocTransport& operator=(const InprocTransport&) = delete;
+    ~InprocTransport() { stop(false); }
+
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return hub_->size(); }
     bool needsPolling() const noexcept { return hub_->shuffles(); }
@@ -166,8 +170,10 @@ public:
         std::lock_guard<std::mutex> lock(self.mutex);
         if (!self.handler || self.waiting.empty())
             return false;
-        if (self.waiting.size() < 16 && self.patience++ < 3)
+        if (self.waiting.size() < 16 && self.patience++ < 3) {
+            self.signal.interrupt(); // to be asked again soon
             return false;
+        }
         std::swap(self.waiting[static_cast<std::size_t>(self.random() % self.waiting.size())], self.waiting.back());
         auto [source, message] = std::move(self.waiting.back());
         self.waiting.pop_back();

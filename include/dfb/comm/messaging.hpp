@@ -17,6 +17,7 @@
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -119,18 +120,29 @@ public:
 
     // Returns when what this rank has sent, and nobody has taken out of an inbox yet, is no more than a pool, or
     // `over()`. Runs waiting tasks meanwhile, so that ranks that wait for each other's inboxes get on. On a thread that
-    // could not make progress it returns at once.
+    // could not make progress it returns at once. False if nobody takes anything for as long as `limit`, unless that is
+    // 0.
     template <class Over>
-    void waitForRoom(const Over& over)
+    bool waitForRoom(const Over& over, std::chrono::milliseconds limit)
     {
+        std::size_t before = flow_.underWay();
         const auto roomy = [this] { return flow_.underWay() <= flow_.poolBytes(); };
         const auto done = [&] { return roomy() || failed() || over(); };
-        while (!done()) {
+        if (done())
+            return true;
+        const typename Messenger<Transport>::Hurry hurry(*messenger_);
+        for (auto lastChange = Clock::now(); !done();) {
+            if (const std::size_t now = flow_.underWay(); now < before) {
+                before = now;
+                lastChange = Clock::now();
+            } else if (limit.count() > 0 && Clock::now() - lastChange > limit) {
+                return false;
+            }
             if (executor_->help())
                 continue;
             if (messenger_->needsCaller()) {
                 if (!messenger_->mayPoll())
-                    return;
+                    return true;
                 if (!messenger_->poll() && !done())
                     messenger_->nap(std::chrono::microseconds(50));
             } else {
@@ -138,6 +150,7 @@ public:
                 changed_.wait_for(lock, std::chrono::microseconds(200), [&] { return !inbox_.empty() || roomy(); });
             }
         }
+        return true;
     }
 
     // Message bytes and messages to other ranks since the start.
@@ -192,14 +205,21 @@ public:
     template <class Ready>
     bool wait(const Ready& ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
+        const typename Messenger<Transport>::Hurry hurry(*messenger_);
         std::unique_lock<std::mutex> lock(mutex_);
         const auto over = [&] { return failed() || ready(); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
         if (!messenger_->needsCaller()) {
-            if (deadline)
-                changed_.wait_until(lock, *deadline, over);
-            else
-                changed_.wait(lock, over);
+            while (!over() && !late()) {
+                const auto next = Clock::now() + std::chrono::milliseconds(2);
+                changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next, over);
+                // Workers may be short: those of several ranks in one process can all be in waitForRoom(), each for
+                // the others.
+                lock.unlock();
+                while (!over() && !late() && executor_->help()) {
+                }
+                lock.lock();
+            }
         } else {
             // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
             while ((!over() || (!failed() && !messenger_->quiet())) && !late()) {
@@ -225,6 +245,7 @@ public:
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         messenger_->expectMessages(true);
+        reducing_ = true;
         reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
                           [this, result](const Bytes& bytes) {
                               result->bytes = bytes;
@@ -234,9 +255,11 @@ public:
         try {
             wait([&] { return result->there.load(); });
         } catch (...) {
+            reducing_ = false;
             messenger_->expectMessages(false);
             throw;
         }
+        reducing_ = false;
         messenger_->expectMessages(false);
         return result->bytes;
     }
@@ -315,7 +338,7 @@ private:
                 }
             }
         } catch (const Error& e) {
-            handler_.undecodable(a.source, e.info());
+            undecodable(a.source, e.info());
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
@@ -323,7 +346,19 @@ private:
 
     void malformed(int source, const ErrorInfo& error) override
     {
-        submit([this, source, error] { handler_.undecodable(source, error); });
+        submit([this, source, error] { undecodable(source, error); });
+    }
+
+    // A frame can fail; a reduction outside frames can not go on without the message that this may have been.
+    void undecodable(int source, ErrorInfo error)
+    {
+        if (epoch_ > 0 && !reducing_) {
+            handler_.undecodable(source, error);
+            return;
+        }
+        error.rank = rank();
+        error.message += ", in a message from rank " + std::to_string(source);
+        messenger_->giveUp(error);
     }
 
     void messengerFailed() override { notify(); }
@@ -337,6 +372,7 @@ private:
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
     std::int64_t reductionCount_ = 0; // of reduce()
+    std::atomic<bool> reducing_{false};
 
     std::mutex mutex_;
     std::condition_variable changed_;

@@ -6,12 +6,14 @@
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/detail/byte_io.hpp>
 
 #include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <cstring>
+#include <exception>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -90,8 +92,16 @@ public:
             progress_.start();
     }
 
+    // While an exception passes it waits for nobody, as the other ranks may not be on their way here, and tells them.
     ~Messenger()
     {
+        if (std::uncaught_exceptions() > exceptions_) {
+            ErrorInfo error;
+            error.kind = ErrorKind::Transport;
+            error.rank = rank();
+            error.message = "an exception has ended its messenger";
+            giveUp(error);
+        }
         progress_.stop();
         if (failed_) // what tells the others of it should still leave, but not at any cost
             for (int tries = 0; tries < 100 && transport_.mayPoll() && !transport_.quiet(); ++tries) {
@@ -129,6 +139,9 @@ public:
                 receiver.receive(e.source, e.header, std::move(e.message));
             early_.erase(early);
         }
+        if (stray_)
+            receiver.malformed(stray_->first, stray_->second);
+        stray_.reset();
     }
 
     // Afterwards the receiver is not called any more; what comes for it is dropped.
@@ -181,6 +194,18 @@ public:
         progress_.expectMessages(expecting_ > 0);
     }
 
+    // As long as it lives, messages are looked for often.
+    class Hurry {
+    public:
+        explicit Hurry(Messenger& messenger) : progress_(messenger.progress_) { progress_.hurry(true); }
+        Hurry(const Hurry&) = delete;
+        Hurry& operator=(const Hurry&) = delete;
+        ~Hurry() { progress_.hurry(false); }
+
+    private:
+        ProgressThread<Transport>& progress_;
+    };
+
     // Whether poll() is what the calling thread must do while it waits, and whether somebody else does so.
     bool needsCaller() const noexcept { return transport_.needsPolling() && !progress_.running(); }
     bool mayPoll() const noexcept { return transport_.mayPoll(); }
@@ -206,14 +231,13 @@ public:
     {
         if (!setFailure(error))
             return;
-        const std::string text = error.describe();
+        detail::ByteWriter body;
+        put(body, error);
+        detail::MessageHeader header;
+        header.kind = detail::MessageKind::Failure;
         for (int other = 0; other < size(); ++other)
-            if (other != rank()) {
-                detail::MessageHeader header;
-                header.kind = detail::MessageKind::Failure;
-                send(other,
-                     detail::makeMessage(*pool_, header, reinterpret_cast<const std::byte*>(text.data()), text.size()));
-            }
+            if (other != rank())
+                send(other, detail::makeMessage(*pool_, header, body.bytes().data(), body.bytes().size()));
         tellReceivers();
     }
 
@@ -255,15 +279,17 @@ private:
             checkChecksum(header, message);
             if (!isNew(source, header.sequence))
                 return;
+            if (header.kind == detail::MessageKind::Failure) {
+                detail::ByteReader body(std::as_const(message).data() + sizeof header, message.size() - sizeof header);
+                fail(detail::getErrorInfo(body));
+                return;
+            }
         } catch (const Error& e) {
             const std::lock_guard<std::mutex> lock(mutex_);
             for (const auto& [address, receiver] : receivers_)
                 receiver->malformed(source, e.info());
-            return;
-        }
-        if (header.kind == detail::MessageKind::Failure) {
-            const std::byte* text = std::as_const(message).data() + sizeof header;
-            fail(failureOf(source, std::string(reinterpret_cast<const char*>(text), message.size() - sizeof header)));
+            if (receivers_.empty())
+                stray_.emplace(source, e.info());
             return;
         }
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -282,15 +308,6 @@ private:
             detail::failMalformed("a running number far from the others");
         duplicates_ += result == detail::SequenceWindow::Result::Duplicate;
         return result == detail::SequenceWindow::Result::New;
-    }
-
-    static ErrorInfo failureOf(int rank, std::string text)
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::Transport;
-        info.rank = rank;
-        info.message = "this rank can not go on: " + std::move(text);
-        return info;
     }
 
     bool setFailure(const ErrorInfo& error)
@@ -319,6 +336,7 @@ private:
     }
 
     const MessengerOptions options_;
+    const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
     std::mutex pollMutex_;
@@ -330,6 +348,7 @@ private:
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::map<std::uint32_t, detail::MessageReceiver*> receivers_;
     std::map<std::uint32_t, std::vector<Early>> early_; // for receivers to come
+    std::optional<std::pair<int, ErrorInfo>> stray_;    // what was malformed when there was no receiver
     std::uint32_t addresses_ = 0;
     int expecting_ = 0;
 

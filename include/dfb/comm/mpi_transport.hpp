@@ -1,17 +1,25 @@
 // MpiTransport: ranks are MPI processes. The only header that includes mpi.h.
 //
-// All MPI calls are made by the constructor, stop() and poll(), none of them blocks once the constructor is done
-// (MPI libraries spin while they block). Works on a duplicate of the caller's communicator; never initialises or
+// All MPI calls are made by the constructor, poll() and stop(), and none of them blocks (MPI libraries spin while they
+// block): what has to wait tests and naps. Works on a duplicate of the caller's communicator; never initialises or
 // finalises MPI.
+//
+// Small messages to one rank travel together, in packets of at most 8 KiB, which the libraries send without asking the
+// receiver first. A larger message is announced in a packet, and then sent on its own under the tag that the
+// announcement names, so that it goes straight into the block that the handler gets. Receives of packets are posted
+// beforehand: nothing is ever probed for. They take 64 KiB per transport.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
 
 #include <mpi.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cstddef>
-#include <limits>
+#include <cstdint>
+#include <cstring>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -21,13 +29,55 @@
 
 namespace dfb {
 
+namespace detail {
+
+inline const char* mpiLevelName(int level)
+{
+    return level == MPI_THREAD_SINGLE       ? "MPI_THREAD_SINGLE"
+           : level == MPI_THREAD_FUNNELED   ? "MPI_THREAD_FUNNELED"
+           : level == MPI_THREAD_SERIALIZED ? "MPI_THREAD_SERIALIZED"
+                                            : "MPI_THREAD_MULTIPLE";
+}
+
+inline void checkMpi(int code, const char* call, int rank)
+{
+    if (code == MPI_SUCCESS)
+        return;
+    char text[MPI_MAX_ERROR_STRING];
+    int length = 0;
+    MPI_Error_string(code, text, &length);
+    throw TransportError(std::string(call) + ": " + std::string(text, static_cast<std::size_t>(length)), rank);
+}
+
+// For waiting without spinning and without a blocking call.
+class Patience {
+public:
+    void nap()
+    {
+        std::this_thread::sleep_for(next_);
+        next_ = std::min<std::chrono::microseconds>(next_ + next_ / 4, std::chrono::microseconds(200));
+    }
+    void reset() { next_ = shortest; }
+
+private:
+    static constexpr std::chrono::microseconds shortest{20};
+    std::chrono::microseconds next_ = shortest;
+};
+
+} // namespace detail
+
 class MpiTransport {
 public:
     using Communicator = MPI_Comm;
     static constexpr const char* name = "mpi";
 
+    static constexpr std::size_t packetBytes = 8192;                // see above
+    static constexpr int postedPackets = 8;                         // receives; together they are what is said above
+    static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
+
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // at a lower thread level than `progress` needs.
+    // at a lower thread level than `progress` needs. At MPI_THREAD_FUNNELED to be called by the thread that initialised
+    // MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool))
     {
@@ -41,13 +91,40 @@ public:
         MPI_Query_thread(&level);
         const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
         if (level < needed)
-            throw TransportError(std::string("MPI was initialised at thread level ") + levelName(level) + ", "
-                                 + levelName(needed) + " is needed: call MPI_Init_thread with it"
+            throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
+                                 + ", " + detail::mpiLevelName(needed) + " is needed: call MPI_Init_thread with it"
                                  + (progress == Progress::Thread ? ", or configure Progress::Caller" : ""));
-        check(MPI_Comm_dup(communicator, &comm_), "MPI_Comm_dup");
+        if (level == MPI_THREAD_FUNNELED) {
+            int isMain = 0;
+            MPI_Is_thread_main(&isMain);
+            if (!isMain)
+                throw TransportError("MPI was initialised at thread level MPI_THREAD_FUNNELED by another thread: only "
+                                     "that one may call MPI");
+            onlyThread_ = std::this_thread::get_id();
+        }
+
+        MPI_Request duplicated = MPI_REQUEST_NULL;
+        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
+        for (detail::Patience patience; !completed(duplicated);)
+            patience.nap();
         MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN);
         MPI_Comm_rank(comm_, &rank_);
         MPI_Comm_size(comm_, &size_);
+        const int* tagBound = nullptr;
+        int found = 0;
+        MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found);
+        lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
+
+        peers_.resize(static_cast<std::size_t>(size_));
+        packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
+        packets_ = pool_->acquire(packetBytes * postedPackets);
+        try {
+            for (int slot = 0; slot < postedPackets; ++slot)
+                postPacket(slot);
+        } catch (...) {
+            abandon();
+            throw;
+        }
     }
     MpiTransport(const MpiTransport&) = delete;
     MpiTransport& operator=(const MpiTransport&) = delete;
@@ -55,14 +132,23 @@ public:
     {
         int finalized = 0;
         MPI_Finalized(&finalized);
-        if (comm_ != MPI_COMM_NULL && !finalized)
-            MPI_Comm_free(&comm_);
+        if (comm_ == MPI_COMM_NULL || finalized)
+            return;
+        try {
+            cancelPackets([](int, std::size_t) {}); // if stop() was never called
+        } catch (const std::exception&) {
+        }
+        MPI_Comm_free(&comm_);
     }
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     bool needsPolling() const noexcept { return true; }
-    bool mayPoll() const noexcept { return true; }
+    // At MPI_THREAD_FUNNELED only the thread that initialised MPI, above that any.
+    bool mayPoll() const noexcept
+    {
+        return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
+    }
     bool wakesOnArrival() const noexcept { return false; }
     void nap(std::chrono::nanoseconds limit) { signal_.nap(limit); }
     void interrupt() { signal_.interrupt(); }
@@ -71,147 +157,443 @@ public:
 
     void send(int destination, Buffer&& message)
     {
+        bool first = false;
         {
-            std::lock_guard<std::mutex> lock(mutex_);
+            const std::lock_guard<std::mutex> lock(mutex_);
+            first = outbox_.empty();
             outbox_.emplace_back(destination, std::move(message));
         }
-        signal_.interrupt();
+        if (first)
+            signal_.interrupt();
     }
 
     bool quiet() const
     {
-        std::lock_guard<std::mutex> lock(mutex_);
-        return outbox_.empty() && pendingSends_ == 0;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return outbox_.empty() && !sending_;
     }
 
+    // A failure is told to the other ranks, whose poll() then fails with the same error: they would wait for this one.
+    // Afterwards nothing is sent but that, and nothing received.
     bool poll()
     {
-        try {
-            const bool sent = startSends();
-            const bool arrived = startReceives();
-            const bool delivered = finishReceives();
-            const bool completed = finishSends();
-            return sent || arrived || delivered || completed;
-        } catch (const Error& e) {
-            handler_->fail(e.info());
-            return false;
-        }
+        if (failed_)
+            finishNotices();
+        return !failed_ && guarded([this] { return move(); });
     }
 
-    // Orderly it is collective, and goes on receiving until the sends of all ranks have completed.
+    // Orderly it is collective: serves the other ranks until all have called it, then goes on until all messages have
+    // come; MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
-        if (!orderly) {
-            // MPI may still use these buffers, and freeing a communicator waits for others: both are left to it.
-            new std::vector<Buffer>(std::move(sending_));
-            new std::vector<Receive>(std::move(receiving_));
-            comm_ = MPI_COMM_NULL;
-            return;
-        }
-        MPI_Request barrier = MPI_REQUEST_NULL;
-        bool entered = false;
-        for (int done = 0; !done;) {
-            poll();
-            if (!entered && quiet()) {
-                check(MPI_Ibarrier(comm_, &barrier), "MPI_Ibarrier");
-                entered = true;
-            }
-            if (entered)
-                check(MPI_Test(&barrier, &done, MPI_STATUS_IGNORE), "MPI_Test");
-            if (!done)
-                std::this_thread::sleep_for(std::chrono::microseconds(20));
-        }
-        while (poll()) {
-        }
+        if (!orderly || failed_ || !guarded([this] { return finish(); }))
+            abandon();
     }
 
 private:
-    struct Receive {
-        int source;
-        Buffer message;
+    // Precedes each message in a packet, and stands alone for one that is sent on its own.
+    struct Record {
+        enum Kind : std::uint32_t { Message, Announcement, Failure };
+        std::uint64_t byteCount;
+        std::int32_t tag; // of an announced message
+        Kind kind;
+    };
+    static_assert(sizeof(Record) == 16);
+
+    // Bytes that MPI has in hand. What is longer than a chunk goes on when the chunk has gone.
+    struct Transfer {
+        Buffer data;
+        std::size_t offset = 0; // of the chunk
+        int peer = -1;
+        int tag = 0;
+
+        int count() const { return static_cast<int>(std::min(data.size() - offset, chunkBytes)); }
     };
 
-    static const char* levelName(int level)
+    // Requests that have not completed, each with what it moves.
+    struct Transfers {
+        std::vector<MPI_Request> requests;
+        std::vector<Transfer> items;
+    };
+
+    struct Announced {
+        int source;
+        int tag;
+        std::uint64_t byteCount;
+    };
+
+    // A queue that keeps its memory.
+    template <class T>
+    class Fifo {
+    public:
+        bool empty() const { return first_ == items_.size(); }
+        void push(T&& item) { items_.push_back(std::move(item)); }
+        T pop()
+        {
+            T item = std::move(items_[first_++]);
+            if (empty() || (first_ >= 1024 && first_ >= items_.size() / 2)) {
+                items_.erase(items_.begin(), items_.begin() + static_cast<std::ptrdiff_t>(first_));
+                first_ = 0;
+            }
+            return item;
+        }
+
+    private:
+        std::vector<T> items_;
+        std::size_t first_ = 0;
+    };
+
+    struct Peer {
+        Fifo<Buffer> waiting;
+        int inFlight = 0; // sends to it that have not completed
+        int tag = 0;      // the last one used
+        bool listed = false, addressed = false;
+    };
+
+    // More would not be faster, but every poll() looks at each.
+    static constexpr int sendsPerPeer = 32;
+    static constexpr std::size_t bodiesAtOnce = 64;
+
+    void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
+
+    [[noreturn]] void failMalformed(int source) const
     {
-        return level == MPI_THREAD_SINGLE       ? "MPI_THREAD_SINGLE"
-               : level == MPI_THREAD_FUNNELED   ? "MPI_THREAD_FUNNELED"
-               : level == MPI_THREAD_SERIALIZED ? "MPI_THREAD_SERIALIZED"
-                                                : "MPI_THREAD_MULTIPLE";
+        throw TransportError("a packet from rank " + std::to_string(source) + " is malformed", rank_);
     }
 
-    void check(int code, const char* call) const
+    [[noreturn]] void failAsTold(std::string text, int source)
     {
-        if (code == MPI_SUCCESS)
-            return;
-        char text[MPI_MAX_ERROR_STRING];
-        int length = 0;
-        MPI_Error_string(code, text, &length);
-        throw TransportError(std::string(call) + ": " + std::string(text, static_cast<std::size_t>(length)), rank_);
+        told_ = true;
+        throw TransportError(std::move(text), source);
     }
+
+    // `action()`, or false if it failed.
+    template <class Action>
+    bool guarded(const Action& action)
+    {
+        try {
+            return action();
+        } catch (const Error& e) {
+            fail(e.info());
+        } catch (const std::exception& e) {
+            fail(TransportError(e.what(), rank_).info());
+        }
+        return false;
+    }
+
+    void fail(const ErrorInfo& error)
+    {
+        failed_ = true;
+        if (!told_)
+            tellFailure(error.message);
+        finishNotices();
+        if (handler_)
+            handler_->fail(error);
+    }
+
+    // As far as it can be done: MPI itself may be what has failed.
+    void tellFailure(const std::string& text)
+    {
+        try {
+            Buffer notice = pool_->acquire(packetBytes);
+            const std::size_t length = std::min(text.size(), packetBytes - sizeof(Record));
+            const Record record{length, 0, Record::Failure};
+            std::memcpy(notice.data(), &record, sizeof record);
+            std::memcpy(notice.data() + sizeof record, text.data(), length);
+            notice.shrink(sizeof record + length);
+            notices_.items.push_back({std::move(notice), 0, -1, 0});
+            const Transfer& sent = notices_.items.back();
+            for (int peer = 0; peer < size_; ++peer) {
+                MPI_Request request = MPI_REQUEST_NULL;
+                if (peer != rank_
+                    && MPI_Isend(sent.data.data(), sent.count(), MPI_BYTE, peer, 0, comm_, &request) == MPI_SUCCESS)
+                    notices_.requests.push_back(request);
+            }
+        } catch (const std::exception&) {
+        }
+    }
+
+    // It is quiet when they have gone, or can not go.
+    void finishNotices()
+    {
+        int done = 1;
+        if (MPI_Testall(static_cast<int>(notices_.requests.size()), notices_.requests.data(), &done,
+                        MPI_STATUSES_IGNORE)
+            != MPI_SUCCESS)
+            done = 1;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        outbox_.clear();
+        sending_ = !done;
+    }
+
+    bool completed(MPI_Request& request) const
+    {
+        int done = 0;
+        check(MPI_Test(&request, &done, MPI_STATUS_IGNORE), "MPI_Test");
+        return done != 0;
+    }
+
+    bool move()
+    {
+        const bool started = !leaving_ && startSends();
+        const bool arrived = receivePackets();
+        const bool delivered = receiveBodies();
+        const bool completed = finishSends();
+        return started || arrived || delivered || completed;
+    }
+
+    // --- sending
 
     bool startSends()
     {
         {
-            std::lock_guard<std::mutex> lock(mutex_);
-            if (outbox_.empty())
-                return false;
+            const std::lock_guard<std::mutex> lock(mutex_);
             starting_.swap(outbox_);
-            pendingSends_ += starting_.size();
+            if (!starting_.empty())
+                sending_ = true;
         }
         for (auto& [destination, message] : starting_) {
-            if (message.size() > static_cast<std::size_t>(std::numeric_limits<int>::max()))
-                throw TransportError("a message of " + std::to_string(message.size()) + " bytes is over 2 GiB", rank_);
-            MPI_Request request = MPI_REQUEST_NULL;
-            check(
-                MPI_Isend(message.data(), static_cast<int>(message.size()), MPI_BYTE, destination, 0, comm_, &request),
-                "MPI_Isend");
-            sendRequests_.push_back(request);
-            sending_.push_back(std::move(message));
+            Peer& peer = peers_[static_cast<std::size_t>(destination)];
+            peer.waiting.push(std::move(message));
+            peer.addressed = true;
+            if (!std::exchange(peer.listed, true))
+                waitingPeers_.push_back(destination);
         }
         starting_.clear();
-        return true;
-    }
 
-    // A probe looks before it makes progress, so what this poll brings in shows at the next probe: two in a row.
-    bool startReceives()
-    {
         bool any = false;
-        for (int misses = 0; misses < 2 && receiving_.size() < 64;) {
-            int found = 0;
-            MPI_Message handle = MPI_MESSAGE_NULL;
-            MPI_Status status;
-            check(MPI_Improbe(MPI_ANY_SOURCE, MPI_ANY_TAG, comm_, &found, &handle, &status), "MPI_Improbe");
-            if (!found) {
-                ++misses;
-                continue;
+        for (std::size_t i = 0; i < waitingPeers_.size();) {
+            const int destination = waitingPeers_[i];
+            Peer& peer = peers_[static_cast<std::size_t>(destination)];
+            any = startSends(destination, peer) || any;
+            if (peer.waiting.empty()) {
+                peer.listed = false;
+                waitingPeers_[i] = waitingPeers_.back();
+                waitingPeers_.pop_back();
+            } else {
+                ++i;
             }
-            int byteCount = 0;
-            MPI_Get_count(&status, MPI_BYTE, &byteCount);
-            Buffer message = pool_->acquire(static_cast<std::size_t>(byteCount));
-            MPI_Request request = MPI_REQUEST_NULL;
-            check(MPI_Imrecv(message.data(), byteCount, MPI_BYTE, &handle, &request), "MPI_Imrecv");
-            receiveRequests_.push_back(request);
-            receiving_.push_back({status.MPI_SOURCE, std::move(message)});
-            any = true;
         }
         return any;
     }
 
-    // Calls `finished(i)` for each completed request and removes it, keeping `items` in step.
-    template <class Item, class Finished>
-    bool testSome(std::vector<MPI_Request>& requests, std::vector<Item>& items, const Finished& finished)
+    bool startSends(int destination, Peer& peer)
     {
+        if (peer.inFlight >= sendsPerPeer)
+            return false;
+        while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
+            Buffer message = peer.waiting.pop();
+            if (sizeof(Record) + message.size() <= packetBytes) {
+                pack(destination, {message.size(), 0, Record::Message}, message.data());
+                continue;
+            }
+            peer.tag = peer.tag % lastTag_ + 1;
+            pack(destination, {message.size(), peer.tag, Record::Announcement}, nullptr);
+            bodies_.push_back({std::move(message), 0, destination, peer.tag});
+            ++peer.inFlight;
+        }
+        // Announcements first, so that the receiver is ready.
+        sendPacket(destination);
+        for (Transfer& body : bodies_)
+            addSend(std::move(body));
+        bodies_.clear();
+        return true;
+    }
+
+    // `payload` of record.byteCount bytes, or none. Records begin at multiples of 16.
+    void pack(int destination, const Record& record, const std::byte* payload)
+    {
+        const std::size_t payloadBytes = payload ? static_cast<std::size_t>(record.byteCount) : 0;
+        const std::size_t end = sizeof record + payloadBytes;
+        const std::size_t paddedEnd = (end + sizeof record - 1) / sizeof record * sizeof record;
+        if (packed_ + paddedEnd > packetBytes)
+            sendPacket(destination);
+        if (packed_ == 0)
+            packing_ = pool_->acquire(packetBytes);
+        std::byte* to = packing_.data() + packed_;
+        std::memcpy(to, &record, sizeof record);
+        if (payloadBytes > 0)
+            std::memcpy(to + sizeof record, payload, payloadBytes);
+        std::memset(to + end, 0, paddedEnd - end);
+        packed_ += paddedEnd;
+    }
+
+    void sendPacket(int destination)
+    {
+        if (packed_ == 0)
+            return;
+        packing_.shrink(packed_);
+        packed_ = 0;
+        ++peers_[static_cast<std::size_t>(destination)].inFlight;
+        addSend({std::move(packing_), 0, destination, 0});
+    }
+
+    void addSend(Transfer&& transfer)
+    {
+        const MPI_Request request = startSend(transfer);
+        sends_.requests.push_back(request);
+        sends_.items.push_back(std::move(transfer));
+    }
+
+    MPI_Request startSend(const Transfer& transfer)
+    {
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Isend(transfer.data.data() + transfer.offset, transfer.count(), MPI_BYTE, transfer.peer, transfer.tag,
+                        comm_, &request),
+              "MPI_Isend");
+        return request;
+    }
+
+    bool finishSends()
+    {
+        if (!testSome(sends_, [this](Transfer& sent, const MPI_Status&) {
+                sent.offset += static_cast<std::size_t>(sent.count());
+                if (sent.offset < sent.data.size())
+                    return startSend(sent);
+                --peers_[static_cast<std::size_t>(sent.peer)].inFlight;
+                return MPI_REQUEST_NULL;
+            }))
+            return false;
+        if (sends_.requests.empty() && waitingPeers_.empty()) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            sending_ = false;
+        }
+        return true;
+    }
+
+    // --- receiving
+
+    std::byte* packetAt(int slot) { return packets_.data() + static_cast<std::size_t>(slot) * packetBytes; }
+
+    void postPacket(int slot)
+    {
+        check(MPI_Irecv(packetAt(slot), static_cast<int>(packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm_,
+                        &packetRequests_[static_cast<std::size_t>(slot)]),
+              "MPI_Irecv");
+    }
+
+    bool receivePackets()
+    {
+        const int count = testSome(packetRequests_);
+        for (int i = 0; i < count; ++i) {
+            const int slot = indices_[static_cast<std::size_t>(i)];
+            const MPI_Status& status = statuses_[static_cast<std::size_t>(i)];
+            unpack(status.MPI_SOURCE, packetAt(slot), byteCountOf(status));
+            postPacket(slot);
+        }
+        return count > 0;
+    }
+
+    // An empty packet says goodbye, see finish().
+    void unpack(int source, const std::byte* from, std::size_t left)
+    {
+        while (left > 0) {
+            Record record;
+            if (left < sizeof record)
+                failMalformed(source);
+            std::memcpy(&record, from, sizeof record);
+            from += sizeof record;
+            left -= sizeof record;
+            if (record.kind == Record::Announcement) {
+                if (record.tag < 1 || record.byteCount == 0)
+                    failMalformed(source);
+                announced_.push({source, record.tag, record.byteCount});
+                continue;
+            }
+            if (record.kind > Record::Failure || record.byteCount > left)
+                failMalformed(source);
+            const auto byteCount = static_cast<std::size_t>(record.byteCount);
+            if (record.kind == Record::Failure)
+                failAsTold(std::string(reinterpret_cast<const char*>(from), byteCount), source);
+            Buffer message = pool_->acquire(byteCount);
+            if (byteCount > 0)
+                std::memcpy(message.data(), from, byteCount);
+            deliver(source, std::move(message));
+            const std::size_t padded = (byteCount + sizeof record - 1) / sizeof record * sizeof record;
+            if (padded > left)
+                failMalformed(source);
+            from += padded;
+            left -= padded;
+        }
+    }
+
+    bool receiveBodies()
+    {
+        while (!announced_.empty() && receives_.requests.size() < bodiesAtOnce) {
+            const Announced next = announced_.pop();
+            Transfer body{pool_->acquire(static_cast<std::size_t>(next.byteCount)), 0, next.source, next.tag};
+            const MPI_Request request = startReceive(body);
+            receives_.requests.push_back(request);
+            receives_.items.push_back(std::move(body));
+        }
+        return testSome(receives_, [this](Transfer& body, const MPI_Status& status) {
+            if (byteCountOf(status) != static_cast<std::size_t>(body.count()))
+                throw TransportError(
+                    "a message from rank " + std::to_string(body.peer) + " is not as long as it was announced", rank_);
+            body.offset += static_cast<std::size_t>(body.count());
+            if (body.offset < body.data.size())
+                return startReceive(body);
+            deliver(body.peer, std::move(body.data));
+            return MPI_REQUEST_NULL;
+        });
+    }
+
+    MPI_Request startReceive(Transfer& body)
+    {
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Irecv(body.data.data() + body.offset, body.count(), MPI_BYTE, body.peer, body.tag, comm_, &request),
+              "MPI_Irecv");
+        return request;
+    }
+
+    void deliver(int source, Buffer&& message)
+    {
+        if (handler_)
+            handler_->receive(source, std::move(message));
+    }
+
+    static std::size_t byteCountOf(const MPI_Status& status)
+    {
+        int byteCount = 0;
+        MPI_Get_count(&status, MPI_BYTE, &byteCount);
+        return static_cast<std::size_t>(byteCount);
+    }
+
+    // --- completion
+
+    // How many have completed; indices_ and statuses_ say which and how.
+    // MPI_Testsome reports errors to the handler of MPI_COMM_SELF or MPI_COMM_WORLD, which by default ends the job.
+    int testSome(std::vector<MPI_Request>& requests)
+    {
+        if (indices_.size() < requests.size()) {
+            indices_.resize(requests.size());
+            statuses_.resize(requests.size());
+        }
+        int count = 0, kind = MPI_SUCCESS;
+        const int code =
+            MPI_Testsome(static_cast<int>(requests.size()), requests.data(), &count, indices_.data(), statuses_.data());
+        if (code != MPI_SUCCESS && MPI_Error_class(code, &kind) == MPI_SUCCESS && kind == MPI_ERR_IN_STATUS)
+            for (int i = 0; i < count; ++i)
+                check(statuses_[static_cast<std::size_t>(i)].MPI_ERROR, "MPI_Testsome");
+        check(code, "MPI_Testsome");
+        return count == MPI_UNDEFINED ? 0 : count;
+    }
+
+    // Calls `next(item, status)` for each that has completed, which returns the request of its next chunk or that it
+    // was the last; removes those. True if there were any.
+    template <class Next>
+    bool testSome(Transfers& transfers, const Next& next)
+    {
+        auto& [requests, items] = transfers;
         if (requests.empty())
             return false;
-        int count = 0;
-        indices_.resize(requests.size());
-        check(MPI_Testsome(static_cast<int>(requests.size()), requests.data(), &count, indices_.data(),
-                           MPI_STATUSES_IGNORE),
-              "MPI_Testsome");
-        if (count == MPI_UNDEFINED || count == 0)
+        const int count = testSome(requests);
+        if (count == 0)
             return false;
-        for (int i = 0; i < count; ++i)
-            finished(items[static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)])]);
+        for (int i = 0; i < count; ++i) {
+            const auto which = static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)]);
+            requests[which] = next(items[which], statuses_[static_cast<std::size_t>(i)]);
+        }
         std::size_t kept = 0;
         for (std::size_t i = 0; i < requests.size(); ++i) {
             if (requests[i] == MPI_REQUEST_NULL)
@@ -227,37 +609,126 @@ private:
         return true;
     }
 
-    bool finishReceives()
+    // --- the end
+
+    // False if the handler has failed: then what it waits for may never be.
+    template <class Done>
+    bool moveUntil(const Done& done)
     {
-        return testSome(receiveRequests_, receiving_,
-                        [this](Receive& r) { handler_->receive(r.source, std::move(r.message)); });
+        for (detail::Patience patience; !done();) {
+            if (handler_ && handler_->failed())
+                return false;
+            if (move())
+                patience.reset();
+            else
+                patience.nap();
+        }
+        return true;
     }
 
-    bool finishSends()
+    bool barrier()
     {
-        if (!testSome(sendRequests_, sending_, [](Buffer& message) { message = Buffer(); }))
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Ibarrier(comm_, &request), "MPI_Ibarrier");
+        return moveUntil([&] { return completed(request); });
+    }
+
+    // Once all ranks are here none needs an answer. Then each says goodbye to those that it has sent to, with an empty
+    // packet, synchronously: when that has completed, the receiver has all packets that went before. Once it is so on
+    // all ranks nothing but announced bodies can be on the way. False: see moveUntil().
+    bool finish()
+    {
+        if (!barrier() || !moveUntil([this] { return quiet(); }))
             return false;
-        std::lock_guard<std::mutex> lock(mutex_);
-        pendingSends_ = sending_.size();
-        return true;
+        leaving_ = true;
+        std::vector<MPI_Request> goodbyes;
+        for (int peer = 0; peer < size_; ++peer) {
+            if (!peers_[static_cast<std::size_t>(peer)].addressed)
+                continue;
+            goodbyes.push_back(MPI_REQUEST_NULL);
+            check(MPI_Issend(nullptr, 0, MPI_BYTE, peer, 0, comm_, &goodbyes.back()), "MPI_Issend");
+        }
+        const auto said = [&] {
+            int done = 0;
+            check(MPI_Testall(static_cast<int>(goodbyes.size()), goodbyes.data(), &done, MPI_STATUSES_IGNORE),
+                  "MPI_Testall");
+            return done != 0;
+        };
+        if (!moveUntil(said) || !barrier())
+            return false;
+        // A receive that can not be cancelled any more has a packet.
+        cancelPackets([this](int slot, std::size_t byteCount) {
+            unpack(statuses_[static_cast<std::size_t>(slot)].MPI_SOURCE, packetAt(slot), byteCount);
+        });
+        return moveUntil([this] { return announced_.empty() && receives_.requests.empty(); });
+    }
+
+    // Calls `came(slot, byteCount)` for the receives that have got something.
+    template <class Came>
+    void cancelPackets(const Came& came)
+    {
+        for (MPI_Request& request : packetRequests_)
+            if (request != MPI_REQUEST_NULL)
+                MPI_Cancel(&request);
+        statuses_.resize(std::max(statuses_.size(), packetRequests_.size()));
+        for (int slot = 0; slot < postedPackets; ++slot) {
+            MPI_Request& request = packetRequests_[static_cast<std::size_t>(slot)];
+            if (request == MPI_REQUEST_NULL)
+                continue;
+            MPI_Status& status = statuses_[static_cast<std::size_t>(slot)];
+            int done = 0, cancelled = 0;
+            for (detail::Patience patience; check(MPI_Test(&request, &done, &status), "MPI_Test"), !done;)
+                patience.nap();
+            MPI_Test_cancelled(&status, &cancelled);
+            if (!cancelled)
+                came(slot, byteCountOf(status));
+        }
+    }
+
+    // MPI may still use the buffers, and freeing a communicator is collective: what can not be taken back is left to
+    // it.
+    void abandon()
+    {
+        int finalized = 0, done = 0;
+        MPI_Finalized(&finalized);
+        if (!finalized)
+            for (auto* requests : {&packetRequests_, &receives_.requests})
+                for (MPI_Request& request : *requests)
+                    if (request != MPI_REQUEST_NULL && MPI_Cancel(&request) == MPI_SUCCESS)
+                        MPI_Test(&request, &done, MPI_STATUS_IGNORE);
+        struct Abandoned {
+            Transfers sends, receives, notices;
+            Buffer packets;
+        };
+        new Abandoned{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
+        comm_ = MPI_COMM_NULL;
     }
 
     std::shared_ptr<MemoryPool> pool_;
     TransportHandler* handler_ = nullptr;
     MPI_Comm comm_ = MPI_COMM_NULL;
-    int rank_ = 0, size_ = 1;
+    int rank_ = 0, size_ = 1, lastTag_ = 1;
+    std::thread::id onlyThread_; // that may call MPI; none if all may
 
     NapSignal signal_;
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> outbox_; // under mutex_
-    std::size_t pendingSends_ = 0;               // under mutex_
+    bool sending_ = false;                       // under mutex_; something has left the outbox and not completed
 
-    // Only poll() uses these.
+    // Only the thread that polls uses these.
+    bool failed_ = false, told_ = false, leaving_ = false;
     std::vector<std::pair<int, Buffer>> starting_;
-    std::vector<MPI_Request> sendRequests_, receiveRequests_;
-    std::vector<Buffer> sending_;
-    std::vector<Receive> receiving_;
+    std::vector<Peer> peers_;
+    std::vector<int> waitingPeers_; // those with messages that wait
+    Buffer packing_;                // the packet that is being filled, and how far
+    std::size_t packed_ = 0;
+    std::vector<Transfer> bodies_; // to follow it
+    Transfers sends_, receives_, notices_;
+    Fifo<Announced> announced_;
+    Buffer packets_; // the posted ones
+    std::vector<MPI_Request> packetRequests_;
     std::vector<int> indices_;
+    std::vector<MPI_Status> statuses_;
 };
 
 static_assert(is_transport_v<MpiTransport>);

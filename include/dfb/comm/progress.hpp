@@ -1,5 +1,5 @@
 // ProgressThread: calls poll() of a transport so that messages move while the renderer works. It polls for a
-// few microseconds after the last message, then naps, the longer the less comes.
+// few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -48,9 +48,34 @@ public:
             transport_.interrupt();
     }
 
+    // Somebody waits for messages from now on, or no more; as often false as true. From any thread.
+    void hurry(bool more)
+    {
+        if (more && waiting_++ == 0)
+            transport_.interrupt();
+        if (!more)
+            --waiting_;
+    }
+
 private:
     using Clock = std::chrono::steady_clock;
-    static constexpr std::chrono::microseconds pollTime{5}, shortestNap{50}, longestNap{200}, longestRungNap{2000};
+    static constexpr std::chrono::microseconds pollTime{5};
+
+    // Waking up costs some 10 us of a core. While all threads render, a message that is taken a little later delays
+    // nobody; what this rank sends interrupts the nap anyway.
+    Clock::duration napAfter(Clock::duration idle, bool quiet) const
+    {
+        using std::chrono::microseconds;
+        const auto between = [&](int shortest, int longest) {
+            return std::clamp<Clock::duration>(idle / 8, microseconds(shortest), microseconds(longest));
+        };
+        // What the network library has taken may need it for a moment more.
+        if (!expecting_ && quiet && idle > std::chrono::milliseconds(10))
+            return std::chrono::seconds(1);
+        if (transport_.wakesOnArrival())
+            return between(waiting_ > 0 ? 50 : 200, 2000);
+        return waiting_ > 0 || !quiet ? between(50, 200) : between(200, 2000);
+    }
 
     void run()
     {
@@ -66,17 +91,13 @@ private:
             const Clock::duration idle = Clock::now() - last;
             if (idle < pollTime)
                 continue;
-            if (!expecting_ && transport_.quiet())
-                transport_.nap(std::chrono::seconds(1));
-            else if (transport_.wakesOnArrival())
-                transport_.nap(std::clamp<Clock::duration>(idle / 8, shortestNap, longestRungNap));
-            else
-                transport_.nap(std::clamp<Clock::duration>(idle / 8, shortestNap, longestNap));
+            transport_.nap(napAfter(idle, transport_.quiet()));
         }
     }
 
     Transport& transport_;
     std::atomic<bool> stop_{false}, expecting_{false};
+    std::atomic<int> waiting_{0};
     std::thread thread_;
 };
 

@@ -9,21 +9,27 @@
 //   int rank() const; int size() const;
 //   bool needsPolling() const;                   false: messages are delivered without poll()
 //   bool mayPoll() const;                        whether the calling thread may call poll()
-//   bool wakesOnArrival() const;                 nap() ends by itself when a message comes, from whichever rank
+//   bool wakesOnArrival() const;                 nap() ends by itself when a message has come that needs poll(), from
+//                                                whichever rank; a few polls may be needed to bring it
 //   void start(TransportHandler&);               from here on the handler is called
-//   void send(int destination, Buffer&&);        any thread; never blocks; destination is another rank; reliable,
-//                                                in any order; of any size
-//   bool poll();                                 one thread at a time; never blocks; moves what can be moved; true if
-//                                                something was; calls the handler
-//   bool quiet() const;                          any thread; nothing waits to be sent
+//   void send(int destination, Buffer&&);        after start(); any thread; never blocks; destination is another rank;
+//                                                reliable, in any order; of any size, 0 included. To a rank that has
+//                                                stopped: nothing happens
+//   bool poll();                                 between start() and stop(), one thread at a time; never blocks; moves
+//                                                what can be moved; true if something was; calls the handler
+//   bool quiet() const;                          any thread; nothing waits to be sent: what was sent arrives although
+//                                                this rank polls no more
 //   void nap(std::chrono::nanoseconds limit);    the thread that polls; sleeps until poll() has something to send,
 //                                                interrupt() is called, or `limit` has passed
 //   void interrupt();                            any thread; ends the nap under way, else the next one
-//   void stop(bool orderly);                     afterwards the handler is not called. Orderly: no rank expects
-//                                                anything more; collective where the transport needs it, and goes
-//                                                on delivering while it waits, until the handler has failed(). Else:
-//                                                waits for nobody
+//   void stop(bool orderly);                     once, after start(), when no thread is in another member; afterwards
+//                                                the handler is not called. Orderly: this rank expects nothing more;
+//                                                what it has sent still reaches the ranks that have not called stop().
+//                                                May wait until all ranks have called it or the handler has failed().
+//                                                Else: waits for nobody; other ranks may get fail(), and what was under
+//                                                way may be lost
 //
+// Messages may outlive the transport.
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
 
@@ -47,7 +53,8 @@ enum class Progress {
            // MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile. Messages move only in those calls
 };
 
-// Where a transport delivers. The calls are quick, never block, and may come from any thread.
+// Where a transport delivers. The calls are quick, never block, may come from any thread, and must not call the
+// transport.
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;

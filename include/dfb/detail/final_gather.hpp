@@ -241,7 +241,8 @@ public:
         return !isDisplay_ || !enabled() || (ranksDone_ == rankCount_ - 1 && tilesReceived_ == tilesAnnounced_);
     }
 
-    // In words: whose finished tiles have not come.
+    // How many of the other ranks' tiles have come completely, and in words whose have not.
+    int ranksDone() const noexcept { return ranksDone_; }
     std::string missing() const
     {
         std::string text;

@@ -64,8 +64,11 @@ public:
             mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};
         }
         const auto all = Agreement::from(messaging_->reduce(mine.bytes(), Agreement::combine));
-        if (!all.fine)
+        if (!all.fine) {
+            outcome_.reset();
+            messaging_.reset(); // before the exception passes: all ranks throw it, so this end is in order
             throw InvalidArgument(all.text);
+        }
     }
 
     FrameEngine(const FrameEngine&) = delete;
@@ -119,7 +122,6 @@ public:
         ownTilesDone_ = endCalled_ = false;
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
-        repeatedBefore_ = messaging_->messenger().duplicates();
         renderNs_ = 0;
         tilesLeft_ = countUnknown + (params.declared ? 0 : static_cast<std::int64_t>(ownedTiles().size()));
         beginTime_ = Clock::now();
@@ -148,11 +150,22 @@ public:
         const int owner = tileOwner(tile.tile);
         if (owner != rank()) {
             messaging_->sendWithCredit(owner, std::move(message));
-            messaging_->waitForRoom([this] { return outcome_->failed(); });
+            waitForRoom();
         } else if (gate_.enter(tile.frame)) {
             arrive(std::move(message), {});
             gate_.leave();
         }
+    }
+
+    void waitForRoom()
+    {
+        const std::chrono::milliseconds limit(params_.timeoutMs);
+        if (messaging_->waitForRoom([this] { return outcome_->failed(); }, limit))
+            return;
+        ErrorInfo info;
+        info.kind = ErrorKind::TimedOut;
+        info.message = "no room for more tiles: " + messaging_->flow().notTaken();
+        failWith(std::make_exception_ptr(Error(std::move(info))));
     }
 
     void declare(const std::vector<TileInput>& inputs)
@@ -207,7 +220,8 @@ public:
         info.kind = ErrorKind::Cancelled;
         info.message = "the frame was left without end()";
         try {
-            failWith(std::make_exception_ptr(Error(std::move(info))));
+            outcome_->fail(std::make_exception_ptr(Error(std::move(info))), {});
+            messaging_->flow().drop();
             conclude();
         } catch (const TransportError&) {
             // begin() will say so.
@@ -266,14 +280,16 @@ private:
             messaging_->send(config_.displayRank, std::move(message));
     }
 
-    // Nobody knows which frame it was for: if none is open, the next one can not do without it.
+    // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
+    // next one can not do without it.
     void undecodable(int source, const ErrorInfo& error) override
     {
         const std::exception_ptr reason = std::make_exception_ptr(Error(error));
         if (gate_.enterAny()) {
-            failWith(reason, messageFrom(source));
+            const bool inTime = failWith(reason, messageFrom(source));
             gate_.leave();
-            return;
+            if (inTime)
+                return;
         }
         const std::lock_guard<std::mutex> lock(strayMutex_);
         stray_ = errorInfoOf(reason, messageFrom(source));
@@ -450,12 +466,15 @@ private:
         }
     }
 
-    void failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
+    // False if this rank has voted.
+    bool failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
-        if (!outcome_->fail(reason, where))
+        const bool inTime = outcome_->fail(reason, where);
+        if (!inTime)
             gate_.countLate(); // too late to matter to this frame
         messaging_->flow().drop();
         tryVote();
+        return inTime;
     }
 
     void failElsewhere(const ErrorInfo& info)
@@ -463,7 +482,10 @@ private:
         std::optional<ErrorInfo> mine;
         if (info.kind == ErrorKind::TimedOut && !outcome_->failed())
             mine = missing(); // this rank's part of what is missing
-        outcome_->failElsewhere(mine && mine->tile >= 0 ? *mine : info);
+        ErrorInfo copy = info;
+        if (info.kind == ErrorKind::TimedOut)
+            copy.tile = copy.expected = -1; // it must not pass for the list of the rank that it came from
+        outcome_->failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(copy) ? *mine : copy);
         messaging_->flow().drop();
         tryVote();
     }
@@ -475,6 +497,7 @@ private:
         if (!ownTilesDone_ && wantsDeclaration_ && tilesLeft_ >= countUnknown / 2) {
             info.emplace();
             info->message = "not all ranks have declared their inputs";
+            info->expected = size();
             for (const int other : messaging_->reductions().missing({AllDeclared, gate_.frame()}))
                 info->message += ", no word from rank " + std::to_string(other);
         } else if (!ownTilesDone_) {
@@ -482,6 +505,8 @@ private:
         } else if (!pipeline_->gather().complete()) {
             info.emplace();
             info->message = pipeline_->gather().missing();
+            info->expected = size() - 1;
+            info->got = pipeline_->gather().ranksDone();
         } else {
             info.emplace();
             info->message = outcome_->waitsFor();
@@ -502,13 +527,15 @@ private:
         outcome_->vote([this] { return endCalled_ && ownTilesDone_ && pipeline_->gather().complete(); },
                        [this] {
                            Verdict v;
+                           const std::int64_t repeated = messaging_->messenger().duplicates();
                            v.paramsHash = fingerprintOf(params_);
                            v.sums = {messaging_->bytesSent() - bytesBefore_,
                                      messaging_->messagesSent() - messagesBefore_,
                                      ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
                                      pipeline_->nonFinitePixels(),
                                      gate_.takeLateCount(),
-                                     messaging_->messenger().duplicates() - repeatedBefore_};
+                                     repeated - repeatedBefore_};
+                           repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
                            return v;

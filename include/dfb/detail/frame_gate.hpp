@@ -50,8 +50,8 @@ public:
             return Entry::Kept;
         }
         if (header.number < frame_ || !open_) {
-            // Credit for what nobody sends any more is no sign of anything.
-            late_ += header.kind != MessageKind::Credit && header.kind != MessageKind::CreditRequest;
+            // Of control messages a late one is no sign of anything.
+            late_ += header.kind == MessageKind::Fragment || header.kind == MessageKind::FinishedTiles;
             return Entry::Late;
         }
         ++inside_;

@@ -130,7 +130,7 @@ struct Verdict {
     {
         if (e.kind == ErrorKind::Cancelled)
             return 0;
-        return e.kind != ErrorKind::TimedOut ? 3 : e.tile >= 0 ? 2 : 1;
+        return e.kind != ErrorKind::TimedOut ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
     // Of several errors, one that says most, and the one of the lowest rank; of what is missing, all.
@@ -140,7 +140,7 @@ struct Verdict {
         const bool second = weight(a) != weight(b) ? weight(b) > weight(a) : b.rank < a.rank;
         ErrorInfo info = second ? b : a;
         const ErrorInfo& other = second ? a : b;
-        if (weight(a) == 2 && weight(b) == 2 && a.rank != b.rank && info.message.size() < mostText)
+        if (weight(a) == 3 && weight(b) == 3 && a.rank != b.rank && info.message.size() < mostText)
             info.message += "; on rank " + std::to_string(other.rank) + ": " + other.message;
         return info;
     }
@@ -179,6 +179,7 @@ struct Agreement {
                           + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
                           + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth)
                           + ", display rank " + text(c.displayRank) + ", codec " + text(c.codec ? c.codec->id() : 0)
+                          + ", gather " + text(static_cast<int>(c.gather)) + ", checksums " + text(c.checksums)
                           + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};
     }
 
