@@ -10,7 +10,8 @@ set(level_2 comm/message.hpp comm/reduction.hpp comm/snappy_codec.hpp comm/trans
             tbb_executor.hpp)
 set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/manifest.hpp)
-set(level_4 comm/messaging.hpp image.hpp render/world.hpp)
+set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
+            testing/transport_conformance.hpp image.hpp render/world.hpp)
 set(level_5 tile.hpp)
 set(level_6 dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/wire.hpp render/visibility.hpp)

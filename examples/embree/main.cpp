@@ -280,10 +280,9 @@ int fromLauncher(const char* mpich, const char* openMpi, int otherwise)
 
 int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
 {
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    int rank = 0, code = 1;
-    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+    const dfb::MpiSession mpi(argc, argv);
+    const int rank = mpi.rank();
+    int code = 1;
     try {
         if (!parsed.options) {
             code = rank == 0 ? report(parsed) : parsed.exitCode;
@@ -307,7 +306,6 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
         std::fprintf(stderr, "dfb_render: rank %d: %s\n", rank, e.what());
         MPI_Abort(MPI_COMM_WORLD, 1); // the others may wait for this rank
     }
-    MPI_Finalize();
     return code;
 }
 #endif

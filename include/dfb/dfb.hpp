@@ -11,6 +11,7 @@
 #include <dfb/render/image_parallel.hpp>
 
 #if defined(DFB_HAS_MPI)
+#include <dfb/comm/mpi_session.hpp>
 #include <dfb/comm/mpi_transport.hpp>
 #endif
 #if defined(DFB_HAS_TBB)

@@ -1,0 +1,131 @@
+// MpiSession: MPI from its beginning to its end, for programs that do not manage it themselves.
+//
+//   int main(int argc, char** argv)
+//   {
+//       dfb::MpiSession mpi(argc, argv);
+//       dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(mpi.communicator(), config);
+//       ...
+//   }
+#pragma once
+
+#include <dfb/comm/mpi_transport.hpp>
+
+#include <chrono>
+#include <cstddef>
+#include <cstdlib>
+#include <exception>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace dfb {
+
+class MpiSession {
+public:
+    // Initialises MPI at a thread level; one that is less than MPI_THREAD_MULTIPLE asks for Progress::Caller. Throws
+    // TransportError if MPI has been initialised or finalised before, or does not have that level.
+    MpiSession(int& argc, char**& argv, int level = MPI_THREAD_MULTIPLE)
+    {
+        int initialized = 0, finalized = 0;
+        MPI_Initialized(&initialized);
+        MPI_Finalized(&finalized);
+        if (finalized)
+            throw TransportError("MPI has been finalised: it can not be initialised again");
+        if (initialized)
+            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
+        detail::checkMpi(MPI_Init_thread(&argc, &argv, level, &level_), "MPI_Init_thread", -1);
+        MPI_Comm_rank(MPI_COMM_WORLD, &rank_);
+        MPI_Comm_size(MPI_COMM_WORLD, &size_);
+        if (level_ < level) {
+            finalize();
+            throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
+                                     + " at most, " + detail::mpiLevelName(level) + " was asked for",
+                                 rank_);
+        }
+    }
+    MpiSession(const MpiSession&) = delete;
+    MpiSession& operator=(const MpiSession&) = delete;
+
+    // Collective: waits for all ranks, then finalises MPI, unless that has been done. Not so if an exception ends the
+    // life of this object: the other ranks may wait for what never comes, and only the end of the job helps them.
+    // Whoever catches the exception can still report it; when this process exits it aborts the job, with code 1.
+    ~MpiSession()
+    {
+        int finalized = 0;
+        MPI_Finalized(&finalized);
+        if (finalized)
+            return;
+        if (std::uncaught_exceptions() == exceptions_)
+            finalize();
+        else if (std::atexit(abortJob) != 0)
+            abortJob();
+    }
+
+    int rank() const noexcept { return rank_; }
+    int size() const noexcept { return size_; }
+    int level() const noexcept { return level_; } // that MPI has, at least what was asked for
+    MPI_Comm communicator() const noexcept { return MPI_COMM_WORLD; }
+
+private:
+    static void abortJob()
+    {
+        int finalized = 0;
+        MPI_Finalized(&finalized);
+        if (!finalized)
+            MPI_Abort(MPI_COMM_WORLD, 1);
+    }
+
+    void finalize()
+    {
+        try {
+            partFromAll();
+        } catch (const std::exception&) { // it is only a precaution
+        }
+        MPI_Finalize();
+    }
+
+    // MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
+    // what it has left in its connections, but one that has got further answers no more. With no connection in use,
+    // and nothing new on them for a while, it does not.
+    void partFromAll()
+    {
+        if (size_ == 1)
+            return;
+        MPI_Comm comm = MPI_COMM_NULL;
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
+        wait(request);
+        MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN);
+
+        std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
+        std::vector<MPI_Request> requests;
+        for (int other = 0; other < size_; ++other)
+            if (other != rank_) {
+                requests.push_back(MPI_REQUEST_NULL);
+                check(MPI_Irecv(&bytes[static_cast<std::size_t>(other)], 1, MPI_CHAR, other, 0, comm, &requests.back()),
+                      "MPI_Irecv");
+                requests.push_back(MPI_REQUEST_NULL);
+                check(MPI_Isend(&bytes.back(), 1, MPI_CHAR, other, 0, comm, &requests.back()), "MPI_Isend");
+            }
+        for (MPI_Request& each : requests)
+            wait(each);
+        check(MPI_Ibarrier(comm, &request), "MPI_Ibarrier");
+        wait(request);
+        MPI_Comm_free(&comm);
+        std::this_thread::sleep_for(std::chrono::milliseconds(20));
+    }
+
+    void wait(MPI_Request& request) const
+    {
+        int done = 0;
+        for (detail::Patience patience; check(MPI_Test(&request, &done, MPI_STATUS_IGNORE), "MPI_Test"), !done;)
+            patience.nap();
+    }
+
+    void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
+
+    int level_ = MPI_THREAD_SINGLE, rank_ = 0, size_ = 1;
+    int exceptions_ = std::uncaught_exceptions();
+};
+
+} // namespace dfb

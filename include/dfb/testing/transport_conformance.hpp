@@ -1,0 +1,1417 @@
+// checkTransport: whether a transport keeps the contract of comm/transport.hpp. For authors of transports; needs no
+// test framework, and no other way between the ranks than the transport itself.
+//
+//   for (const auto& result : dfb::testing::checkTransport<MyTransport>(communicator))
+//       if (!result.passed())
+//           std::cerr << result.name << ": " << result.message << '\n';
+#pragma once
+
+#include <dfb/comm/transport.hpp>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <exception>
+#include <functional>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+namespace dfb::testing {
+
+struct ConformanceResult {
+    std::string name;
+    std::string message; // empty if the case passed here and, as far as this rank heard, on all others
+    bool ran = true;     // false after a case that could not end
+    bool passed() const { return message.empty(); }
+};
+
+struct ConformanceOptions {
+    std::uint64_t seed = 1;                            // of the contents, sizes and pauses; the same on all ranks
+    std::size_t largestMessage = std::size_t{1} << 24; // bytes. A rank holds a few of them
+    int smallMessages = 20000;                         // of all ranks together, in the cases with many messages
+    std::chrono::milliseconds timeLimit{10000};        // of a case. What must happen "soon" gets a tenth of it
+    bool duplicatesAllowed = false;                    // if messages may come more than once
+    std::vector<Progress> modes{Progress::Thread, Progress::Caller};
+};
+
+// A line for each case that failed; empty if all passed.
+inline std::string describeFailures(const std::vector<ConformanceResult>& results)
+{
+    std::string text;
+    int notRun = 0;
+    for (const ConformanceResult& result : results) {
+        notRun += !result.ran;
+        if (result.ran && !result.passed())
+            text += result.name + ": " + result.message + '\n';
+    }
+    return notRun == 0 ? text : text + "and " + std::to_string(notRun) + " cases were not run\n";
+}
+
+namespace detail {
+
+using Clock = std::chrono::steady_clock;
+
+inline std::uint64_t mix(std::uint64_t x) noexcept
+{
+    x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9u;
+    x = (x ^ (x >> 27)) * 0x94d049bb133111ebu;
+    return (x ^ (x >> 31)) + 0x9e3779b97f4a7c15u;
+}
+
+inline std::string inSeconds(Clock::duration time)
+{
+    const auto ms = std::chrono::duration_cast<std::chrono::milliseconds>(time).count();
+    return ms % 1000 ? std::to_string(ms) + " ms" : std::to_string(ms / 1000) + " s";
+}
+
+// What the messages of a case say of themselves, if they are long enough to say anything; their content follows from
+// it, so that the receiver can check every byte.
+struct Label {
+    std::uint64_t magic = 0;
+    std::uint32_t channel = 0, series = 0; // the transport; the case, and the round in it
+    std::int32_t source = 0, destination = 0;
+    std::uint64_t number = 0, size = 0, checksum = 0;
+
+    std::uint64_t sum() const noexcept
+    {
+        std::uint64_t state = magic;
+        for (const std::uint64_t part :
+             {std::uint64_t{channel}, std::uint64_t{series}, static_cast<std::uint64_t>(source),
+              static_cast<std::uint64_t>(destination), number, size})
+            state = mix(state ^ part);
+        return state;
+    }
+};
+static_assert(std::has_unique_object_representations_v<Label>);
+
+inline constexpr std::uint64_t testMagic = 0x74736574'6266640au, controlMagic = 0x6c727463'6266640au;
+
+// Calls `visit(place, bytes, count)` for each piece of the content, up to 8 bytes long.
+template <class Visit>
+void forContent(const Label& label, std::uint64_t seed, const Visit& visit)
+{
+    std::size_t place = 0;
+    if (label.size >= sizeof label) {
+        visit(std::size_t{0}, reinterpret_cast<const unsigned char*>(&label), sizeof label);
+        place = sizeof label;
+    }
+    std::uint64_t state = mix(seed ^ label.sum());
+    while (place < label.size) {
+        state = state * 6364136223846793005u + 1442695040888963407u;
+        const std::uint64_t word = state ^ (state >> 31);
+        const std::size_t count = std::min(sizeof word, static_cast<std::size_t>(label.size) - place);
+        visit(place, reinterpret_cast<const unsigned char*>(&word), count);
+        place += count;
+    }
+}
+
+inline Buffer makeMessage(MemoryPool& pool, const Label& label, std::uint64_t seed)
+{
+    Buffer message = pool.acquire(static_cast<std::size_t>(label.size));
+    forContent(label, seed, [&message](std::size_t place, const unsigned char* bytes, std::size_t count) {
+        std::memcpy(message.data() + place, bytes, count);
+    });
+    return message;
+}
+
+// What keeps a case from passing; the first few in words.
+class Problems {
+public:
+    void add(const std::string& text)
+    {
+        if (++count_ <= 3)
+            text_ += (count_ > 1 ? "; " : "") + text;
+    }
+    void clear() { *this = Problems(); }
+    std::string text() const { return count_ > 3 ? text_ + "; and " + std::to_string(count_ - 3) + " more" : text_; }
+
+private:
+    int count_ = 0;
+    std::string text_;
+};
+
+// The case can not go on: something did not happen in time.
+class GaveUp : public std::runtime_error {
+    using std::runtime_error::runtime_error;
+};
+
+// Where a transport delivers. It outlives the transport, to notice what comes too late.
+class Mailbox final : public TransportHandler {
+public:
+    explicit Mailbox(NapSignal& bell) : bell_(bell) {}
+
+    void receive(int source, Buffer&& message) override
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (closed_)
+                ++tooLate_;
+            else
+                messages_.emplace_back(source, std::move(message));
+        }
+        bell_.interrupt();
+    }
+
+    void fail(const ErrorInfo& error) override
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (closed_)
+                ++tooLate_;
+            else if (failure_.empty())
+                failure_ = error.describe();
+        }
+        bell_.interrupt();
+    }
+
+    // So that a stop(true) that waits for ever ends all the same.
+    bool failed() const override
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return !failure_.empty() || (failsWithMessage_ && !messages_.empty()) || Clock::now() > failsAt_;
+    }
+    void failAt(Clock::time_point time)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        failsAt_ = time;
+    }
+    void failWithMessage()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        failsWithMessage_ = true;
+    }
+
+    std::vector<std::pair<int, Buffer>> take()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return std::exchange(messages_, {});
+    }
+
+    std::string failure() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return failure_;
+    }
+
+    // From here on nothing may come.
+    void close()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        closed_ = true;
+    }
+
+    int takeTooLate()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return std::exchange(tooLate_, 0);
+    }
+
+private:
+    NapSignal& bell_;
+    mutable std::mutex mutex_;
+    std::vector<std::pair<int, Buffer>> messages_;
+    std::string failure_;
+    bool failsWithMessage_ = false;
+    Clock::time_point failsAt_ = Clock::time_point::max();
+    bool closed_ = false;
+    int tooLate_ = 0;
+};
+
+// Which messages a rank expects in a case, and which have come.
+class Ledger {
+public:
+    // From rank s come the numbers 0 to counts[s]-1, that of number i with sizeOf(i) bytes; sizes too small for a label
+    // differ from each other.
+    Ledger(const Label& like, int rank, std::uint64_t seed, const std::vector<std::uint64_t>& counts,
+           std::function<std::size_t(std::uint64_t)> sizeOf, bool duplicatesAllowed)
+        : like_(like), rank_(rank), seed_(seed), sizeOf_(std::move(sizeOf)), duplicatesAllowed_(duplicatesAllowed)
+    {
+        for (const std::uint64_t count : counts)
+            seen_.emplace_back(static_cast<std::size_t>(count), false);
+        got_.resize(counts.size());
+    }
+
+    void check(int source, const Buffer& message, Problems& problems)
+    {
+        const std::string from = "from rank " + std::to_string(source) + ": ";
+        if (source < 0 || static_cast<std::size_t>(source) >= seen_.size() || source == rank_) {
+            problems.add("a message " + from + "there can be none from there");
+            return;
+        }
+        std::vector<bool>& seen = seen_[static_cast<std::size_t>(source)];
+        Label label = like_;
+        label.source = source;
+        label.destination = rank_;
+        label.size = message.size();
+        if (message.size() >= sizeof label) {
+            Label found;
+            std::memcpy(&found, message.data(), sizeof found);
+            if (duplicatesAllowed_ && found.magic == testMagic && found.series < like_.series)
+                return;
+            if (const std::string what = differences(found, label); !what.empty()) {
+                problems.add("a message " + from + what);
+                return;
+            }
+            label.number = found.number;
+            label.checksum = found.checksum;
+        } else {
+            while (label.number < seen.size() && sizeOf_(label.number) != message.size())
+                ++label.number;
+        }
+        if (label.number >= seen.size() || sizeOf_(label.number) != message.size()) {
+            if (!duplicatesAllowed_ || message.size() >= sizeof label)
+                problems.add("a message " + from + std::to_string(message.size()) + " bytes long, which nobody sent");
+            return;
+        }
+        const std::string which =
+            from + "message " + std::to_string(label.number) + " of " + std::to_string(message.size()) + " bytes ";
+        bool wrong = false;
+        forContent(label, seed_, [&](std::size_t place, const unsigned char* bytes, std::size_t count) {
+            if (!wrong && std::memcmp(message.data() + place, bytes, count) != 0) {
+                problems.add(which + "is changed at byte " + std::to_string(place) + " or soon after");
+                wrong = true;
+            }
+        });
+        if (!seen[static_cast<std::size_t>(label.number)]) {
+            seen[static_cast<std::size_t>(label.number)] = true;
+            ++got_[static_cast<std::size_t>(source)];
+        } else if (!duplicatesAllowed_) {
+            problems.add(which + "came twice");
+        }
+    }
+
+    // From one rank, or from all.
+    bool complete(int source = -1) const
+    {
+        if (source >= 0)
+            return got_[static_cast<std::size_t>(source)] == seen_[static_cast<std::size_t>(source)].size();
+        for (std::size_t s = 0; s < seen_.size(); ++s)
+            if (got_[s] < seen_[s].size())
+                return false;
+        return true;
+    }
+
+    std::string missing(Clock::duration limit) const
+    {
+        Problems missing;
+        for (std::size_t source = 0; source < seen_.size(); ++source) {
+            const std::vector<bool>& seen = seen_[source];
+            if (got_[source] == seen.size())
+                continue;
+            const auto first = static_cast<std::uint64_t>(std::find(seen.begin(), seen.end(), false) - seen.begin());
+            missing.add("no message from rank " + std::to_string(source) + " within " + inSeconds(limit) + ": got "
+                        + std::to_string(got_[source]) + " of " + std::to_string(seen.size()) + ", number "
+                        + std::to_string(first) + " of " + std::to_string(sizeOf_(first)) + " bytes is missing");
+        }
+        return missing.text();
+    }
+
+private:
+    static std::string differences(const Label& found, const Label& expected)
+    {
+        if (found.magic == controlMagic)
+            return "it belongs to another transport";
+        if (found.magic != testMagic || found.checksum != found.sum())
+            return "its first bytes are changed";
+        if (found.channel != expected.channel)
+            return "it belongs to another transport";
+        if (found.series != expected.series)
+            return "it came once more, or too late: it was for something before";
+        if (found.source != expected.source)
+            return "it was sent by rank " + std::to_string(found.source);
+        if (found.destination != expected.destination)
+            return "it was sent to rank " + std::to_string(found.destination);
+        if (found.size != expected.size)
+            return std::to_string(expected.size) + " of its " + std::to_string(found.size) + " bytes came";
+        return "";
+    }
+
+    Label like_;
+    int rank_;
+    std::uint64_t seed_;
+    std::vector<std::vector<bool>> seen_;
+    std::vector<std::uint64_t> got_;
+    std::function<std::size_t(std::uint64_t)> sizeOf_;
+    bool duplicatesAllowed_;
+};
+
+// A thread that polls a transport and naps in between.
+template <class Transport>
+class Poller {
+public:
+    explicit Poller(Transport& transport) : transport_(transport), thread_([this] { run(); }) {}
+    Poller(const Poller&) = delete;
+    Poller& operator=(const Poller&) = delete;
+    ~Poller()
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            stopping_ = true;
+        }
+        changed_.notify_all();
+        transport_.interrupt();
+        thread_.join();
+    }
+
+    // While paused another thread may poll.
+    void pause(bool pause)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        paused_ = pause;
+        changed_.notify_all();
+        if (!pause)
+            return;
+        lock.unlock();
+        transport_.interrupt();
+        lock.lock();
+        changed_.wait(lock, [this] { return resting_; });
+    }
+
+    // How long it naps whenever nothing moves; zero: not long, as suits a transport that does not wake.
+    void napFor(Clock::duration nap)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            nap_ = nap;
+        }
+        transport_.interrupt();
+    }
+
+    bool mayPoll() const { return mayPoll_; }
+
+private:
+    void run()
+    {
+        mayPoll_ = transport_.mayPoll();
+        for (int misses = 0, naps = 0;;) {
+            Clock::duration nap;
+            {
+                std::unique_lock<std::mutex> lock(mutex_);
+                resting_ = true;
+                changed_.notify_all();
+                changed_.wait(lock, [this] { return stopping_ || !paused_; });
+                resting_ = false;
+                if (stopping_)
+                    return;
+                nap = nap_;
+            }
+            if (mayPoll_ && transport_.poll()) {
+                misses = naps = 0;
+            } else if (++misses >= 8) { // it may take a few to get at what is there
+                misses = 0;
+                transport_.nap(nap > nap.zero() ? nap : std::chrono::microseconds(std::min(50 * ++naps, 1000)));
+            }
+        }
+    }
+
+    Transport& transport_;
+    std::mutex mutex_;
+    std::condition_variable changed_;
+    bool paused_ = false, resting_ = false, stopping_ = false;
+    Clock::duration nap_{0};
+    std::atomic<bool> mayPoll_{true};
+    std::thread thread_;
+};
+
+// What the calling thread sees of a suite that runs in another.
+class Report {
+public:
+    // A case, or another step that must end within `limit`.
+    void enter(const std::string& what, Clock::duration limit)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        activity_ = what;
+        until_ = Clock::now() + limit;
+    }
+    void add(ConformanceResult result)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        results_.push_back(std::move(result));
+    }
+    void finish()
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            finished_ = true;
+        }
+        changed_.notify_all();
+    }
+
+    // Returns false if a step has not ended in time; then it is the last result.
+    bool waitForEnd()
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        while (!finished_) {
+            if (Clock::now() > until_) {
+                results_.push_back({activity_, "has not ended: a call of the transport does not return", true});
+                return false;
+            }
+            changed_.wait_for(lock, std::chrono::milliseconds(100));
+        }
+        return true;
+    }
+    std::vector<ConformanceResult> results() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return results_;
+    }
+
+private:
+    mutable std::mutex mutex_;
+    std::condition_variable changed_;
+    std::string activity_ = "constructor";
+    Clock::time_point until_ = Clock::time_point::max();
+    std::vector<ConformanceResult> results_;
+    bool finished_ = false;
+};
+
+// The cases, on one rank. All ranks go through them in step, by announcements over a transport of the suite's own,
+// which are repeated until they are heard: so a transport that loses messages is found out by the cases.
+template <class Transport>
+class Suite {
+public:
+    Suite(const typename Transport::Communicator& communicator, const ConformanceOptions& options, Report& report)
+        : communicator_(communicator), options_(options), report_(report), soon_(options.timeLimit / 10),
+          longNap_(options.timeLimit / 5), controlMailbox_(bell_), control_(communicator_, pool_, Progress::Caller),
+          rank_(control_.rank()), size_(control_.size())
+    {
+        std::thread([this] { anyThread_ = control_.mayPoll(); }).join();
+    }
+
+    // Whether run() may be called from another thread than the constructor.
+    bool anyThread() const { return anyThread_; }
+
+    void run()
+    {
+        if (rank_ < 0 || rank_ >= size_) {
+            report_.add(
+                {"ranks and sizes", "this is rank " + std::to_string(rank_) + " of " + std::to_string(size_), true});
+            return;
+        }
+        peers_.resize(static_cast<std::size_t>(size_));
+        control_.start(controlMailbox_);
+        for (const Progress mode : options_.modes) {
+            mode_ = mode;
+            runCase("ranks and sizes", [this] { checkRanks(); });
+            runCase("messages of all sizes", [this] { checkSizes(); });
+            runCase("many small messages, all to all", [this] { checkManyMessages(1); });
+            runCase("sends from several threads", [this] { checkManyMessages(4); });
+            runCase("send() never blocks", [this] { checkFlood(); });
+            runCase("what was sent needs no polls after quiet()", [this] { checkQuiet(); });
+            runCase("poll() and quiet() come to rest", [this] { checkRest(); });
+            runCase("nap() ends by its limit and by interrupt()", [this] { checkNap(); });
+            runCase("send() ends the nap", [this] { checkNapOfSender(); });
+            runCase("arrival ends the nap", [this] { checkNapOfReceiver(); });
+            runCase("stop(true) after everything has come", [this] { checkEnd(); });
+            runCase("messages before start()", [this] { checkEarlyMessages(); });
+            runCase("two transports at once", [this] { checkTwoAtOnce(); });
+            runCase("made and ended again and again", [this] { checkAgain(); });
+            runCase("stop(true) loses nothing", [this] { checkOrderlyStop(); });
+            runCase("stop(true) ends when the handler has failed", [this] { checkHopelessStop(); });
+            runCase("stop(false) waits for nobody", [this] { checkAbandon(); });
+        }
+        report_.enter("stop() at the end", 2 * options_.timeLimit);
+        controlMailbox_.failAt(Clock::now() + options_.timeLimit);
+        control_.stop(allPassed_);
+    }
+
+private:
+    using SizeOf = std::function<std::size_t(std::uint64_t)>;
+    static constexpr std::size_t smallSize = 64, mediumSize = std::size_t{1} << 16, largeSize = std::size_t{1} << 20;
+
+    // A transport under test and what drives it. Its mailbox outlives it.
+    struct End {
+        End(Suite& suite, Mailbox& itsMailbox)
+            : mailbox(itsMailbox), transport(suite.communicator_, suite.pool_, suite.mode_), channel(++suite.channels_),
+              polledHere(transport.needsPolling() && suite.mode_ == Progress::Caller),
+              polledByThread(transport.needsPolling() && suite.mode_ == Progress::Thread)
+        {
+        }
+
+        Mailbox& mailbox;
+        Transport transport;
+        std::uint32_t channel;
+        bool polledHere, polledByThread;
+        bool started = false, resting = false;
+        bool mayFail = false; // a rank has left it, or will: the others may hear of that
+        std::unique_ptr<Poller<Transport>> poller;
+    };
+
+    // What a rank tells the others: that it has come to a step, and in the last step of a case how that went. The words
+    // follow.
+    struct Announcement {
+        std::uint64_t magic = controlMagic, checksum = 0;
+        std::uint32_t step = 0;
+        std::int32_t rank = 0;
+        std::uint32_t givesUp = 0, wantsAnswer = 0;
+    };
+    static_assert(std::has_unique_object_representations_v<Announcement>);
+    struct Peer {
+        std::uint32_t step = 0;
+        bool givesUp = false;
+        std::map<std::uint32_t, std::string> verdicts; // by step
+    };
+    static constexpr std::uint32_t stepsPerCase = 1 << 16; // at least as many as ranks
+
+    template <class Body>
+    void runCase(const char* what, const Body& body)
+    {
+        const std::string name =
+            std::string(what) + (mode_ == Progress::Thread ? " (Progress::Thread)" : " (Progress::Caller)");
+        if (!gaveUpIn_.empty()) {
+            report_.add({name, "not run after '" + gaveUpIn_ + "'", false});
+            return;
+        }
+        const Clock::duration grace = std::max<Clock::duration>(options_.timeLimit, std::chrono::seconds(1));
+        step_ = series_ = ++caseNumber_ * stepsPerCase;
+        problems_.clear();
+        report_.enter(name, options_.timeLimit + grace);
+        deadline_ = Clock::now() + options_.timeLimit;
+        bool givesUp = false;
+        try {
+            body();
+        } catch (const std::exception& e) { // ours, or one of the transport
+            problems_.add(e.what());
+            lookForStrays();
+            givesUp = true;
+        }
+        lookForLateCalls();
+
+        // One that gives up waits only so long that the others can hear of it.
+        const Clock::duration patience = givesUp ? soon_ : 2 * options_.timeLimit + std::chrono::seconds(2);
+        report_.enter(name + ", waiting for the other ranks", patience + grace);
+        step_ = caseNumber_ * stepsPerCase + stepsPerCase - 1;
+        announce(problems_.text(), givesUp);
+        if (!waitUntil([this] { return allHaveCome(); }, Clock::now() + patience) && !givesUp) {
+            problems_.add(whoHasNotCome(patience));
+            givesUp = true;
+        }
+        std::string text = problems_.text();
+        for (int r = 0; r < size_; ++r) {
+            const auto verdict = peer(r).verdicts.find(step_);
+            if (text.empty() && verdict != peer(r).verdicts.end() && !verdict->second.empty())
+                text = "rank " + std::to_string(r) + ": " + verdict->second;
+            givesUp = givesUp || peer(r).givesUp;
+        }
+        allPassed_ = allPassed_ && text.empty();
+        report_.add({name, text, true});
+        if (!givesUp)
+            return;
+        gaveUpIn_ = name;
+        report_.enter("stop(false) after '" + name + "'", options_.timeLimit);
+        while (!ends_.empty())
+            close(*ends_.back(), false);
+    }
+
+    // --- in step with the other ranks
+
+    Peer& peer(int r) { return peers_[static_cast<std::size_t>(r)]; }
+
+    void announce(const std::string& verdict, bool givesUp)
+    {
+        verdict_ = verdict;
+        givesUp_ = givesUp;
+        for (int r = 0; r < size_; ++r)
+            if (r != rank_)
+                tell(r, false);
+        nextRepeat_ = Clock::now() + repeatAfter;
+        // This rank may go into a call that waits for the others: they must be on their way to it by then.
+        waitUntil([this] { return control_.quiet(); }, nextRepeat_);
+    }
+
+    static std::uint64_t checksumOf(Announcement announcement, const std::string& text)
+    {
+        announcement.checksum = 0;
+        std::string bytes(reinterpret_cast<const char*>(&announcement), sizeof announcement);
+        bytes += text;
+        std::uint64_t sum = bytes.size();
+        for (const char c : bytes)
+            sum = mix(sum ^ static_cast<unsigned char>(c));
+        return sum;
+    }
+
+    void tell(int destination, bool wantsAnswer)
+    {
+        Announcement announcement;
+        announcement.step = step_;
+        announcement.rank = rank_;
+        announcement.givesUp = givesUp_;
+        announcement.wantsAnswer = wantsAnswer;
+        announcement.checksum = checksumOf(announcement, verdict_);
+        Buffer message = pool_->acquire(sizeof announcement + verdict_.size());
+        std::memcpy(message.data(), &announcement, sizeof announcement);
+        if (!verdict_.empty())
+            std::memcpy(message.data() + sizeof announcement, verdict_.data(), verdict_.size());
+        control_.send(destination, std::move(message));
+    }
+
+    void hear(int source, const Buffer& message)
+    {
+        const std::string from = "a message of the suite from rank " + std::to_string(source);
+        Announcement announcement;
+        if (message.size() >= sizeof announcement)
+            std::memcpy(&announcement, message.data(), sizeof announcement);
+        std::string text;
+        if (message.size() > sizeof announcement)
+            text.assign(reinterpret_cast<const char*>(message.data()) + sizeof announcement,
+                        message.size() - sizeof announcement);
+        if (announcement.magic == testMagic) {
+            problems_.add("a message from rank " + std::to_string(source) + " belongs to another transport");
+        } else if (message.size() < sizeof announcement || announcement.checksum != checksumOf(announcement, text)
+                   || announcement.rank < 0 || announcement.rank >= size_) {
+            problems_.add(from + " is damaged");
+        } else {
+            if (announcement.rank != source)
+                problems_.add(from + " was sent by rank " + std::to_string(announcement.rank));
+            Peer& sender = peer(announcement.rank);
+            sender.step = std::max(sender.step, announcement.step);
+            sender.givesUp = sender.givesUp || announcement.givesUp != 0;
+            if (!text.empty())
+                sender.verdicts[announcement.step] = text;
+            if (announcement.wantsAnswer != 0 && announcement.rank != rank_ && announcement.step <= step_)
+                tell(announcement.rank, false);
+        }
+    }
+
+    bool allHaveCome()
+    {
+        bool all = true;
+        const bool repeat = Clock::now() >= nextRepeat_;
+        for (int r = 0; r < size_; ++r)
+            if (r != rank_ && peer(r).step < step_) {
+                all = false;
+                if (repeat)
+                    tell(r, true);
+            }
+        if (repeat)
+            nextRepeat_ = Clock::now() + repeatAfter;
+        return all;
+    }
+
+    std::string whoHasNotCome(Clock::duration limit)
+    {
+        Problems missing;
+        for (int r = 0; r < size_; ++r)
+            if (r != rank_ && peer(r).step < step_)
+                missing.add("nothing heard from rank " + std::to_string(r) + " within " + inSeconds(limit));
+        return missing.text();
+    }
+
+    // Waits until all ranks are here.
+    void meet()
+    {
+        ++step_;
+        announce("", false);
+        // A little longer than for a message: what is missing says more than who waits for it.
+        await([this] { return allHaveCome(); }, [this] { return whoHasNotCome(options_.timeLimit); },
+              deadline_ + soon_);
+    }
+
+    // --- waiting
+
+    // Makes progress with everything that this thread polls.
+    bool pump()
+    {
+        bool moved = control_.needsPolling() && control_.poll();
+        for (const auto& end : ends_)
+            if (end->polledHere && end->started && !end->resting)
+                moved = end->transport.poll() || moved;
+        for (const auto& [source, message] : controlMailbox_.take())
+            hear(source, message);
+        return moved;
+    }
+
+    // Sleeps a little, since there may be more ranks than cores.
+    void pause(Clock::duration time)
+    {
+        End* polled = nullptr;
+        for (const auto& end : ends_)
+            if (end->polledHere && end->started && !end->resting)
+                polled = end.get();
+        if (polled)
+            polled->transport.nap(time);
+        else
+            bell_.nap(time);
+    }
+
+    template <class Ready>
+    bool waitUntil(const Ready& ready, Clock::time_point deadline)
+    {
+        constexpr std::chrono::microseconds shortest(20), longest(1000);
+        for (Clock::duration time = shortest; !ready();) {
+            if (Clock::now() >= deadline)
+                return false;
+            if (pump()) {
+                time = shortest;
+            } else {
+                pause(time);
+                time = std::min<Clock::duration>(time * 3 / 2, longest);
+            }
+        }
+        return true;
+    }
+
+    // Waits within the time limit of the case. Throws GaveUp if `ready` has not come true by then, with the words of
+    // `what`, and before if there is no more hope.
+    template <class Ready, class What>
+    void await(const Ready& ready, const What& what)
+    {
+        await(ready, what, deadline_);
+    }
+
+    template <class Ready, class What>
+    void await(const Ready& ready, const What& what, Clock::time_point deadline)
+    {
+        std::string trouble;
+        const auto over = [&] {
+            trouble = hopeless();
+            return !trouble.empty() || ready();
+        };
+        if (!waitUntil(over, deadline))
+            throw GaveUp(what());
+        if (!trouble.empty())
+            throw GaveUp(trouble);
+    }
+
+    std::string hopeless()
+    {
+        if (const std::string failure = controlMailbox_.failure(); !failure.empty())
+            return "the transport reports: " + failure;
+        for (const auto& end : ends_) {
+            if (const std::string failure = end->mailbox.failure(); !failure.empty() && !end->mayFail)
+                return "the transport reports: " + failure;
+            if (end->poller && !end->poller->mayPoll())
+                return "mayPoll() forbids it to the thread that Progress::Thread asks for";
+        }
+        for (int r = 0; r < size_; ++r)
+            if (peer(r).givesUp) {
+                const auto& verdicts = peer(r).verdicts;
+                return "rank " + std::to_string(r) + " gave up"
+                       + (verdicts.empty() ? "" : ": " + verdicts.rbegin()->second);
+            }
+        return "";
+    }
+
+    void idle(Clock::duration time)
+    {
+        waitUntil([] { return false; }, Clock::now() + time);
+    }
+
+    // --- transports under test
+
+    End& make()
+    {
+        mailboxes_.push_back(std::make_unique<Mailbox>(bell_));
+        ends_.push_back(std::make_unique<End>(*this, *mailboxes_.back()));
+        return *ends_.back();
+    }
+
+    void begin(End& end)
+    {
+        end.transport.start(end.mailbox);
+        end.started = true;
+        if (end.polledByThread)
+            end.poller = std::make_unique<Poller<Transport>>(end.transport);
+    }
+
+    // While it rests the suite does not poll it.
+    void rest(End& end, bool resting)
+    {
+        end.resting = resting;
+        if (end.poller)
+            end.poller->pause(resting);
+    }
+
+    void close(End& end, bool orderly)
+    {
+        end.poller.reset();
+        end.mailbox.failAt(deadline_);
+        if (end.started)
+            end.transport.stop(orderly);
+        end.mailbox.close();
+        const bool late = orderly && Clock::now() > deadline_;
+        const std::size_t more = end.mailbox.take().size();
+        ends_.erase(std::find_if(ends_.begin(), ends_.end(), [&end](const auto& e) { return e.get() == &end; }));
+        if (late)
+            throw GaveUp("stop(true) has not ended within " + inSeconds(options_.timeLimit) + " of the start");
+        if (orderly && more > 0 && !options_.duplicatesAllowed)
+            problems_.add(std::to_string(more) + " messages more than were sent");
+    }
+
+    void lookForLateCalls()
+    {
+        for (const auto& mailbox : mailboxes_)
+            if (const int calls = mailbox->takeTooLate(); calls > 0)
+                problems_.add("the handler was called after stop(), " + std::to_string(calls) + " times");
+    }
+
+    // What is missing in one transport may have come to another.
+    void lookForStrays()
+    {
+        for (const auto& end : ends_)
+            for (const auto& [source, message] : end->mailbox.take()) {
+                Label found;
+                if (message.size() >= sizeof found)
+                    std::memcpy(&found, message.data(), sizeof found);
+                if (found.magic == controlMagic || (found.magic == testMagic && found.channel != end->channel))
+                    problems_.add("a message from rank " + std::to_string(source) + " belongs to another transport");
+            }
+    }
+
+    // --- messages
+
+    static std::size_t small(std::uint64_t) { return smallSize; }
+    std::size_t atMost(std::size_t size) const { return std::max(smallSize, std::min(size, options_.largestMessage)); }
+    // The first is large, the second medium, the others small.
+    SizeOf mixed() const
+    {
+        return [large = atMost(largeSize), medium = atMost(mediumSize)](std::uint64_t number) {
+            return number == 0 ? large : number == 1 ? medium : smallSize;
+        };
+    }
+
+    Label label(const End& end) const
+    {
+        Label result;
+        result.magic = testMagic;
+        result.channel = end.channel;
+        result.series = series_;
+        return result;
+    }
+
+    void send(End& end, int destination, std::uint64_t number, std::size_t size)
+    {
+        Label own = label(end);
+        own.source = rank_;
+        own.destination = destination;
+        own.number = number;
+        own.size = size;
+        own.checksum = own.sum();
+        end.transport.send(destination, makeMessage(*pool_, own, options_.seed));
+    }
+
+    // `count` messages to each rank for which `to(rank)`.
+    template <class To>
+    void sendAll(End& end, const To& to, std::uint64_t count, const SizeOf& sizeOf)
+    {
+        for (std::uint64_t number = 0; number < count; ++number)
+            for (int r = 0; r < size_; ++r)
+                if (r != rank_ && to(r))
+                    send(end, r, number, sizeOf(number));
+    }
+
+    // `count` messages are expected from each rank for which `from(rank)`.
+    template <class From>
+    Ledger expect(const End& end, const From& from, std::uint64_t count, const SizeOf& sizeOf) const
+    {
+        std::vector<std::uint64_t> counts(static_cast<std::size_t>(size_));
+        for (int r = 0; r < size_; ++r)
+            counts[static_cast<std::size_t>(r)] = r != rank_ && from(r) ? count : 0;
+        return Ledger(label(end), rank_, options_.seed, counts, sizeOf, options_.duplicatesAllowed);
+    }
+
+    void receive(End& end, Ledger& ledger, int source = -1)
+    {
+        await(
+            [&] {
+                for (const auto& [from, message] : end.mailbox.take())
+                    ledger.check(from, message, problems_);
+                return ledger.complete(source);
+            },
+            [&] { return ledger.missing(options_.timeLimit); });
+    }
+
+    // How many of `total` messages each rank sends each other.
+    std::uint64_t share(int total) const
+    {
+        return static_cast<std::uint64_t>(std::max(1, size_ > 1 ? total / (size_ * (size_ - 1)) : 1));
+    }
+
+    static bool everyone(int) { return true; }
+    // In a round the ranks of one parity send, the others receive.
+    bool isSender(int r, int round) const { return r % 2 == round % 2; }
+
+    // --- cases
+
+    void checkRanks()
+    {
+        session_ = &make();
+        const Transport& transport = session_->transport;
+        if (transport.rank() != rank_ || transport.size() != size_)
+            throw GaveUp("rank " + std::to_string(transport.rank()) + " of " + std::to_string(transport.size())
+                         + ", in another transport on this communicator rank " + std::to_string(rank_) + " of "
+                         + std::to_string(size_));
+        if (session_->polledHere && !transport.mayPoll())
+            throw GaveUp("mayPoll() forbids it to the thread that made the transport, with Progress::Caller");
+        begin(*session_);
+        meet(); // messages before start() have a case of their own
+        sendAll(*session_, everyone, 1, small);
+        Ledger ledger = expect(*session_, everyone, 1, small);
+        receive(*session_, ledger);
+    }
+
+    // Each rank sends to one other at a time: there may not be memory for all at once.
+    void checkSizes()
+    {
+        std::vector<std::size_t> sizes;
+        for (const std::size_t base : {std::size_t{0}, std::size_t{16}, std::size_t{64}, std::size_t{8192}, mediumSize,
+                                       largeSize, options_.largestMessage})
+            for (const std::size_t size : {base, base + 1, base - 1, base + 3, base - 3})
+                if (size <= options_.largestMessage && (size <= largeSize + 1 || size == options_.largestMessage)
+                    && std::find(sizes.begin(), sizes.end(), size) == sizes.end())
+                    sizes.push_back(size);
+        const auto sizeOf = [&sizes](std::uint64_t number) { return sizes[static_cast<std::size_t>(number)]; };
+        Ledger ledger = expect(*session_, everyone, sizes.size(), sizeOf);
+        for (int shift = 1; shift < size_; ++shift) {
+            for (std::size_t i = 0; i < sizes.size(); ++i) { // small ones after large ones, and before
+                const std::size_t number = i % 2 ? i / 2 : sizes.size() - 1 - i / 2;
+                send(*session_, (rank_ + shift) % size_, number, sizes[number]);
+            }
+            receive(*session_, ledger, (rank_ + size_ - shift) % size_);
+            meet();
+        }
+    }
+
+    void checkManyMessages(int threadCount)
+    {
+        const auto sizeOf = [seed = options_.seed](std::uint64_t number) {
+            return smallSize + static_cast<std::size_t>(mix(seed + number) % 256);
+        };
+        const std::uint64_t count = share(options_.smallMessages);
+        const auto step = static_cast<std::uint64_t>(threadCount);
+        std::vector<std::thread> threads;
+        std::vector<std::string> errors(static_cast<std::size_t>(threadCount));
+        std::atomic<int> running{threadCount};
+        const auto sendOwn = [&](std::uint64_t first) {
+            try {
+                for (std::uint64_t number = first; number < count; number += step)
+                    for (int r = 0; r < size_; ++r)
+                        if (r != rank_)
+                            send(*session_, r, number, sizeOf(number));
+            } catch (const std::exception& e) {
+                errors[static_cast<std::size_t>(first)] = e.what();
+            }
+            --running;
+        };
+        meet();
+        Ledger ledger = expect(*session_, everyone, count, sizeOf);
+        if (threadCount == 1) {
+            sendOwn(0);
+        } else {
+            for (std::uint64_t t = 0; t < step; ++t)
+                threads.emplace_back(sendOwn, t);
+            waitUntil([&running] { return running == 0; }, Clock::time_point::max());
+            for (std::thread& thread : threads)
+                thread.join();
+        }
+        for (const std::string& error : errors)
+            if (!error.empty())
+                throw GaveUp("send() throws: " + error);
+        receive(*session_, ledger);
+    }
+
+    void checkFlood()
+    {
+        const std::uint64_t count = 3 + share(options_.smallMessages / 4);
+        const auto sizeOf = [large = atMost(largeSize)](std::uint64_t number) {
+            return number < 2 ? large : std::size_t{1024};
+        };
+        rest(*session_, true);
+        meet();
+        sendAll(*session_, everyone, count, sizeOf);
+        meet();
+        rest(*session_, false);
+        Ledger ledger = expect(*session_, everyone, count, sizeOf);
+        receive(*session_, ledger);
+    }
+
+    void checkQuiet()
+    {
+        for (int round = 0; round < 2; ++round) {
+            ++series_;
+            const bool sends = isSender(rank_, round);
+            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            Ledger ledger = expect(
+                *session_, [&](int r) { return !sends && others(r); }, 20, mixed());
+            meet();
+            if (sends) {
+                sendAll(*session_, others, 20, mixed());
+                await([this] { return session_->transport.quiet(); },
+                      [this] { return "quiet() has not come true within " + inSeconds(options_.timeLimit); });
+                rest(*session_, true);
+            }
+            receive(*session_, ledger);
+            meet();
+            rest(*session_, false);
+            meet(); // the ledger of the next round starts with an empty mailbox
+        }
+    }
+
+    void checkRest()
+    {
+        meet();
+        Transport& transport = session_->transport;
+        const auto late = [&](const char* what) { return what + (" within " + inSeconds(options_.timeLimit)); };
+        await([&] { return transport.quiet(); }, [&] { return late("quiet() has not come true"); });
+        rest(*session_, true);
+        int misses = 0; // polls in a row that moved nothing
+        await([&] { return !transport.needsPolling() || (misses = transport.poll() ? 0 : misses + 1) > 20; },
+              [&] { return late("poll() returned true again and again, with nothing to move,"); });
+        rest(*session_, false);
+        meet();
+    }
+
+    void checkNap()
+    {
+        rest(*session_, true);
+        meet();
+        Transport& transport = session_->transport;
+        const auto nap = [&](Clock::duration limit, Clock::duration most, const char* how) {
+            const auto before = Clock::now();
+            transport.nap(limit);
+            const auto time = Clock::now() - before;
+            if (time > most)
+                problems_.add("nap(" + inSeconds(limit) + ")" + how + " took " + inSeconds(time));
+            return time;
+        };
+        using std::chrono::milliseconds;
+        for (int i = 0; i < 3; ++i)
+            nap(milliseconds(1), soon_, ""); // for interrupts left over
+        nap(milliseconds(0), soon_, "");
+        Clock::duration total{0};
+        for (int i = 0; i < 10; ++i)
+            total += nap(milliseconds(10), milliseconds(10) + soon_, "");
+        if (total < milliseconds(50))
+            problems_.add("10 times nap(10 ms) took " + inSeconds(total) + " together: it hardly sleeps");
+        transport.interrupt();
+        nap(longNap_, soon_, " just after interrupt()");
+        std::thread interrupter([&transport] {
+            std::this_thread::sleep_for(milliseconds(30));
+            transport.interrupt();
+        });
+        nap(longNap_, soon_, ", interrupted after 30 ms,");
+        interrupter.join();
+
+        // The interrupt comes just when the nap begins.
+        NapSignal begins;
+        std::atomic<bool> over{false};
+        interrupter = std::thread([&, seed = options_.seed]() mutable {
+            while (begins.nap(std::chrono::hours(1)), !over) {
+                const auto until = Clock::now() + std::chrono::nanoseconds((seed = mix(seed)) % 20000);
+                while (Clock::now() < until) {
+                }
+                transport.interrupt();
+            }
+        });
+        for (int i = 0; i < 100; ++i) {
+            begins.interrupt();
+            if (nap(longNap_, soon_, ", interrupted as it began,") > soon_)
+                break;
+        }
+        over = true;
+        begins.interrupt();
+        interrupter.join();
+        rest(*session_, false);
+        meet();
+    }
+
+    // That nap() ends when a message is sent, and when one comes, shows only where another thread naps.
+    void checkNapOfSender()
+    {
+        if (!session_->poller)
+            return;
+        for (int round = 0; round < 4; ++round) {
+            ++series_;
+            const bool sends = isSender(rank_, round);
+            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            Ledger ledger = expect(
+                *session_, [&](int r) { return !sends && others(r); }, 1, small);
+            session_->poller->napFor(sends ? longNap_ : Clock::duration::zero());
+            meet();
+            const auto before = Clock::now();
+            if (sends) {
+                idle(std::chrono::milliseconds(10));
+                sendAll(*session_, others, 1, small);
+            }
+            receive(*session_, ledger);
+            if (const auto time = Clock::now() - before; time > soon_)
+                problems_.add("messages sent during a nap of " + inSeconds(longNap_) + " took " + inSeconds(time));
+            meet();
+        }
+        session_->poller->napFor(Clock::duration::zero());
+        meet();
+    }
+
+    // Each rank plays ping-pong with the next one, and so with the one before as well.
+    void checkNapOfReceiver()
+    {
+        if (!session_->poller)
+            return;
+        constexpr std::uint64_t rounds = 10;
+        const bool wakes = session_->transport.wakesOnArrival();
+        session_->poller->napFor(wakes ? longNap_ : Clock::duration::zero());
+        meet();
+        const auto before = Clock::now();
+        std::uint64_t pings = 0, pongs = 0, sent = 0;
+        std::array<bool, 2 * rounds> seen{};
+        const auto play = [&] {
+            for (const auto& [source, message] : session_->mailbox.take()) {
+                Label found;
+                if (message.size() == smallSize)
+                    std::memcpy(&found, message.data(), sizeof found);
+                if (found.magic != testMagic || found.series != series_ || found.number >= 2 * rounds) {
+                    if (!options_.duplicatesAllowed)
+                        problems_.add("a message from rank " + std::to_string(source) + " that nobody sent");
+                } else if (std::exchange(seen[static_cast<std::size_t>(found.number)], true)) {
+                    if (!options_.duplicatesAllowed)
+                        problems_.add("a message from rank " + std::to_string(source) + " came twice");
+                } else if (found.number % 2 == 0) {
+                    ++pings;
+                    send(*session_, source, found.number + 1, smallSize);
+                } else {
+                    ++pongs;
+                }
+            }
+            if (pongs == sent && sent < rounds) {
+                std::this_thread::sleep_for(std::chrono::microseconds(500 + mix(options_.seed + sent) % 2000));
+                send(*session_, (rank_ + 1) % size_, 2 * sent++, smallSize);
+            }
+            return pings >= rounds && pongs >= rounds;
+        };
+        if (size_ > 1)
+            await(play, [&] {
+                return "after " + inSeconds(options_.timeLimit) + " only " + std::to_string(pongs) + " of "
+                       + std::to_string(rounds) + " answers came"
+                       + (wakes ? "; nap() is said to end on arrival, these took " + inSeconds(longNap_) : "");
+            });
+        if (const auto time = Clock::now() - before; wakes && time > longNap_)
+            problems_.add(std::to_string(rounds) + " messages and answers took " + inSeconds(time)
+                          + ": nap() is said to end on arrival, these took " + inSeconds(longNap_));
+        meet();
+        session_->poller->napFor(Clock::duration::zero());
+        meet();
+    }
+
+    void checkEnd()
+    {
+        meet();
+        close(*session_, true);
+    }
+
+    void checkEarlyMessages()
+    {
+        for (int round = 0; round < 2; ++round) {
+            const bool sends = isSender(rank_, round);
+            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            End& end = make();
+            Ledger ledger = expect(
+                end, [&](int r) { return !sends && others(r); }, 20, mixed());
+            if (sends) {
+                begin(end);
+                sendAll(end, others, 20, mixed());
+                idle(std::chrono::milliseconds(10)); // so that they leave, as far as they can
+            }
+            meet();
+            if (!sends)
+                begin(end);
+            receive(end, ledger);
+            meet();
+            close(end, true);
+        }
+    }
+
+    void checkTwoAtOnce()
+    {
+        End& first = make();
+        End& second = make();
+        begin(second);
+        begin(first);
+        meet();
+        for (std::uint64_t number = 0; number < 50; ++number)
+            for (int shift = 1; shift < size_; ++shift)
+                for (End* end : {&first, &second})
+                    send(*end, (rank_ + shift) % size_, number, mixed()(number));
+        Ledger ofFirst = expect(first, everyone, 50, mixed()), ofSecond = expect(second, everyone, 50, mixed());
+        receive(second, ofSecond);
+        receive(first, ofFirst);
+        meet();
+        close(first, true);
+        ++series_;
+        sendAll(second, everyone, 5, small);
+        Ledger later = expect(second, everyone, 5, small);
+        receive(second, later);
+        meet();
+        close(second, true);
+    }
+
+    void checkAgain()
+    {
+        std::vector<std::pair<int, Buffer>> kept; // a message may be read when its transport is no more
+        for (int round = 0; round < 6; ++round) {
+            End& end = make();
+            begin(end);
+            meet();
+            sendAll(end, everyone, 1, small);
+            Ledger ledger = expect(end, everyone, 1, small);
+            const Ledger empty = ledger;
+            kept.clear();
+            await(
+                [&] {
+                    for (auto& [source, message] : end.mailbox.take()) {
+                        ledger.check(source, message, problems_);
+                        kept.emplace_back(source, std::move(message));
+                    }
+                    return ledger.complete();
+                },
+                [&] { return ledger.missing(options_.timeLimit); });
+            meet();
+            close(end, true);
+            Ledger afterwards = empty;
+            for (const auto& [source, message] : kept)
+                afterwards.check(source, message, problems_);
+        }
+    }
+
+    void checkOrderlyStop()
+    {
+        for (int round = 0; round < 2; ++round) {
+            const bool sends = isSender(rank_, round);
+            const auto others = [&](int r) { return isSender(r, round) != sends; };
+            End& end = make();
+            begin(end);
+            Ledger ledger = expect(
+                end, [&](int r) { return !sends && others(r); }, 50, mixed());
+            meet();
+            if (sends)
+                sendAll(end, others, 50, mixed());
+            else
+                receive(end, ledger);
+            close(end, true); // the senders expect nothing
+            meet();
+        }
+    }
+
+    // The others wait for rank 0, which never calls stop(true). That it has failed they learn from its message.
+    void checkHopelessStop()
+    {
+        End& end = make();
+        end.mayFail = true;
+        begin(end);
+        meet();
+        if (rank_ == 0) {
+            idle(std::chrono::milliseconds(20));
+            sendAll(end, everyone, 1, small);
+        } else {
+            end.poller.reset();
+            end.mailbox.failWithMessage();
+            end.mailbox.failAt(deadline_);
+            const auto before = Clock::now();
+            end.transport.stop(true);
+            end.mailbox.close();
+            end.started = false;
+            if (const auto time = Clock::now() - before; time > soon_)
+                problems_.add("it took " + inSeconds(time));
+        }
+        meet();
+        close(end, false);
+    }
+
+    void checkAbandon()
+    {
+        End& end = make();
+        end.mayFail = true;
+        begin(end);
+        meet();
+        sendAll(end, everyone, 20, mixed());
+        if (isSender(rank_, 0)) { // to ranks that have left
+            idle(std::chrono::milliseconds(20));
+            sendAll(end, everyone, 20, mixed());
+            idle(std::chrono::milliseconds(20));
+        }
+        const auto before = Clock::now();
+        close(end, false);
+        if (const auto time = Clock::now() - before; time > soon_)
+            problems_.add("it took " + inSeconds(time));
+        meet();
+        idle(std::chrono::milliseconds(20)); // for calls that come too late
+    }
+
+    typename Transport::Communicator communicator_;
+    ConformanceOptions options_;
+    Report& report_;
+    Clock::duration soon_, longNap_;
+    std::shared_ptr<MemoryPool> pool_ = MemoryPool::create();
+    NapSignal bell_; // rings when a message has come
+    std::vector<std::unique_ptr<Mailbox>> mailboxes_;
+    std::vector<std::unique_ptr<End>> ends_;
+    End* session_ = nullptr; // the transport of the first cases
+    Mailbox controlMailbox_;
+    Transport control_;
+    int rank_, size_;
+    bool anyThread_ = true;
+
+    Progress mode_ = Progress::Thread;
+    std::uint32_t channels_ = 0, caseNumber_ = 0, step_ = 0, series_ = 0;
+    Clock::time_point deadline_; // of the case
+    Problems problems_;          // of the case
+    std::string gaveUpIn_;
+    bool allPassed_ = true;
+
+    static constexpr std::chrono::milliseconds repeatAfter{100};
+    Clock::time_point nextRepeat_;
+    std::string verdict_; // what was announced last
+    bool givesUp_ = false;
+    std::vector<Peer> peers_;
+};
+
+} // namespace detail
+
+// Collective over `communicator`, of any size, though one rank alone shows little. Each rank gets the same cases, and a
+// case that failed anywhere has a message everywhere (as far as messages arrive). After a case that could not end the
+// others are not run. Every case has its time limit, also for calls that never return: those are left behind in their
+// thread, with their transport. The exceptions are the first constructor, and transports that only one thread may poll.
+template <class Transport>
+std::vector<ConformanceResult> checkTransport(const typename Transport::Communicator& communicator,
+                                              const ConformanceOptions& options = {})
+{
+    static_assert(is_transport_v<Transport>, "dfb: checkTransport() needs a transport, see comm/transport.hpp");
+    const auto report = std::make_shared<detail::Report>();
+    std::shared_ptr<detail::Suite<Transport>> suite;
+    try {
+        suite = std::make_shared<detail::Suite<Transport>>(communicator, options, *report);
+    } catch (const std::exception& e) {
+        return {{"constructor", e.what(), true}};
+    }
+    const auto run = [report, suite] {
+        try {
+            suite->run();
+        } catch (const std::exception& e) {
+            report->add({"start and end of the suite", e.what(), true});
+        }
+        report->finish();
+    };
+    if (!suite->anyThread()) {
+        run();
+        return report->results();
+    }
+    std::thread thread(run);
+    if (report->waitForEnd())
+        thread.join();
+    else
+        thread.detach();
+    return report->results();
+}
+
+} // namespace dfb::testing

@@ -1,0 +1,284 @@
+// A suite that passes everything is worth nothing: transports that break the contract, each in one way, and what
+// checkTransport() is to say of them.
+#include "catch.hpp"
+
+#include <dfb/comm/inproc_transport.hpp>
+#include <dfb/testing/fault_transport.hpp>
+#include <dfb/testing/transport_conformance.hpp>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+using namespace dfb;
+using std::chrono::milliseconds;
+using testing::ConformanceOptions;
+
+namespace {
+
+constexpr milliseconds timeLimit{400};
+
+enum class Defect {
+    LosesSome,
+    LosesEmptyMessages,
+    LosesTheEndOfLargeMessages,
+    DeliversTwice,
+    NamesTheWrongSource,
+    LosesWhatComesBeforeStart,
+    MixesTransports, // of those on a rank the one that was started last gets some messages of the others
+    BlocksInSend,
+    WaitsInAbandon,
+    CallsAfterStop,
+    Oversleeps,
+    HardlySleeps,
+    IsNotInterrupted,
+    ForgetsAnEarlyInterrupt, // ends the nap under way, and no other
+    SleepsOverSendsAndArrivals,
+    ClaimsToNeedNoPolls,
+    AlwaysSaysThatItMoved,
+    HasAnotherRankEachTime,
+    ForgetsWhatItHoldsInStop,
+    LiesAboutQuiet,
+    IsNeverQuiet
+};
+
+std::atomic<bool> testIsOver{false};
+
+// The handlers of the transports on each of the two ranks, in the order of their start.
+struct Started {
+    std::mutex mutex;
+    std::array<std::vector<TransportHandler*>, 2> handlers;
+} started;
+
+// One type for all, as each takes a while to compile with the suite.
+class Broken : private TransportHandler {
+public:
+    using Base = testing::FaultTransport<InprocTransport>;
+    struct Communicator {
+        Base::Communicator communicator;
+        Defect defect;
+    };
+    static constexpr const char* name = "broken";
+
+    Broken(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
+        : defect_(communicator.defect), pool_(pool), base_(communicator.communicator, std::move(pool), progress)
+    {
+    }
+    ~Broken()
+    {
+        if (late_.joinable())
+            late_.join();
+    }
+
+    int rank() const
+    {
+        static std::array<std::atomic<int>, 2> calls{0, 0};
+        return has(Defect::HasAnotherRankEachTime) ? ++calls[own()] % 2 : base_.rank();
+    }
+    int size() const { return base_.size(); }
+    bool needsPolling() const { return base_.needsPolling() && !has(Defect::ClaimsToNeedNoPolls); }
+    bool mayPoll() const { return true; }
+    bool wakesOnArrival() const { return true; }
+    bool quiet() const { return (base_.quiet() || has(Defect::LiesAboutQuiet)) && !has(Defect::IsNeverQuiet); }
+
+    void start(TransportHandler& handler)
+    {
+        handler_ = &handler;
+        {
+            const std::lock_guard<std::mutex> lock(started.mutex);
+            started.handlers[own()].push_back(handler_);
+        }
+        starting_ = true;
+        base_.start(*this);
+        starting_ = false;
+    }
+
+    void send(int destination, Buffer&& message)
+    {
+        const int number = ++sent_;
+        if ((has(Defect::LosesSome) && number % 40 == 0) || (has(Defect::LosesEmptyMessages) && message.empty()))
+            return;
+        if (has(Defect::LosesTheEndOfLargeMessages))
+            message.shrink(20000);
+        while (has(Defect::BlocksInSend) && number == 100 && !testIsOver)
+            std::this_thread::sleep_for(milliseconds(1));
+        base_.send(destination, std::move(message));
+    }
+
+    bool poll() { return base_.poll() || has(Defect::AlwaysSaysThatItMoved); }
+
+    void nap(std::chrono::nanoseconds limit)
+    {
+        napping_ = true;
+        if (has(Defect::SleepsOverSendsAndArrivals))
+            signal_.nap(limit);
+        else
+            base_.nap(has(Defect::Oversleeps) ? 10 * limit : has(Defect::HardlySleeps) ? limit / 100 : limit);
+        napping_ = false;
+    }
+    void interrupt()
+    {
+        signal_.interrupt();
+        if (!has(Defect::IsNotInterrupted) && (!has(Defect::ForgetsAnEarlyInterrupt) || napping_))
+            base_.interrupt();
+    }
+
+    void stop(bool orderly)
+    {
+        if (has(Defect::WaitsInAbandon) && !orderly)
+            std::this_thread::sleep_for(timeLimit / 2);
+        base_.stop(orderly && !has(Defect::ForgetsWhatItHoldsInStop));
+        {
+            const std::lock_guard<std::mutex> lock(started.mutex);
+            auto& handlers = started.handlers[own()];
+            handlers.erase(std::find(handlers.begin(), handlers.end(), handler_));
+        }
+        if (has(Defect::CallsAfterStop))
+            late_ = std::thread([this] {
+                std::this_thread::sleep_for(milliseconds(5));
+                handler_->receive(1 - base_.rank(), Buffer());
+            });
+    }
+
+private:
+    bool has(Defect defect) const { return defect_ == defect; }
+    std::size_t own() const { return static_cast<std::size_t>(base_.rank()); }
+
+    void receive(int source, Buffer&& message) override
+    {
+        const int number = ++received_;
+        if (has(Defect::LosesWhatComesBeforeStart) && starting_ && message.size() >= 64)
+            return;
+        if (has(Defect::NamesTheWrongSource) && message.size() > 60000)
+            source = base_.rank();
+        if (has(Defect::DeliversTwice) && number % 100 == 0) {
+            Buffer copy = pool_->acquire(message.size());
+            std::copy(message.data(), message.data() + message.size(), copy.data());
+            handler_->receive(source, std::move(copy));
+        }
+        if (has(Defect::MixesTransports) && number % 10 == 0 && message.size() >= 64) {
+            const std::lock_guard<std::mutex> lock(started.mutex);
+            started.handlers[own()].back()->receive(source, std::move(message));
+        } else {
+            handler_->receive(source, std::move(message));
+        }
+    }
+    void fail(const ErrorInfo& error) override { handler_->fail(error); }
+    bool failed() const override { return handler_->failed(); }
+
+    Defect defect_;
+    std::shared_ptr<MemoryPool> pool_;
+    Base base_;
+    NapSignal signal_;
+    TransportHandler* handler_ = nullptr;
+    std::atomic<bool> starting_{false}, napping_{false};
+    std::atomic<int> sent_{0}, received_{0};
+    std::thread late_;
+};
+
+// What to put the transport over: one that delivers at once, one that holds messages back at the sender, or one that
+// holds them back at the receiver.
+enum class Over { Plain, Late, Shuffled };
+
+std::string failuresOf(Defect defect, Over over = Over::Plain, Progress mode = Progress::Caller)
+{
+    ConformanceOptions options;
+    options.timeLimit = timeLimit;
+    options.largestMessage = std::size_t{1} << 16;
+    options.smallMessages = 400;
+    options.modes = {mode};
+    testing::FaultOptions faults;
+    faults.delay = over == Over::Late ? 1 : 0;
+    std::mutex mutex;
+    std::string text;
+    runRanks(
+        2,
+        [&](const InprocCommunicator& communicator) {
+            const Broken::Communicator broken{{communicator, faults}, defect};
+            const std::string own = testing::describeFailures(testing::checkTransport<Broken>(broken, options));
+            const std::lock_guard<std::mutex> lock(mutex);
+            text += own;
+        },
+        over == Over::Shuffled ? std::optional<std::uint64_t>(1) : std::nullopt);
+    return text;
+}
+
+// `text` has a line for `name` that says `what`.
+bool finds(const std::string& text, const std::string& name, const std::string& what)
+{
+    for (std::size_t from = 0, to = 0; from < text.size(); from = to + 1) {
+        to = text.find('\n', from);
+        const std::string line = text.substr(from, to - from);
+        if (line.compare(0, name.size(), name) == 0 && line.find(what) != std::string::npos)
+            return true;
+    }
+    return false;
+}
+
+} // namespace
+
+#define CHECK_FINDS(text_, name, what)  \
+    do {                                \
+        const std::string text = text_; \
+        INFO(text);                     \
+        CHECK(finds(text, name, what)); \
+    } while (false)
+
+TEST_CASE("Messages that are lost, added or changed are found")
+{
+    CHECK_FINDS(failuresOf(Defect::LosesSome), "", "no message from rank ");
+    CHECK_FINDS(failuresOf(Defect::LosesEmptyMessages), "messages of all sizes", "of 0 bytes is missing");
+    CHECK_FINDS(failuresOf(Defect::LosesTheEndOfLargeMessages), "messages of all sizes",
+                "20000 of its 65536 bytes came");
+    CHECK_FINDS(failuresOf(Defect::DeliversTwice), "many small messages", "came twice");
+    CHECK_FINDS(failuresOf(Defect::NamesTheWrongSource), "messages of all sizes", "there can be none from there");
+    CHECK_FINDS(failuresOf(Defect::LosesWhatComesBeforeStart), "messages before start()", "no message from rank ");
+    CHECK_FINDS(failuresOf(Defect::MixesTransports), "", "belongs to another transport");
+    CHECK_FINDS(failuresOf(Defect::ClaimsToNeedNoPolls, Over::Shuffled), "", "nothing heard from rank ");
+    CHECK_FINDS(failuresOf(Defect::ForgetsWhatItHoldsInStop, Over::Late), "stop(true) loses nothing",
+                "no message from rank ");
+}
+
+TEST_CASE("Calls that do not return, and those that come too late, are found")
+{
+    testIsOver = false;
+    CHECK_FINDS(failuresOf(Defect::BlocksInSend), "", "has not ended: a call of the transport does not return");
+    testIsOver = true;
+    CHECK_FINDS(failuresOf(Defect::WaitsInAbandon), "stop(false) waits for nobody", "it took ");
+    CHECK_FINDS(failuresOf(Defect::CallsAfterStop), "", "the handler was called after stop()");
+}
+
+TEST_CASE("Naps that are too long or too short are found")
+{
+    const char* const limits = "nap() ends by its limit and by interrupt()";
+    CHECK_FINDS(failuresOf(Defect::Oversleeps), limits, "nap(10 ms) took ");
+    CHECK_FINDS(failuresOf(Defect::HardlySleeps), limits, "it hardly sleeps");
+    CHECK_FINDS(failuresOf(Defect::IsNotInterrupted), limits, ", interrupted after ");
+    CHECK_FINDS(failuresOf(Defect::ForgetsAnEarlyInterrupt), limits, " just after interrupt() took ");
+    CHECK_FINDS(failuresOf(Defect::SleepsOverSendsAndArrivals, Over::Late, Progress::Thread), "send() ends the nap",
+                "messages sent during a nap of ");
+    CHECK_FINDS(failuresOf(Defect::SleepsOverSendsAndArrivals, Over::Shuffled, Progress::Thread),
+                "arrival ends the nap", "nap() is said to end on arrival");
+}
+
+TEST_CASE("Wrong answers are found")
+{
+    CHECK_FINDS(failuresOf(Defect::HasAnotherRankEachTime), "ranks and sizes",
+                "in another transport on this communicator");
+    CHECK_FINDS(failuresOf(Defect::AlwaysSaysThatItMoved, Over::Shuffled), "poll() and quiet() come to rest",
+                "poll() returned true");
+    CHECK_FINDS(failuresOf(Defect::LiesAboutQuiet, Over::Late), "what was sent needs no polls after quiet()",
+                "no message from rank ");
+    CHECK_FINDS(failuresOf(Defect::IsNeverQuiet), "what was sent needs no polls after quiet()",
+                "quiet() has not come true");
+}
