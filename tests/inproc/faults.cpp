@@ -1,0 +1,72 @@
+// Frames over a transport that reorders, delays, repeats, loses and damages messages.
+#include "catch.hpp"
+#include "fault_frames.hpp"
+
+#include <algorithm>
+#include <cstdint>
+#include <string>
+#include <vector>
+
+namespace {
+
+struct Tally {
+    int frames = 0, right = 0, frameErrors = 0, transportErrors = 0;
+    std::string wrong; // the first, with its seed
+};
+
+// Groups of frames until there are `frames`.
+Tally faultGroups(std::uint64_t firstSeed, int frames)
+{
+    Tally tally;
+    for (std::uint64_t seed = firstSeed; tally.frames < frames && tally.wrong.empty(); ++seed) {
+        const scene::FaultGroup group = scene::faultGroup(seed);
+        const auto expected = scene::referenceOf(group.scene);
+        std::vector<std::vector<scene::FaultEnding>> endings(static_cast<std::size_t>(group.ranks));
+        dfb::runRanks(group.ranks, [&](dfb::InprocCommunicator communicator) {
+            endings[static_cast<std::size_t>(communicator.rank())] =
+                scene::faultFrames<dfb::InprocTransport>(communicator, group, expected, 10);
+        });
+        std::size_t longest = 0;
+        for (const auto& e : endings)
+            longest = std::max(longest, e.size());
+        for (std::size_t frame = 0; frame < longest; ++frame) {
+            std::vector<scene::FaultEnding> ranks;
+            for (const auto& e : endings)
+                if (frame < e.size())
+                    ranks.push_back(e[frame]);
+            const std::string wrong = scene::verdictOn(ranks, group.harmless);
+            if (!wrong.empty() && tally.wrong.empty())
+                tally.wrong = "seed " + std::to_string(seed) + ", frame " + std::to_string(frame + 1) + ": " + wrong;
+            const auto ended = [&](const char* how) {
+                return std::any_of(ranks.begin(), ranks.end(),
+                                   [how](const scene::FaultEnding& r) { return scene::has(r.text, how); });
+            };
+            ++tally.frames;
+            if (ended("TransportError"))
+                ++tally.transportErrors;
+            else if (ended("FrameError"))
+                ++tally.frameErrors;
+            else
+                ++tally.right;
+        }
+    }
+    return tally;
+}
+
+void check(const Tally& tally, int frames)
+{
+    INFO(tally.wrong);
+    INFO(tally.frames << " frames: " << tally.right << " right, " << tally.frameErrors << " FrameError, "
+                      << tally.transportErrors << " TransportError");
+    CHECK(tally.wrong.empty());
+    CHECK(tally.frames >= frames);
+    CHECK(10 * tally.right >= 3 * frames);
+    CHECK(tally.frameErrors > 0);
+    CHECK(tally.transportErrors > 0);
+}
+
+} // namespace
+
+TEST_CASE("Disturbed frames end in the right image or in an error of dfb", "[faults]") { check(faultGroups(1, 2000), 2000); }
+
+TEST_CASE("Many more disturbed frames", "[faults][.stress]") { check(faultGroups(100000, 40000), 40000); }

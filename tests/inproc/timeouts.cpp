@@ -1,0 +1,810 @@
+// Frames with a time-out: what is missing fails them with an error that says so, the same on every rank; what can not
+// even be agreed on is a TransportError. Ranks are threads; every test has a time limit.
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <functional>
+#include <future>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using scene::has;
+using scene::Loop;
+using scene::outcomeOf;
+using scene::Picture;
+using scene::Scene;
+using Clock = std::chrono::steady_clock;
+
+// Which messages get lost; and the end of it all when time is up.
+struct Board {
+    // True: this message gets lost. Called from any thread.
+    std::function<bool(int from, int to, const MessageHeader&, const dfb::Buffer&)> loses;
+
+    std::mutex mutex;
+    std::vector<dfb::TransportHandler*> handlers;
+    std::atomic<bool> timeIsUp{false};
+
+    // Every rank that waits gets a TransportError.
+    void giveUp()
+    {
+        timeIsUp = true;
+        const std::lock_guard<std::mutex> lock(mutex);
+        for (dfb::TransportHandler* handler : handlers) {
+            dfb::ErrorInfo info;
+            info.kind = dfb::ErrorKind::Transport;
+            info.message = "the test's time limit";
+            handler->fail(info);
+        }
+    }
+};
+
+class LossyTransport {
+public:
+    struct Communicator {
+        dfb::InprocCommunicator inner;
+        std::shared_ptr<Board> board;
+    };
+    [[maybe_unused]] static constexpr const char* name = "lossy";
+
+    LossyTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
+        : board_(c.board), inner_(c.inner, std::move(pool), progress)
+    {
+    }
+    int rank() const { return inner_.rank(); }
+    int size() const { return inner_.size(); }
+    bool needsPolling() const { return inner_.needsPolling(); }
+    bool mayPoll() const { return inner_.mayPoll(); }
+    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
+    bool quiet() const { return inner_.quiet(); }
+    bool poll() { return inner_.poll(); }
+    void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
+    void interrupt() { inner_.interrupt(); }
+    void start(dfb::TransportHandler& handler)
+    {
+        handler_ = &handler;
+        {
+            const std::lock_guard<std::mutex> lock(board_->mutex);
+            board_->handlers.push_back(&handler);
+        }
+        inner_.start(handler);
+    }
+    void stop(bool orderly)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(board_->mutex);
+            auto& all = board_->handlers;
+            all.erase(std::remove(all.begin(), all.end(), handler_), all.end());
+        }
+        inner_.stop(orderly);
+    }
+    void send(int to, dfb::Buffer&& message)
+    {
+        if (board_->loses && board_->loses(rank(), to, dfb::detail::loadAs<MessageHeader>(message.data()), message))
+            const dfb::Buffer lost = std::move(message);
+        else
+            inner_.send(to, std::move(message));
+    }
+
+private:
+    std::shared_ptr<Board> board_;
+    dfb::InprocTransport inner_;
+    dfb::TransportHandler* handler_ = nullptr;
+};
+
+// runRanks() over a board, for at most so long. Says what was thrown; nothing must be.
+void runOn(const std::shared_ptr<Board>& board, int ranks,
+           const std::function<void(const LossyTransport::Communicator&)>& body,
+           std::optional<std::uint64_t> shuffleSeed = std::nullopt,
+           std::chrono::seconds limit = std::chrono::seconds(30))
+{
+    std::promise<void> done;
+    std::thread watch([&, over = done.get_future()] {
+        if (over.wait_for(limit) == std::future_status::ready)
+            return;
+        board->giveUp();
+        if (over.wait_for(std::chrono::seconds(20)) == std::future_status::ready)
+            return;
+        std::fputs("a test hangs even after its transport has failed\n", stderr);
+        std::abort();
+    });
+    std::string thrown;
+    try {
+        dfb::runRanks(
+            ranks,
+            [&](dfb::InprocCommunicator communicator) {
+                body({communicator, board});
+            },
+            shuffleSeed);
+    } catch (const std::exception& e) {
+        thrown = e.what();
+    }
+    done.set_value();
+    watch.join();
+    CHECK(thrown == "");
+    CHECK_FALSE(board->timeIsUp);
+}
+
+using Blend = dfb::BasicAlphaBlend<16>;
+using FrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, LossyTransport>;
+
+dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
+{
+    dfb::FrameBufferConfig config;
+    config.width = s.width;
+    config.height = s.height;
+    config.format = dfb::OutputFormat::RGBA32F;
+    config.depth = true;
+    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+    return config;
+}
+
+std::string joined(const std::vector<std::string>& texts)
+{
+    std::string all;
+    for (const std::string& t : texts)
+        all += "\n  " + t;
+    return all;
+}
+
+bool allSame(const std::vector<std::string>& texts)
+{
+    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
+}
+
+// What a rank got out of a frame: its error, or none.
+struct Ending {
+    std::optional<dfb::ErrorInfo> error;
+    bool isFrameError = false;
+    std::string text;
+    double ms = 0; // that end() took
+};
+
+template <class Frame>
+Ending endingOf(Frame& frame)
+{
+    Ending ending;
+    const auto start = Clock::now();
+    try {
+        frame.end();
+        ending.text = "fine";
+    } catch (const dfb::FrameError& e) {
+        ending.error = e.info();
+        ending.isFrameError = true;
+        ending.text = std::string("FrameError: ") + e.what();
+    } catch (const dfb::Error& e) {
+        ending.error = e.info();
+        ending.text = std::string("Error: ") + e.what();
+    }
+    ending.ms = std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+    return ending;
+}
+
+std::vector<std::string> textsOf(const std::vector<Ending>& endings)
+{
+    std::vector<std::string> texts;
+    for (const Ending& e : endings)
+        texts.push_back(e.text);
+    return texts;
+}
+
+// One bad frame, then a good one without time-out. `frame(fb)` runs the bad one up to end().
+struct Run {
+    std::vector<Ending> endings;
+    std::size_t wrongAfter = 1;
+};
+
+Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig config, const dfb::FrameParams& params,
+        const std::function<void(FrameBuffer&, FrameBuffer::Frame&)>& frame)
+{
+    Run result;
+    result.endings.resize(static_cast<std::size_t>(ranks));
+    const Scene s = scene::makeScene(5, 2, config.width, config.height);
+    runOn(board, ranks, [&](const LossyTransport::Communicator& communicator) {
+        auto mine = config;
+        mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        FrameBuffer fb(communicator, mine);
+        {
+            auto open = fb.begin(params);
+            frame(fb, open);
+            result.endings[static_cast<std::size_t>(fb.rank())] = endingOf(open);
+        }
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
+        if (fb.isDisplayRank())
+            result.wrongAfter = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+    });
+    return result;
+}
+
+void send(FrameBuffer::Frame& frame, int index, int generation, std::uint32_t source, std::uint16_t part, int children,
+          int pass = 0)
+{
+    const auto tile = std::make_unique<FrameBuffer::Tile>();
+    frame.start(*tile, index, pass);
+    tile->generation = generation;
+    tile->source = source;
+    tile->part = part;
+    tile->children = children;
+    frame.setTile(*tile);
+}
+
+dfb::FrameBufferConfig smallConfig() // 28 tiles
+{
+    return configOf(scene::makeScene(0));
+}
+
+constexpr int limitMs = 80;
+// How long after that many milliseconds an error may come, on a machine that is busy with other things.
+constexpr double marginMs = 5000;
+
+dfb::FrameParams timed(bool declared, int timeoutMs = limitMs)
+{
+    dfb::FrameParams params;
+    params.declared = declared;
+    params.timeoutMs = timeoutMs;
+    return params;
+}
+
+} // namespace
+
+TEST_CASE("A negative time-out is refused", "[timeouts]")
+{
+    std::string text, after;
+    runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
+        FrameBuffer fb(communicator, smallConfig());
+        text = outcomeOf([&] { fb.begin(timed(true, -1)); });
+        after = outcomeOf([&] {
+            auto frame = fb.begin(timed(true, 0));
+            frame.declare({});
+            frame.end();
+        });
+    });
+    CHECK((has(text, "InvalidArgument") && has(text, "-1 ms")));
+    CHECK(after == "fine");
+}
+
+TEST_CASE("Different time-outs are a disagreement", "[timeouts]")
+{
+    for (int odd = 0; odd < 3; ++odd) {
+        std::vector<std::string> texts(3);
+        runOn(std::make_shared<Board>(), 3, [&](const auto& communicator) {
+            FrameBuffer fb(communicator, smallConfig());
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+                auto frame = fb.begin(timed(true, fb.rank() == odd ? 30000 : 20000));
+                frame.declare({});
+                frame.end();
+            });
+        });
+        INFO(joined(texts));
+        CHECK(allSame(texts));
+        CHECK((has(texts[0], "FrameError: dfb: ranks disagree") && has(texts[0], "timeoutMs")));
+    }
+}
+
+TEST_CASE("A time-out that is not reached changes nothing", "[timeouts]")
+{
+    for (const Loop loop : {Loop::Listing3, Loop::Declared}) {
+        Scene s = scene::makeScene(6, 3);
+        std::vector<std::uint64_t> hashes;
+        std::vector<std::int64_t> messages;
+        runOn(std::make_shared<Board>(), 3, [&](const auto& communicator) {
+            FrameBuffer fb(communicator, configOf(s));
+            for (const int timeoutMs : {0, 60000, 2147483647}) {
+                Scene mine = s;
+                mine.timeoutMs = timeoutMs;
+                const auto report = scene::renderLoop(fb, mine, loop);
+                if (fb.isDisplayRank()) {
+                    const Picture p(fb.image(), report);
+                    CHECK(scene::wrongValues(p, scene::referenceOf(s)) == 0);
+                    hashes.push_back(p.hash());
+                    messages.push_back(report.lateMessages);
+                }
+            }
+        });
+        CHECK(hashes.size() == 3);
+        CHECK(std::count(hashes.begin(), hashes.end(), hashes.front()) == 3);
+        CHECK(messages == std::vector<std::int64_t>(3));
+    }
+}
+
+TEST_CASE("An announced input that is never sent is named on every rank", "[timeouts]")
+{
+    // Tile 5 of owner 1 waits for 3 inputs of generation 1, and gets 2.
+    for (const int ranks : {2, 4})
+        for (const bool shuffle : {false, true}) {
+            auto config = smallConfig();
+            config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 5 ? 1 : 0; };
+            std::vector<Ending> endings(static_cast<std::size_t>(ranks));
+            runOn(
+                std::make_shared<Board>(), ranks,
+                [&](const auto& communicator) {
+                    auto mine = config;
+                    mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
+                    FrameBuffer fb(communicator, mine);
+                    auto frame = fb.begin(timed(false));
+                    for (int tile : fb.ownedTiles())
+                        send(frame, tile, 0, 0, 0, tile == 5 ? 3 : 0);
+                    if (fb.rank() == ranks - 1) {
+                        send(frame, 5, 1, 70, 0, 0);
+                        send(frame, 5, 1, 71, 0, 0);
+                    }
+                    endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
+                },
+                shuffle ? std::optional<std::uint64_t>(1) : std::nullopt);
+            INFO(ranks << " ranks" << joined(textsOf(endings)));
+            CHECK(allSame(textsOf(endings)));
+            for (const Ending& e : endings) {
+                REQUIRE(e.error);
+                CHECK(e.isFrameError);
+                CHECK(e.error->kind == dfb::ErrorKind::TimedOut);
+                CHECK(e.error->rank == 1);
+                CHECK(e.error->frame == 1);
+                CHECK(e.error->tile == 5);
+                CHECK(e.error->pass == 0);
+                CHECK(e.error->generation == 1);
+                CHECK(e.error->expected == 3);
+                CHECK(e.error->got == 2);
+                CHECK(has(e.text, "tile 5: generation 1 has 2 of 3 inputs"));
+                CHECK(e.ms < 2 * limitMs + marginMs);
+            }
+            // Who ends the frame first waits for the time-out, not less.
+            CHECK(std::any_of(endings.begin(), endings.end(), [](const Ending& e) { return e.ms >= limitMs; }));
+        }
+}
+
+TEST_CASE("A tile that gets nothing at all, and a pass that does", "[timeouts]")
+{
+    const Run none = run(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer& fb, auto& frame) {
+        for (int tile : fb.ownedTiles())
+            if (tile != 6)
+                send(frame, tile, 0, 0, 0, 0);
+    });
+    INFO(joined(textsOf(none.endings)));
+    CHECK(allSame(textsOf(none.endings)));
+    REQUIRE(none.endings[0].error);
+    CHECK(none.endings[0].error->kind == dfb::ErrorKind::TimedOut);
+    CHECK(none.endings[0].error->tile == 6);
+    CHECK(none.endings[0].error->generation == 0);
+    CHECK(none.endings[0].error->expected == 1);
+    CHECK(none.endings[0].error->got == 0);
+    CHECK(none.wrongAfter == 0);
+
+    auto params = timed(false);
+    params.passes = 3;
+    const Run pass = run(std::make_shared<Board>(), 2, smallConfig(), params, [](FrameBuffer& fb, auto& frame) {
+        for (int tile : fb.ownedTiles())
+            for (int p = 0; p < 3; ++p)
+                if (tile != 7 || p != 2)
+                    send(frame, tile, 0, 0, 0, 0, p);
+    });
+    INFO(joined(textsOf(pass.endings)));
+    CHECK(allSame(textsOf(pass.endings)));
+    REQUIRE(pass.endings[0].error);
+    CHECK(pass.endings[0].error->tile == 7);
+    CHECK(pass.endings[0].error->pass == 2);
+    CHECK(has(pass.endings[0].text, "tile 7 pass 2"));
+    CHECK(pass.wrongAfter == 0);
+}
+
+TEST_CASE("A declared input that is never sent is named with its source, part and rank", "[timeouts]")
+{
+    for (const int ranks : {1, 3, 7})
+        for (int culprit = 0; culprit < ranks; culprit += 3) {
+            auto config = smallConfig();
+            config.displayRank = ranks / 2;
+            const Run r = run(std::make_shared<Board>(), ranks, config, timed(true), [&](FrameBuffer& fb, auto& frame) {
+                const auto rank = static_cast<std::uint32_t>(fb.rank());
+                frame.declare({{9, 40 + rank, 0}, {9, 40 + rank, 2}});
+                send(frame, 9, 1, 40 + rank, 0, 0);
+                if (fb.rank() != culprit)
+                    send(frame, 9, 1, 40 + rank, 2, 0);
+            });
+            INFO("rank " << culprit << " of " << ranks << joined(textsOf(r.endings)));
+            CHECK(allSame(textsOf(r.endings)));
+            REQUIRE(r.endings[0].error);
+            const dfb::ErrorInfo& e = *r.endings[0].error;
+            CHECK(r.endings[0].isFrameError);
+            CHECK(e.kind == dfb::ErrorKind::TimedOut);
+            CHECK(e.tile == 9);
+            CHECK(e.generation == 1);
+            CHECK(e.source == 40 + culprit);
+            CHECK(e.expected == 2 * ranks);
+            CHECK(e.got == 2 * ranks - 1);
+            CHECK(has(e.message,
+                      "missing source " + std::to_string(40 + culprit) + " part 2 of rank " + std::to_string(culprit)));
+            CHECK(r.wrongAfter == 0);
+        }
+}
+
+TEST_CASE("What several owners miss is all listed, whoever's time was up first", "[timeouts]")
+{
+    // Tile t is owned by rank t: those in `missing` do not get theirs. Rank `first` ends the frame alone; the others
+    // when they know that it has failed.
+    struct Case {
+        int ranks;
+        std::vector<int> missing;
+    };
+    for (const Case& c : {Case{2, {0, 1}}, Case{4, {0, 3}}, Case{4, {1, 2, 3}}, Case{4, {0, 1}}, Case{7, {0, 3, 5, 6}},
+                          Case{7, {2, 4}}})
+        for (const int first : c.missing) {
+            auto config = smallConfig();
+            config.ownerMap = [&](int tile, const dfb::TileLayout&, int ranks) { return tile < ranks ? tile : 0; };
+            const Run r =
+                run(std::make_shared<Board>(), c.ranks, config, timed(true), [&](FrameBuffer& fb, auto& frame) {
+                    std::vector<dfb::TileInput> inputs;
+                    if (fb.rank() == 0)
+                        for (int tile = 0; tile < c.ranks; ++tile)
+                            inputs.push_back({tile, 50, 0});
+                    frame.declare(inputs);
+                    for (const dfb::TileInput& input : inputs)
+                        if (std::count(c.missing.begin(), c.missing.end(), input.tile) == 0)
+                            send(frame, input.tile, 1, 50, 0, 0);
+                    const auto limit = Clock::now() + std::chrono::seconds(20);
+                    while (fb.rank() != first && !frame.failed() && Clock::now() < limit)
+                        std::this_thread::yield();
+                });
+            INFO(c.ranks << " ranks, first " << first << joined(textsOf(r.endings)));
+            CHECK(allSame(textsOf(r.endings)));
+            REQUIRE(r.endings[0].error);
+            CHECK(r.endings[0].error->kind == dfb::ErrorKind::TimedOut);
+            CHECK(r.endings[0].error->rank == c.missing.front());
+            CHECK(r.endings[0].error->tile == c.missing.front());
+            for (const int owner : c.missing)
+                CHECK(has(r.endings[0].text, "tile " + std::to_string(owner) + ": generation 1 has 0 of 1 inputs"));
+            CHECK(r.wrongAfter == 0);
+        }
+}
+
+TEST_CASE("More than one tile of an owner: the first are listed, the rest are counted", "[timeouts]")
+{
+    const Run r = run(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer&, auto&) {});
+    INFO(joined(textsOf(r.endings)));
+    CHECK(allSame(textsOf(r.endings)));
+    CHECK(has(r.endings[0].text, "and 6 more tiles")); // each has 14
+    CHECK(has(r.endings[0].text, "on rank 1: tile"));
+    CHECK(r.wrongAfter == 0);
+}
+
+TEST_CASE("What fails a frame is said even if something is missing as well", "[timeouts]")
+{
+    for (int culprit = 0; culprit < 3; ++culprit) {
+        const Run r = run(std::make_shared<Board>(), 3, smallConfig(), timed(false), [&](FrameBuffer& fb, auto& frame) {
+            const auto limit = Clock::now() + std::chrono::seconds(20);
+            if (fb.rank() != culprit)
+                return;
+            while (!frame.failed() && Clock::now() < limit) // the others' time is up
+                std::this_thread::yield();
+            frame.abort(std::make_exception_ptr(std::runtime_error("out of paint")));
+        });
+        INFO("rank " << culprit << joined(textsOf(r.endings)));
+        CHECK(allSame(textsOf(r.endings)));
+        CHECK(has(r.endings[0].text, "FrameError"));
+        CHECK(r.wrongAfter == 0);
+    }
+}
+
+TEST_CASE("A rank that does not call end(): the others get their error while it renders on", "[timeouts]")
+{
+    for (int absent = 0; absent < 3; ++absent) {
+        std::promise<void> othersDone;
+        const auto othersAreDone = othersDone.get_future().share();
+        std::atomic<int> left{2};
+        std::vector<Ending> endings(3);
+        std::size_t wrong = 1;
+        bool sawFailure = false;
+        runOn(std::make_shared<Board>(), 3, [&](const auto& communicator) {
+            const Scene s = scene::makeScene(4);
+            FrameBuffer fb(communicator, configOf(s));
+            {
+                auto frame = fb.begin(timed(true));
+                frame.declare({});
+                if (fb.rank() == absent) {
+                    othersAreDone.wait_for(std::chrono::seconds(20));
+                    sawFailure = frame.failed();
+                }
+                endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
+                if (fb.rank() != absent && --left == 0)
+                    othersDone.set_value();
+            }
+            const auto report = scene::renderLoop(fb, s, Loop::Declared);
+            if (fb.isDisplayRank())
+                wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+        });
+        INFO("rank " << absent << joined(textsOf(endings)));
+        CHECK(allSame(textsOf(endings)));
+        for (const Ending& e : endings) {
+            REQUIRE(e.error);
+            CHECK(e.isFrameError);
+            CHECK(e.error->kind == dfb::ErrorKind::TimedOut);
+            CHECK(e.ms < 2 * limitMs + marginMs);
+        }
+        CHECK(has(endings[0].text, "no verdict from rank"));
+        CHECK(sawFailure);
+        CHECK(wrong == 0);
+    }
+}
+
+TEST_CASE("A rank that does not begin the frame: a TransportError on the others, and then on it", "[timeouts]")
+{
+    for (int absent = 0; absent < 3; ++absent) {
+        std::promise<void> othersDone;
+        const auto othersAreDone = othersDone.get_future().share();
+        std::atomic<int> left{2};
+        std::vector<std::string> texts(3);
+        std::vector<double> ms(3);
+        runOn(std::make_shared<Board>(), 3, [&](const auto& communicator) {
+            FrameBuffer fb(communicator, smallConfig());
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            if (fb.rank() == absent)
+                othersAreDone.wait_for(std::chrono::seconds(20));
+            texts[rank] = outcomeOf([&] {
+                auto frame = fb.begin(timed(true));
+                frame.declare({});
+                const auto start = Clock::now();
+                try {
+                    frame.end();
+                } catch (...) {
+                    ms[rank] = std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+                    throw;
+                }
+            });
+            if (fb.rank() != absent && --left == 0)
+                othersDone.set_value();
+        });
+        INFO("rank " << absent << joined(texts));
+        for (std::size_t rank = 0; rank < 3; ++rank) {
+            CHECK(has(texts[rank], "TransportError"));
+            CHECK(ms[rank] < 2 * limitMs + marginMs);
+        }
+    }
+}
+
+TEST_CASE("One lost message of each kind: an error in time, on every rank", "[timeouts]")
+{
+    enum : std::uint32_t { AllDeclared = 1, FrameVerdict = 2 };
+    struct Loss {
+        const char* name;
+        MessageKind kind;
+        std::uint32_t scope;
+        const char* says;     // part of the error
+        bool verdictSurvives; // all ranks get the same FrameError, and the next frame is right
+    };
+    const std::vector<Loss> losses{
+        {"input", MessageKind::Fragment, 0, "of rank", true},
+        {"manifest", MessageKind::Manifest, 0, "declared", true},
+        {"answer to a manifest", MessageKind::ManifestAck, 0, "declared", true},
+        {"finished tiles", MessageKind::FinishedTiles, 0, "finished tiles have not come from rank", true},
+        {"count of finished tiles", MessageKind::TilesDone, 0, "finished tiles have not come from rank", true},
+        {"all have declared, up", MessageKind::ReduceUp, AllDeclared, "from rank", true},
+        {"all have declared, down", MessageKind::ReduceDown, AllDeclared, "from rank", true},
+        {"vote", MessageKind::ReduceUp, FrameVerdict, "no verdict", false},
+        {"verdict", MessageKind::ReduceDown, FrameVerdict, "no verdict", false}};
+    for (const Loss& loss : losses)
+        for (const int ranks : {2, 5})
+            for (int nth = 0; nth < (ranks == 2 ? 1 : 3); ++nth) { // not always the first of its kind
+                const auto board = std::make_shared<Board>();
+                std::atomic<int> seen{0};
+                std::atomic<bool> armed{false}, lost{false};
+                board->loses = [&](int, int, const MessageHeader& header, const dfb::Buffer& message) {
+                    const bool isReduction =
+                        header.kind == MessageKind::ReduceUp || header.kind == MessageKind::ReduceDown;
+                    if (!armed || header.kind != loss.kind || header.number != 1
+                        || (isReduction
+                            && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) != loss.scope)
+                        || seen++ != nth)
+                        return false;
+                    lost = true;
+                    return true;
+                };
+                std::vector<Ending> endings(static_cast<std::size_t>(ranks));
+                std::vector<std::string> after(endings.size());
+                std::size_t wrong = 0;
+                runOn(board, ranks, [&](const auto& communicator) {
+                    const Scene s = scene::makeScene(6, 9);
+                    FrameBuffer fb(communicator, configOf(s));
+                    const auto rank = static_cast<std::size_t>(fb.rank());
+                    fb.allReduce({1}, FrameBuffer::Reduce::Sum);
+                    armed = true;
+                    {
+                        auto frame = fb.begin(timed(true));
+                        std::vector<dfb::TileInput> inputs; // one of each rank for each tile
+                        for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+                            inputs.push_back({tile, static_cast<std::uint32_t>(rank), 0});
+                        frame.declare(inputs);
+                        for (const dfb::TileInput& input : inputs)
+                            send(frame, input.tile, 1, input.source, 0, 0);
+                        endings[rank] = endingOf(frame);
+                    }
+                    after[rank] = outcomeOf([&] {
+                        const auto report = scene::renderLoop(fb, s, Loop::Declared);
+                        if (fb.isDisplayRank())
+                            wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+                    });
+                });
+                const auto texts = textsOf(endings);
+                INFO(loss.name << " " << nth << ", " << ranks << " ranks" << joined(texts) << "\n after it"
+                               << joined(after));
+                CHECK(lost);
+                CHECK(wrong == 0);
+                bool said = false;
+                for (std::size_t rank = 0; rank < endings.size(); ++rank) {
+                    const Ending& e = endings[rank];
+                    CHECK(e.ms < 2 * limitMs + marginMs);
+                    said = said || has(e.text, loss.says);
+                    if (loss.verdictSurvives) {
+                        CHECK(e.isFrameError);
+                        CHECK((e.error && e.error->kind == dfb::ErrorKind::TimedOut));
+                        CHECK(after[rank] == "fine");
+                    } else {
+                        // Who has the verdict is fine, who has not can only give up; then nobody can go on.
+                        CHECK((e.text == "fine" || (e.error && e.error->kind == dfb::ErrorKind::Transport)));
+                        CHECK(has(after[rank], "TransportError"));
+                    }
+                }
+                CHECK(said);
+                if (loss.verdictSurvives)
+                    CHECK(allSame(texts));
+            }
+}
+
+TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, and the next frame is right",
+          "[timeouts]")
+{
+    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, LossyTransport>;
+    for (const auto kind : {MessageKind::Credit, MessageKind::CreditRequest}) {
+        // All of a kind that rank 1 gets or sends: of credit the next would make good for one that is lost. With 9
+        // ranks a sender's own part of the pool is less than a message.
+        const int ranks = kind == MessageKind::Credit ? 2 : 9;
+        const auto board = std::make_shared<Board>();
+        std::atomic<bool> lost{false};
+        board->loses = [&](int from, int to, const MessageHeader& header, const dfb::Buffer&) {
+            const bool loses =
+                header.kind == kind && header.number == 1 && (kind == MessageKind::Credit ? to == 1 : from == 1);
+            lost = lost || loses;
+            return loses;
+        };
+        std::vector<Ending> endings(static_cast<std::size_t>(ranks));
+        std::size_t wrong = 1;
+        const Scene s = scene::makeScene(4, 2, 320, 320);
+        runOn(board, ranks, [&](const auto& communicator) {
+            auto config = configOf(s);
+            config.messagePoolBytes = 0; // 1 MiB
+            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            Large fb(communicator, config);
+            {
+                auto frame = fb.begin(timed(true));
+                std::vector<dfb::TileInput> inputs;
+                for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+                    for (std::uint16_t part = 0; part < 2; ++part)
+                        if (fb.rank() == 1)
+                            inputs.push_back({tile, 1, part});
+                frame.declare(inputs);
+                const auto tile = std::make_unique<Large::Tile>();
+                for (const dfb::TileInput& input : inputs) { // 4 MB
+                    frame.start(*tile, input.tile);
+                    for (int i = 0; i < 4 * 64 * 64; ++i)
+                        tile->color[i] = static_cast<float>(i % 7 + 1);
+                    tile->generation = 1;
+                    tile->part = input.part;
+                    frame.setTile(*tile);
+                }
+                endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
+            }
+            const auto report = scene::renderLoop(fb, s, Loop::Declared);
+            if (fb.isDisplayRank())
+                wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+        });
+        INFO((kind == MessageKind::Credit ? "credit" : "requests") << joined(textsOf(endings)));
+        CHECK(lost);
+        CHECK(allSame(textsOf(endings)));
+        CHECK((endings[0].error && endings[0].error->kind == dfb::ErrorKind::TimedOut));
+        CHECK(has(endings[0].text, "of rank 1"));
+        CHECK(wrong == 0);
+    }
+}
+
+TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()", "[timeouts]")
+{
+    const auto board = std::make_shared<Board>();
+    board->loses = [](int, int, const MessageHeader& header, const dfb::Buffer&) {
+        return header.kind == MessageKind::Credit && header.number == 1;
+    };
+    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, LossyTransport>;
+    std::vector<std::string> texts(2);
+    runOn(
+        board, 2,
+        [&](const auto& communicator) {
+            auto config = configOf(scene::makeScene(0, 1, 640, 640));
+            config.messagePoolBytes = 0; // 1 MiB
+            Large fb(communicator, config);
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+                auto frame = fb.begin(timed(false));
+                const auto tile = std::make_unique<Large::Tile>();
+                for (int index = 0; index < fb.layout().tileCount(); ++index) {
+                    frame.start(*tile, index);
+                    for (int i = 0; i < 4 * 64 * 64; ++i)
+                        tile->color[i] = static_cast<float>(i % 7 + 1);
+                    tile->generation = 1;
+                    frame.setTile(*tile);
+                }
+                frame.end();
+            });
+        },
+        std::nullopt, std::chrono::seconds(4));
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK((has(text, "timed out") || (has(text, "TransportError") && !has(text, "time limit"))));
+}
+
+TEST_CASE("Time-outs in frames of one framebuffer leave the other on the same messenger alone", "[timeouts]")
+{
+    const Scene s = scene::makeScene(5, 4);
+    std::vector<std::string> texts(3);
+    std::size_t wrong = 2;
+    runOn(std::make_shared<Board>(), 3, [&](const LossyTransport::Communicator& communicator) {
+        const auto messenger = std::make_shared<dfb::Messenger<LossyTransport>>(communicator);
+        FrameBuffer a(messenger, configOf(s)), b(messenger, configOf(s));
+        {
+            auto frameB = b.begin(scene::paramsOf(s));
+            {
+                auto frameA = a.begin(timed(false));
+                texts[static_cast<std::size_t>(a.rank())] = endingOf(frameA).text;
+            }
+            for (int index : b.ownedTiles())
+                send(frameB, index, 0, 0, 0, 0);
+            frameB.end();
+        }
+        for (FrameBuffer* fb : {&a, &b}) {
+            const auto report = scene::renderLoop(*fb, s, Loop::Listing3);
+            if (fb->isDisplayRank())
+                wrong -= scene::wrongValues(Picture(fb->image(), report), scene::referenceOf(s)) == 0;
+        }
+    });
+    INFO(joined(texts));
+    CHECK((allSame(texts) && has(texts[0], "FrameError: dfb: timed out")));
+    CHECK(wrong == 0);
+}
+
+TEST_CASE("Progress by the caller: an absent rank that does not poll is a TransportError after twice the time",
+          "[timeouts]")
+{
+    std::promise<void> otherDone;
+    std::vector<Ending> endings(2);
+    runOn(
+        std::make_shared<Board>(), 2,
+        [&](const auto& communicator) {
+            auto config = smallConfig();
+            config.progress = dfb::Progress::Caller;
+            FrameBuffer fb(communicator, config);
+            auto frame = fb.begin(timed(true));
+            frame.declare({});
+            if (fb.rank() == 1)
+                otherDone.get_future().wait_for(std::chrono::seconds(20));
+            endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
+            if (fb.rank() == 0)
+                otherDone.set_value();
+        },
+        1);
+    INFO(joined(textsOf(endings)));
+    for (const Ending& e : endings) {
+        REQUIRE(e.error);
+        CHECK(e.error->kind == dfb::ErrorKind::Transport);
+    }
+    CHECK(endings[0].ms >= 2 * limitMs);
+    CHECK(endings[0].ms < 2 * limitMs + marginMs);
+}

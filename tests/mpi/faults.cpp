@@ -1,0 +1,62 @@
+// Frames over MPI with a transport that reorders, delays, repeats, loses and damages messages.
+#include "../inproc/fault_frames.hpp"
+#include "catch.hpp"
+#include "ranks.hpp"
+
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace {
+
+// Every rank's texts, without waiting inside MPI.
+std::vector<std::string> gathered(const std::string& mine)
+{
+    constexpr int length = 1024;
+    std::vector<char> all(static_cast<std::size_t>(sizeOf(MPI_COMM_WORLD)) * length), own(length);
+    mine.copy(own.data(), length - 1);
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallgather(own.data(), length, MPI_CHAR, all.data(), length, MPI_CHAR, MPI_COMM_WORLD, &request);
+    for (int done = 0; MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done;)
+        std::this_thread::sleep_for(std::chrono::microseconds(200));
+    std::vector<std::string> texts;
+    for (std::size_t i = 0; i < all.size(); i += length)
+        texts.emplace_back(&all[i]);
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("Disturbed frames over MPI end in the right image or in an error of dfb", "[faults]")
+{
+    int frames = 0, right = 0;
+    // A communicator that is not shut down in order is not freed, and there may be a thousand or two of them.
+    for (std::uint64_t seed = 500; seed < 530; ++seed) {
+        const scene::FaultGroup group = scene::faultGroup(seed);
+        const auto expected = scene::referenceOf(group.scene);
+        constexpr int most = 6;
+        const auto mine = scene::faultFrames<dfb::MpiTransport>(MPI_COMM_WORLD, group, expected, most);
+        for (std::size_t frame = 0; frame < most; ++frame) {
+            const bool ran = frame < mine.size();
+            const std::string text = !ran ? "not run" : mine[frame].wrong > 0 ? "wrong" : mine[frame].text;
+            std::vector<scene::FaultEnding> ranks;
+            bool allRight = true;
+            for (const std::string& ending : gathered(text)) {
+                allRight = allRight && ending == "fine";
+                if (ending != "not run")
+                    ranks.push_back({ending, ending == "wrong" ? std::size_t{1} : 0});
+            }
+            if (ranks.empty())
+                break;
+            INFO("seed " << seed << ", frame " << frame + 1);
+            CHECK(scene::verdictOn(ranks, group.harmless) == "");
+            ++frames;
+            right += allRight;
+        }
+    }
+    INFO(right << " of " << frames << " right");
+    CHECK(10 * right >= 3 * frames);
+}

@@ -1,0 +1,514 @@
+// Credit, several framebuffers, repeated and damaged messages, time-outs and progress by the caller, over MPI. Any
+// number of ranks; every frame that could hang has a time-out.
+#include "../inproc/scene.hpp"
+#include "catch.hpp"
+#include "ranks.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <mutex>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using scene::has;
+using scene::Loop;
+using scene::outcomeOf;
+using scene::Picture;
+using scene::Scene;
+
+constexpr int longMs = 30000; // no frame takes so long
+
+// MPI, with messages lost, repeated or changed on the sending side.
+class TamperingTransport {
+public:
+    enum class What { Pass, Lose, Twice };
+    using Tamper = std::function<What(int to, const MessageHeader&, dfb::Buffer&)>; // from any thread
+    struct Communicator {
+        MPI_Comm communicator;
+        Tamper tamper;
+    };
+    [[maybe_unused]] static constexpr const char* name = "tampering";
+
+    TamperingTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
+        : tamper_(c.tamper), inner_(c.communicator, std::move(pool), progress)
+    {
+    }
+    int rank() const { return inner_.rank(); }
+    int size() const { return inner_.size(); }
+    bool needsPolling() const { return inner_.needsPolling(); }
+    bool mayPoll() const { return inner_.mayPoll(); }
+    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
+    bool quiet() const { return inner_.quiet(); }
+    bool poll() { return inner_.poll(); }
+    void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
+    void interrupt() { inner_.interrupt(); }
+    void start(dfb::TransportHandler& handler) { inner_.start(handler); }
+    void stop(bool orderly) { inner_.stop(orderly); }
+    void send(int to, dfb::Buffer&& message)
+    {
+        const What what =
+            tamper_ ? tamper_(to, dfb::detail::loadAs<MessageHeader>(message.data()), message) : What::Pass;
+        if (what == What::Lose) {
+            const dfb::Buffer lost = std::move(message);
+            return;
+        }
+        if (what == What::Twice) {
+            dfb::Buffer copy = copies_->acquire(message.size());
+            std::memcpy(copy.data(), message.data(), message.size());
+            inner_.send(to, std::move(copy));
+        }
+        inner_.send(to, std::move(message));
+    }
+
+private:
+    Tamper tamper_;
+    std::shared_ptr<dfb::MemoryPool> copies_ = dfb::MemoryPool::create();
+    dfb::MpiTransport inner_;
+};
+
+// Colours are added up as inputs come, and none is kept: small whole numbers, so that any order gives the same.
+class Adder {
+public:
+    static constexpr int tileSize = 32;
+    static constexpr dfb::ChannelMask channels = dfb::colorChannel;
+
+    void newFrame(const dfb::TileInfo& info)
+    {
+        region_ = info.region;
+        sum_.assign(static_cast<std::size_t>(4 * region_.width() * region_.height()), 0.0);
+    }
+    void add(dfb::Fragment&& fragment)
+    {
+        dfb::FragmentCursor cursor(fragment);
+        for (int y = 0; y < region_.height(); ++y) {
+            const dfb::FragmentRow row = cursor.next();
+            const float* color = row.color;
+            for (int s = 0; s < row.spanCount; ++s) {
+                double* to = sum_.data() + 4 * (y * region_.width() + row.spans[s].x);
+                for (int i = 0; i < 4 * row.spans[s].count; ++i)
+                    to[i] += static_cast<double>(*color++);
+            }
+        }
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        for (int y = 0; y < region_.height(); ++y)
+            out.setRow(y, sum_.data() + 4 * y * region_.width(), nullptr);
+    }
+
+private:
+    dfb::Region region_;
+    std::vector<double> sum_;
+};
+static_assert(dfb::is_tile_op_v<Adder>);
+
+using AddingFrameBuffer = dfb::DistributedFrameBuffer<Adder>;
+using Blend = dfb::BasicAlphaBlend<16>;
+template <class TileOp>
+using TamperedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, TamperingTransport>;
+
+int valueOf(int rank, int part, int x, int y, int channel)
+{
+    return 1 + (rank * 7 + part * 11 + x * 3 + y * 5 + channel) % 64;
+}
+
+// Number of values that are not the sum of all inputs.
+std::size_t wrongSums(const dfb::Image& image, int ranks, int parts)
+{
+    const Picture p(image, {});
+    std::size_t wrong = image.empty(), i = 0;
+    for (int y = 0; y < image.height(); ++y)
+        for (int x = 0; x < image.width(); ++x)
+            for (int c = 0; c < 4; ++c) {
+                int sum = 0;
+                for (int rank = 0; rank < ranks; ++rank)
+                    for (int part = 0; part < parts; ++part)
+                        sum += valueOf(rank, part, x, y, c);
+                wrong += p.value(i++) != static_cast<float>(sum);
+            }
+    return wrong;
+}
+
+dfb::FrameBufferConfig floodConfig(int pixels, std::shared_ptr<dfb::Executor> executor)
+{
+    dfb::FrameBufferConfig config;
+    config.width = config.height = pixels;
+    config.format = dfb::OutputFormat::RGBA32F;
+    config.messagePoolBytes = 0; // the smallest
+    config.executor = std::move(executor);
+    return config;
+}
+
+enum class From { Loop, Thread };
+
+// One frame in which every rank sends `parts` inputs for every tile.
+template <class Fb>
+dfb::FrameReport floodFrame(Fb& fb, int parts, From from)
+{
+    dfb::FrameParams params;
+    params.declared = true;
+    params.timeoutMs = longMs;
+    auto frame = fb.begin(params);
+    std::vector<dfb::TileInput> inputs;
+    for (int part = 0; part < parts; ++part)
+        for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+            inputs.push_back({tile, static_cast<std::uint32_t>(fb.rank()), static_cast<std::uint16_t>(part)});
+    frame.declare(inputs);
+    const auto sendOne = [&](std::size_t i) {
+        const auto tile = std::make_unique<typename Fb::Tile>();
+        frame.start(*tile, inputs[i].tile);
+        tile->generation = 1;
+        tile->part = inputs[i].part;
+        for (int y = 0; y < tile->region.height(); ++y)
+            for (int x = 0; x < tile->region.width(); ++x)
+                for (int c = 0; c < 4; ++c)
+                    tile->pixel(x, y)[c] = static_cast<float>(
+                        valueOf(fb.rank(), inputs[i].part, tile->region.x0 + x, tile->region.y0 + y, c));
+        frame.setTile(*tile);
+    };
+    if (from == From::Loop)
+        fb.executor().parallelFor(inputs.size(), sendOne);
+    else
+        for (std::size_t i = 0; i < inputs.size(); ++i)
+            sendOne(i);
+    return frame.end();
+}
+
+struct NamedExecutor {
+    std::string name;
+    std::shared_ptr<dfb::Executor> executor;
+};
+
+std::vector<NamedExecutor> executors()
+{
+    std::vector<NamedExecutor> all;
+    for (const int workers : {1, 2}) {
+        all.push_back({std::to_string(workers) + " workers", std::make_shared<dfb::ThreadExecutor>(workers)});
+#if defined(DFB_HAS_TBB)
+        all.push_back({std::to_string(workers) + " workers of oneTBB", std::make_shared<dfb::TbbExecutor>(workers)});
+#endif
+    }
+    return all;
+}
+
+dfb::FrameBufferConfig configOf(const Scene& s)
+{
+    dfb::FrameBufferConfig config;
+    config.width = s.width;
+    config.height = s.height;
+    config.format = dfb::OutputFormat::RGBA32F;
+    config.depth = true;
+    config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+    return config;
+}
+
+Scene sceneFor(int bricks, std::uint64_t seed)
+{
+    Scene s = scene::makeScene(bricks, seed);
+    s.timeoutMs = longMs;
+    return s;
+}
+
+// A good frame; whether its image was right.
+template <class Fb>
+bool goodFrame(Fb& fb, const Scene& s, Loop loop = Loop::Declared)
+{
+    const auto report = scene::renderLoop(fb, s, loop);
+    return !fb.isDisplayRank() || scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0;
+}
+
+bool sameEverywhere(const std::string& text)
+{
+    std::vector<char> first(4000);
+    std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
+    MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
+    return text.compare(0, first.size() - 1, first.data()) == 0;
+}
+
+} // namespace
+
+TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
+{
+    const int ranks = sizeOf(MPI_COMM_WORLD), parts = 2;
+    for (const NamedExecutor& e : executors())
+        for (const From from : {From::Loop, From::Thread}) {
+            auto config = floodConfig(256, e.executor);
+            config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
+            config.displayRank = ranks - 1;
+            AddingFrameBuffer fb(MPI_COMM_WORLD, config);
+            dfb::FrameReport report;
+            for (int i = 0; i < 2; ++i) {
+                report = floodFrame(fb, parts, from);
+                if (fb.isDisplayRank())
+                    CHECK(wrongSums(fb.image(), ranks, parts) == 0);
+                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messagePoolBytes));
+                CHECK((report.peakInboxBytes > 0) == (ranks > 1));
+            }
+            // A rank's memory: a pool in its inbox and on the way to it, a pool under way to others and one message
+            // more for each thread that sets tiles, what is just being added up; the manifests and small messages; the
+            // image. Blocks are up to 1.5 times as large as what is in them.
+            const std::size_t message = dfb::detail::fragmentPrefix + 16 * 32 * 32;
+            const auto threads = static_cast<std::size_t>(fb.executor().concurrency()) + 1;
+            const std::size_t limit =
+                (2 * fb.config().messagePoolBytes + 2 * threads * message + 256 * 256 * 16) * 3 / 2
+                + 256 * static_cast<std::size_t>(report.messagesSent) + static_cast<std::size_t>(ranks) * 8192;
+            INFO(e.name << ": " << report.peakMemoryBytes << " bytes, limit " << limit);
+            CHECK(report.peakMemoryBytes <= static_cast<std::int64_t>(limit));
+        }
+}
+
+TEST_CASE("Everybody floods everybody, and the display rank is flooded by finished tiles", "[messaging]")
+{
+    const int ranks = sizeOf(MPI_COMM_WORLD);
+    for (const NamedExecutor& e : executors())
+        for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd})
+            for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
+                auto config = floodConfig(384, e.executor); // 2.4 MB of finished tiles
+                config.gather = gather;
+                config.progress = progress;
+                AddingFrameBuffer fb(MPI_COMM_WORLD, config);
+                const auto report = floodFrame(fb, 2, From::Loop);
+                INFO(e.name);
+                if (fb.isDisplayRank())
+                    CHECK(wrongSums(fb.image(), ranks, 2) == 0);
+                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messagePoolBytes));
+            }
+}
+
+TEST_CASE("Gathering at the end gives the same image bit for bit", "[messaging]")
+{
+    const Scene s = sceneFor(7, 3);
+    std::vector<std::uint64_t> hashes;
+    for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd}) {
+        auto config = configOf(s);
+        config.gather = gather;
+        dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config);
+        for (int i = 0; i < 2; ++i) {
+            const auto report = scene::renderLoop(fb, s, Loop::Declared);
+            hashes.push_back(fb.isDisplayRank() ? Picture(fb.image(), report).hash() : 0);
+        }
+    }
+    CHECK(std::count(hashes.begin(), hashes.end(), hashes.front()) == 4);
+}
+
+TEST_CASE("Two framebuffers on one messenger, and one with its own, with frames open at once", "[messaging]")
+{
+    const Scene s = sceneFor(6, 4), t = sceneFor(5, 5);
+    const auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(MPI_COMM_WORLD);
+    using Fb = dfb::DistributedFrameBuffer<Blend>;
+    auto a = std::make_unique<Fb>(messenger, configOf(s));
+    auto b = std::make_unique<dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<32>>>(messenger, configOf(t));
+    auto c = std::make_unique<Fb>(MPI_COMM_WORLD, configOf(s));
+    for (int i = 0; i < 3; ++i) {
+        auto frame = a->begin(scene::paramsOf(s));
+        const auto tile = std::make_unique<Fb::Tile>();
+        for (int index : a->ownedTiles()) {
+            frame.start(*tile, index);
+            tile->children = 6;
+            frame.setTile(*tile);
+        }
+        CHECK(goodFrame(*b, t));
+        {
+            auto broken = c->begin(scene::paramsOf(s));
+            if (c->rank() == c->size() - 1)
+                broken.abort(std::make_exception_ptr(std::runtime_error("C broke")));
+            const std::string text = outcomeOf([&] { broken.end(); });
+            CHECK(has(text, "C broke"));
+        }
+        for (const dfb::Brick& brick : scene::bricksOf(s, a->rank(), a->size()))
+            for (int index = 0; index < a->layout().tileCount(); ++index) {
+                frame.start(*tile, index);
+                tile->generation = 1;
+                tile->source = brick.id;
+                scene::renderBrick(s, brick, *tile);
+                frame.setTile(*tile);
+            }
+        const auto report = frame.end();
+        if (a->isDisplayRank())
+            CHECK(scene::wrongValues(Picture(a->image(), report), scene::referenceOf(s)) == 0);
+        CHECK(goodFrame(*c, s, Loop::Listing3));
+    }
+    if (a->rank() % 2 == 0)
+        a.reset(), b.reset();
+    else
+        b.reset(), a.reset();
+}
+
+TEST_CASE("Messages that come twice are dropped and counted", "[messaging]")
+{
+    const Scene s = sceneFor(6, 6);
+    const auto twice = [](int, const MessageHeader&, dfb::Buffer&) { return TamperingTransport::What::Twice; };
+    TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, twice}, configOf(s));
+    for (int i = 0; i < 3; ++i) {
+        const auto report = scene::renderLoop(fb, s, i == 1 ? Loop::Declared : Loop::Listing3);
+        CHECK((report.repeatedMessages > 0) == (fb.size() > 1));
+        CHECK(report.lateMessages == 0);
+        if (fb.isDisplayRank())
+            CHECK(scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0);
+    }
+}
+
+TEST_CASE("With checksums a changed byte is an error on every rank, and the next frame is right", "[messaging]")
+{
+    const Scene s = sceneFor(6, 7);
+    for (const auto kind : {MessageKind::Fragment, MessageKind::Manifest, MessageKind::TilesDone})
+        for (const int place : {9, 25, 70}) {
+            std::atomic<bool> done{false};
+            const auto damage = [&](int, const MessageHeader& header, dfb::Buffer& message) {
+                // One message of rank 1, in the second frame: in the first, its receiver may still be in the
+                // constructor.
+                if (header.kind == kind && header.number == 2 && rankIn(MPI_COMM_WORLD) == 1 && !done.exchange(true))
+                    message.data()[std::min<std::size_t>(static_cast<std::size_t>(place), message.size() - 1)] ^=
+                        std::byte{64};
+                return TamperingTransport::What::Pass;
+            };
+            auto config = configOf(s);
+            config.checksums = true;
+            TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, damage}, config);
+            CHECK(goodFrame(fb, s));
+            bool right = true;
+            const std::string text = outcomeOf([&] {
+                Scene mine = s;
+                mine.timeoutMs = 500;
+                right = goodFrame(fb, mine);
+            });
+            const bool same = sameEverywhere(text);
+            INFO(static_cast<int>(kind) << ", byte " << place << ": " << text);
+            CHECK(right);
+            CHECK(same);
+            if (fb.size() > 1)
+                CHECK((has(text, "FrameError: dfb: malformed message") || has(text, "FrameError: dfb: timed out")));
+            else
+                CHECK(text == "fine");
+            CHECK(goodFrame(fb, s));
+        }
+}
+
+TEST_CASE("What is missing when the time is up is named on every rank, and the next frame is right", "[messaging]")
+{
+    const Scene s = sceneFor(6, 8);
+    dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s));
+    const int last = fb.size() - 1;
+    dfb::FrameParams params;
+    params.timeoutMs = 200;
+    for (const bool declared : {true, false}) {
+        params.declared = declared;
+        const std::string text = outcomeOf([&] {
+            auto frame = fb.begin(params);
+            const auto tile = std::make_unique<decltype(fb)::Tile>();
+            if (declared)
+                frame.declare(fb.rank() == last ? std::vector<dfb::TileInput>{{5, 77, 3}}
+                                                : std::vector<dfb::TileInput>());
+            else
+                for (int index : fb.ownedTiles()) {
+                    frame.start(*tile, index);
+                    tile->children = index == 5 ? 2 : 0;
+                    frame.setTile(*tile);
+                }
+            frame.end();
+        });
+        const bool same = sameEverywhere(text);
+        INFO(text);
+        CHECK(same);
+        CHECK(has(text, "FrameError: dfb: timed out: rank " + std::to_string(fb.tileOwner(5))));
+        CHECK(has(text, "tile 5"));
+        CHECK(has(text, "generation 1"));
+        CHECK(has(text, declared ? "expected 1, got 0" : "expected 2, got 0"));
+        if (declared)
+            CHECK(has(text, "missing source 77 part 3 of rank " + std::to_string(last)));
+        CHECK(goodFrame(fb, s));
+    }
+}
+
+TEST_CASE("A lost message is an error in time on every rank", "[messaging]")
+{
+    const Scene s = sceneFor(6, 9);
+    for (const auto kind : {MessageKind::Fragment, MessageKind::ManifestAck, MessageKind::TilesDone}) {
+        std::atomic<bool> done{false};
+        const auto lose = [&](int, const MessageHeader& header, dfb::Buffer&) {
+            return header.kind == kind && header.number == 1 && !done.exchange(true) ? TamperingTransport::What::Lose
+                                                                                     : TamperingTransport::What::Pass;
+        };
+        TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, lose}, configOf(s));
+        const std::string text = outcomeOf([&] {
+            Scene mine = s;
+            mine.timeoutMs = 200;
+            goodFrame(fb, mine);
+        });
+        const bool same = sameEverywhere(text);
+        INFO(text);
+        CHECK(same);
+        CHECK((fb.size() > 1 ? has(text, "FrameError: dfb: timed out") : text == "fine"));
+        CHECK(goodFrame(fb, s));
+    }
+}
+
+TEST_CASE("With progress by the caller messages move in poll(), and not without it", "[messaging]")
+{
+    const Scene s = sceneFor(6, 10);
+    auto config = configOf(s);
+    config.progress = dfb::Progress::Caller;
+    const int size = sizeOf(MPI_COMM_WORLD), rank = rankIn(MPI_COMM_WORLD);
+    config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+    static std::atomic<int> inputs;
+    inputs = 0;
+    struct Counter : dfb::BasicAlphaBlend<16> {
+        void add(dfb::Fragment&& fragment)
+        {
+            BasicAlphaBlend::add(std::move(fragment));
+            ++inputs;
+        }
+    };
+    dfb::DistributedFrameBuffer<Counter> fb(MPI_COMM_WORLD, config);
+    {
+        auto frame = fb.begin(scene::paramsOf(s));
+        const auto tile = std::make_unique<decltype(fb)::Tile>();
+        if (rank > 0)
+            for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))
+                for (int index = 0; index < 28; ++index) {
+                    frame.start(*tile, index);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    scene::renderBrick(s, brick, *tile);
+                    frame.setTile(*tile);
+                }
+        if (rank == 0) {
+            CHECK(inputs == 0); // it has not polled
+            int expected = 0;
+            for (int other = 1; other < size; ++other)
+                expected += 28 * static_cast<int>(scene::bricksOf(s, other, size).size());
+            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+            while (inputs < expected && std::chrono::steady_clock::now() < limit)
+                fb.poll();
+            CHECK(inputs == expected);
+            for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))
+                for (int index = 0; index < 28; ++index) {
+                    frame.start(*tile, index);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    scene::renderBrick(s, brick, *tile);
+                    frame.setTile(*tile);
+                }
+            for (int index : fb.ownedTiles()) {
+                frame.start(*tile, index);
+                tile->children = 6;
+                frame.setTile(*tile);
+            }
+        }
+        const auto report = frame.end();
+        if (fb.isDisplayRank())
+            CHECK(scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0);
+    }
+    CHECK(goodFrame(fb, s));
+}
