@@ -1,0 +1,360 @@
+// What the benchmarks compare with, MPI called plainly, and what they measure and report with.
+#pragma once
+
+#include <mpi.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <condition_variable>
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <ctime>
+#include <mutex>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+#include <sched.h>
+#include <sys/resource.h>
+#if defined(__linux__)
+#include <sys/prctl.h>
+#endif
+
+namespace bench {
+
+// ---- time
+
+using Clock = std::chrono::steady_clock;
+
+// On Linux the same for all processes of a node.
+inline double now() { return std::chrono::duration<double>(Clock::now().time_since_epoch()).count(); }
+
+inline double cpuSeconds(clockid_t clock)
+{
+    timespec t{};
+    clock_gettime(clock, &t);
+    return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
+}
+inline double processCpuSeconds() { return cpuSeconds(CLOCK_PROCESS_CPUTIME_ID); }
+inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
+
+// How often threads of this process have gone to sleep.
+inline double sleeps()
+{
+    rusage usage{};
+    getrusage(RUSAGE_SELF, &usage);
+    return static_cast<double>(usage.ru_nvcsw);
+}
+
+// Naps of this thread, and of threads that it starts, last what they should and not 50 us more.
+inline void shortenNaps()
+{
+#if defined(__linux__)
+    prctl(PR_SET_TIMERSLACK, 1000, 0, 0, 0);
+#endif
+}
+
+class Signal {
+public:
+    void set()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        set_ = true;
+        changed_.notify_all();
+    }
+    void wait()
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        changed_.wait(lock, [this] { return set_; });
+        set_ = false;
+    }
+    bool isSet()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return set_;
+    }
+
+private:
+    std::mutex mutex_;
+    std::condition_variable changed_;
+    bool set_ = false;
+};
+
+// ---- plain MPI
+
+// How a thread waits for MPI: inside MPI; testing, and giving up its time slice in between; or testing for 5 us and
+// then every 50 us.
+enum class Waiting { Blocking, Yield, Nap };
+
+inline const char* nameOf(Waiting waiting)
+{
+    return waiting == Waiting::Blocking ? "MPI blocking"
+           : waiting == Waiting::Yield  ? "MPI test+yield"
+                                        : "MPI test+nap";
+}
+
+// What to do between tests.
+class Idler {
+public:
+    explicit Idler(Waiting waiting) : waiting_(waiting) {}
+    void idle()
+    {
+        if (waiting_ == Waiting::Yield)
+            sched_yield();
+        else if (Clock::now() - since_ > std::chrono::microseconds(5))
+            std::this_thread::sleep_for(std::chrono::microseconds(50));
+    }
+    void busy() { since_ = Clock::now(); }
+
+private:
+    Waiting waiting_;
+    Clock::time_point since_ = Clock::now();
+};
+
+inline void complete(MPI_Request& request, Waiting waiting)
+{
+    if (waiting == Waiting::Blocking) {
+        MPI_Wait(&request, MPI_STATUS_IGNORE);
+        return;
+    }
+    int done = 0;
+    Idler idler(waiting);
+    while (MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done)
+        idler.idle();
+}
+
+inline void plainSend(const std::byte* data, std::size_t byteCount, int to, int tag, MPI_Comm comm, Waiting waiting)
+{
+    if (waiting == Waiting::Blocking) {
+        MPI_Send(data, static_cast<int>(byteCount), MPI_BYTE, to, tag, comm);
+        return;
+    }
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Isend(data, static_cast<int>(byteCount), MPI_BYTE, to, tag, comm, &request);
+    complete(request, waiting);
+}
+
+inline void plainReceive(std::byte* data, std::size_t byteCount, int from, int tag, MPI_Comm comm, Waiting waiting)
+{
+    if (waiting == Waiting::Blocking) {
+        MPI_Recv(data, static_cast<int>(byteCount), MPI_BYTE, from, tag, comm, MPI_STATUS_IGNORE);
+        return;
+    }
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Irecv(data, static_cast<int>(byteCount), MPI_BYTE, from, tag, comm, &request);
+    complete(request, waiting);
+}
+
+// Indices of some requests that have completed, one at least.
+inline std::vector<int> someOf(std::vector<MPI_Request>& requests, Waiting waiting)
+{
+    std::vector<int> indices(requests.size());
+    int count = 0;
+    const auto size = static_cast<int>(requests.size());
+    Idler idler(waiting);
+    for (;;) {
+        if (waiting == Waiting::Blocking)
+            MPI_Waitsome(size, requests.data(), &count, indices.data(), MPI_STATUSES_IGNORE);
+        else
+            MPI_Testsome(size, requests.data(), &count, indices.data(), MPI_STATUSES_IGNORE);
+        if (count != 0)
+            break;
+        idler.idle();
+    }
+    indices.resize(count == MPI_UNDEFINED ? 0 : static_cast<std::size_t>(count));
+    return indices;
+}
+
+// ---- what ranks do between measurements: never a blocking call, which would take the cores from those that measure
+
+inline void napThrough(MPI_Request& request)
+{
+    int done = 0;
+    std::chrono::microseconds nap{20};
+    while (MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done) {
+        std::this_thread::sleep_for(nap);
+        nap = std::min(nap * 5 / 4, std::chrono::microseconds(1000));
+    }
+}
+
+inline void meet(MPI_Comm comm)
+{
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Ibarrier(comm, &request);
+    napThrough(request);
+}
+
+// What rank 0 says.
+inline double agree(MPI_Comm comm, double value)
+{
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Ibcast(&value, 1, MPI_DOUBLE, 0, comm, &request);
+    napThrough(request);
+    return value;
+}
+
+inline double reduce(MPI_Comm comm, double value, MPI_Op operation)
+{
+    double result = 0;
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallreduce(&value, &result, 1, MPI_DOUBLE, operation, comm, &request);
+    napThrough(request);
+    return result;
+}
+
+// On rank 0: the samples of all ranks, one after the other.
+inline std::vector<double> collect(MPI_Comm comm, const std::vector<double>& samples)
+{
+    int rank = 0, size = 1;
+    MPI_Comm_rank(comm, &rank);
+    MPI_Comm_size(comm, &size);
+    const auto count = static_cast<int>(samples.size());
+    std::vector<int> counts(static_cast<std::size_t>(size)), places(static_cast<std::size_t>(size));
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Igather(&count, 1, MPI_INT, counts.data(), 1, MPI_INT, 0, comm, &request);
+    napThrough(request);
+    int total = 0;
+    for (std::size_t r = 0; r < counts.size(); ++r) {
+        places[r] = total;
+        total += counts[r];
+    }
+    std::vector<double> all(rank == 0 ? static_cast<std::size_t>(total) : 0);
+    MPI_Igatherv(samples.data(), count, MPI_DOUBLE, all.data(), counts.data(), places.data(), MPI_DOUBLE, 0, comm,
+                 &request);
+    napThrough(request);
+    return all;
+}
+
+// ---- figures and tables
+
+// The median absolute deviation says how far from the median half of the samples are at most.
+struct Figure {
+    double median = 0, deviation = 0;
+    std::size_t count = 0;
+};
+
+inline double medianOf(std::vector<double>& samples)
+{
+    if (samples.empty())
+        return 0;
+    const auto middle = samples.begin() + static_cast<std::ptrdiff_t>(samples.size() / 2);
+    std::nth_element(samples.begin(), middle, samples.end());
+    if (samples.size() % 2 == 1)
+        return *middle;
+    return (*middle + *std::max_element(samples.begin(), middle)) / 2;
+}
+
+inline Figure figureOf(std::vector<double> samples)
+{
+    Figure figure;
+    figure.count = samples.size();
+    figure.median = medianOf(samples);
+    for (double& sample : samples)
+        sample = std::abs(sample - figure.median);
+    figure.deviation = medianOf(samples);
+    return figure;
+}
+
+// Three digits of it.
+inline std::string text(double value)
+{
+    char out[32];
+    const double size = std::abs(value);
+    std::snprintf(out, sizeof out, "%.*f", size >= 99.95 || size == 0 ? 0 : size >= 9.995 ? 1 : 2, value);
+    return out;
+}
+
+inline std::string text(const Figure& figure)
+{
+    return figure.count == 0 ? "-" : text(figure.median) + " ±" + text(figure.deviation);
+}
+
+inline std::string byteText(std::size_t byteCount)
+{
+    return byteCount >= (1u << 20) && byteCount % (1u << 20) == 0   ? std::to_string(byteCount >> 20) + " MiB"
+           : byteCount >= (1u << 10) && byteCount % (1u << 10) == 0 ? std::to_string(byteCount >> 10) + " KiB"
+                                                                    : std::to_string(byteCount) + " B";
+}
+
+class Table {
+public:
+    explicit Table(std::vector<std::string> head) : rows_{std::move(head)} {}
+    void add(std::vector<std::string> row) { rows_.push_back(std::move(row)); }
+
+    void print(const std::string& title) const
+    {
+        std::vector<std::size_t> widths(rows_.front().size());
+        for (const auto& row : rows_)
+            for (std::size_t i = 0; i < row.size(); ++i)
+                widths[i] = std::max(widths[i], lettersOf(row[i]));
+        std::printf("\n%s\n", title.c_str());
+        for (std::size_t r = 0; r < rows_.size(); ++r) {
+            for (std::size_t i = 0; i < rows_[r].size(); ++i) {
+                const std::string space(widths[i] - lettersOf(rows_[r][i]), ' ');
+                std::printf(i == 0 ? "| %s%s |" : " %s%s |", i == 0 ? rows_[r][i].c_str() : space.c_str(),
+                            i == 0 ? space.c_str() : rows_[r][i].c_str());
+            }
+            std::printf("\n");
+            if (r == 0)
+                for (std::size_t i = 0; i < widths.size(); ++i)
+                    std::printf("%s%s%s%s", i == 0 ? "|" : "", std::string(widths[i] + 1, '-').c_str(),
+                                i == 0 ? "-|" : ":|", i + 1 == widths.size() ? "\n" : "");
+        }
+        std::fflush(stdout);
+    }
+
+private:
+    // Of UTF-8.
+    static std::size_t lettersOf(const std::string& s)
+    {
+        return static_cast<std::size_t>(
+            std::count_if(s.begin(), s.end(), [](char c) { return (static_cast<unsigned char>(c) & 0xc0) != 0x80; }));
+    }
+
+    std::vector<std::vector<std::string>> rows_;
+};
+
+// ---- a program
+
+// What all benchmarks are called with. Ends the program after --help, or if it was called wrongly.
+struct Arguments {
+    bool quick = false;
+    std::string only; // digits of the parts to run; empty: all
+
+    Arguments(int argc, char** argv, const char* usage)
+    {
+        for (int i = 1; i < argc; ++i) {
+            const std::string argument = argv[i];
+            if (argument == "--quick") {
+                quick = true;
+            } else if (argument.find_first_not_of("123456789") == std::string::npos) {
+                only += argument;
+            } else {
+                std::printf("%s\n", usage);
+                std::exit(argument == "--help" ? 0 : 2);
+            }
+        }
+    }
+
+    bool wants(char part) const { return only.empty() || only.find(part) != std::string::npos; }
+};
+
+inline std::string environment(MPI_Comm comm)
+{
+    int size = 1, length = 0;
+    MPI_Comm_size(comm, &size);
+    char library[MPI_MAX_LIBRARY_VERSION_STRING];
+    MPI_Get_library_version(library, &length);
+    std::string version(library, static_cast<std::size_t>(length));
+    version = version.substr(0, version.find('\n'));
+    for (char& c : version)
+        c = c == '\t' ? ' ' : c;
+    return std::to_string(size) + " ranks, " + std::to_string(std::thread::hardware_concurrency()) + " cores, "
+           + version;
+}
+
+} // namespace bench
