@@ -1,7 +1,10 @@
 #!/bin/sh
-# Installs what building dfb, its tests and its examples needs and this machine lacks: on Debian and Ubuntu with apt-get;
-# elsewhere says what is missing and exits with 1. Quick when nothing is missing.
+# sh cmake/install_packages.sh [clang]
+# Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
+# sanitizers: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when nothing is
+# missing.
 set -eu
+with=${1:-}
 
 have() {
     command -v "$1" >/dev/null 2>&1
@@ -19,6 +22,9 @@ tools() {
     # Any MPI will do; two of them side by side get in each other's way.
     if ! have mpiexec || ! have mpicxx; then
         echo mpich libmpich-dev
+    fi
+    if [ "$with" = clang ] && ! echo 'int main() {}' | clang++ -fsanitize=thread -x c++ - -o /dev/null 2>/dev/null; then
+        echo clang libclang-rt-dev
     fi
 }
 

@@ -64,10 +64,7 @@ __attribute__((target("sse4.2"))) inline std::uint32_t crc32cByInstruction(const
     }
     return crc32cByTable(data, byteCount, ~static_cast<std::uint32_t>(sum));
 }
-inline Crc32cFunction fastestCrc32c()
-{
-    return __builtin_cpu_supports("sse4.2") ? crc32cByInstruction : crc32cByTable;
-}
+inline Crc32cFunction fastestCrc32c() { return __builtin_cpu_supports("sse4.2") ? crc32cByInstruction : crc32cByTable; }
 #elif defined(__ARM_FEATURE_CRC32) && !defined(__ARM_BIG_ENDIAN)
 inline std::uint32_t crc32cByInstruction(const std::byte* data, std::size_t byteCount, std::uint32_t before)
 {

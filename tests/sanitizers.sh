@@ -1,0 +1,38 @@
+#!/bin/sh
+# sh tests/sanitizers.sh [PRESET...]
+# Installs what is missing, then builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
+# tests of what the library does in each.
+set -u
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+cd "$root" || exit 1
+sh cmake/install_packages.sh clang || exit 1
+
+jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+[ $# -gt 0 ] || set -- asan tsan clang
+
+# All test programs but that of guard.odr, which runs nothing and takes long to compile. A test whose program is missing
+# fails.
+run() {
+    cmake --preset "$1" || return
+    targets=$(cmake --build --preset "$1" --target help | sed -nE 's/^((test|mpi)_[a-z_]+): phony$/\1/p' |
+        grep -v '^test_odr$') || return
+    # shellcheck disable=SC2086 # one word per target
+    cmake --build --preset "$1" --parallel "$jobs" --target $targets || return
+    ctest --preset "$1" --parallel "$jobs"
+}
+
+results=""
+verdict=passed
+for preset; do
+    started=$(date +%s)
+    if run "$preset"; then
+        result=passed
+    else
+        result=FAILED
+        verdict=FAILED
+    fi
+    results="$results, $preset $result in $(($(date +%s) - started)) s"
+done
+echo "sanitizers.sh: $verdict (${results#, })"
+[ $verdict = passed ]
