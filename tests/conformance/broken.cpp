@@ -68,7 +68,7 @@ public:
         Base::Communicator communicator;
         Defect defect;
     };
-    static constexpr const char* name = "broken";
+    [[maybe_unused]] static constexpr const char* name = "broken";
 
     Broken(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : defect_(communicator.defect), pool_(pool), base_(communicator.communicator, std::move(pool), progress)

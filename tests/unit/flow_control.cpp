@@ -41,8 +41,7 @@ struct Habits {
 
 class Network {
 public:
-    Network(int ranks, std::size_t pool, std::uint64_t seed, Habits habits = {})
-        : habits_(habits), pool_(pool), random_(seed)
+    Network(int ranks, std::size_t pool, std::uint64_t seed, Habits habits = {}) : habits_(habits), random_(seed)
     {
         for (int rank = 0; rank < ranks; ++rank) {
             nodes_.push_back(std::make_unique<Node>());
@@ -279,7 +278,6 @@ private:
     }
 
     Habits habits_;
-    std::size_t pool_;
     std::mt19937_64 random_;
     std::shared_ptr<dfb::MemoryPool> memory_ = dfb::MemoryPool::create();
     std::vector<std::unique_ptr<Node>> nodes_;
