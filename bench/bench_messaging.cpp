@@ -119,6 +119,7 @@ std::vector<double> pingPongInReceive(const Group& pair, Messenger& messenger, s
 {
     std::vector<double> samples;
     Signal done;
+    const Messenger::Hurry hurry(messenger); // as in Frame::end()
     double start = 0;
     int got = 0;
     std::optional<Endpoint> endpoint;
@@ -148,6 +149,7 @@ std::vector<double> pingPongInThread(const Group& pair, Messenger& messenger, st
 {
     std::vector<double> samples;
     Signal arrived;
+    const Messenger::Hurry hurry(messenger); // as in Frame::end()
     Buffer ball;
     Endpoint endpoint(messenger, [&](int, const MessageHeader&, Buffer&& message) {
         ball = std::move(message);
@@ -225,6 +227,7 @@ std::vector<double> streamPlain(const Group& pair, const Stream& stream, Waiting
 std::vector<double> streamMessenger(const Group& pair, Messenger& messenger, const Stream& stream)
 {
     Signal done;
+    const Messenger::Hurry hurry(messenger); // as in Frame::end()
     int sent = 0, got = 0;
     std::optional<Endpoint> endpoint;
     const auto sendUpTo = [&](int count) {
@@ -326,6 +329,7 @@ std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Messen
                                  const std::shared_ptr<dfb::Executor>& executor, const Stream& stream)
 {
     CreditEnd end(messenger, executor, stream);
+    const Messenger::Hurry hurry(*messenger); // as in Frame::end()
     bench::meet(pair.comm);
     const double start = bench::now();
     if (pair.rank == 0)
@@ -580,6 +584,7 @@ std::vector<double> ringMessenger(const Group& all, Messenger& messenger, std::s
 {
     Ring ring;
     Signal done;
+    const Messenger::Hurry hurry(messenger); // as in Frame::end()
     std::optional<Endpoint> endpoint;
     bench::meet(all.comm);
     endpoint.emplace(messenger, [&](int, const MessageHeader& header, Buffer&& message) {
@@ -679,6 +684,7 @@ std::vector<double> exchangeMessenger(const Group& all, Messenger& messenger, st
 {
     std::vector<double> samples, starts(static_cast<std::size_t>(all.size));
     Signal done;
+    const Messenger::Hurry hurry(messenger); // as in Frame::end()
     int outstanding = 0, roundsLeft = rounds;
     std::optional<Endpoint> endpoint;
     const auto beginRound = [&] {

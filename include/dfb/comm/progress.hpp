@@ -61,8 +61,8 @@ private:
     using Clock = std::chrono::steady_clock;
     static constexpr std::chrono::microseconds pollTime{5};
 
-    // Waking up costs some 10 us of a core. While all threads render, a message that is taken a little later delays
-    // nobody; what this rank sends interrupts the nap anyway.
+    // Waking up costs some 10 us of a core, which rendering threads lose. While nobody waits here, a message that is
+    // taken a little later delays nobody; what this rank sends interrupts the nap anyway.
     Clock::duration napAfter(Clock::duration idle, bool quiet) const
     {
         using std::chrono::microseconds;
@@ -74,7 +74,7 @@ private:
             return std::chrono::seconds(1);
         if (transport_.wakesOnArrival())
             return between(waiting_ > 0 ? 50 : 200, 2000);
-        return waiting_ > 0 || !quiet ? between(50, 200) : between(200, 2000);
+        return waiting_ > 0 ? between(50, 200) : between(1000, 2000);
     }
 
     void run()
