@@ -4,7 +4,7 @@
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
 // Returns 0 if all is well.
-#include <dfb/comm/mpi_session.hpp>
+#include <dfb/dfb.hpp>
 
 #include <chrono>
 #include <cstdio>
@@ -100,6 +100,27 @@ void wholeLife(int& argc, char**& argv, int level)
     check(has(after, "transport failure") && has(after, "finalised"), "a session after the end", after);
 }
 
+void emptyFrame(dfb::DistributedFrameBuffer<dfb::AlphaBlend>& fb)
+{
+    dfb::FrameParams params;
+    params.declared = true;
+    auto frame = fb.begin(params);
+    frame.declare({});
+    frame.end();
+}
+
+// Between two frames: the other ranks wait for this one in the second.
+void leaveFrameBuffer(int& argc, char**& argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(mpi.communicator(), {64, 64});
+    emptyFrame(fb);
+    if (mpi.rank() == 1 % mpi.size())
+        throw std::runtime_error("rank 1 leaves");
+    emptyFrame(fb);
+    std::fprintf(stderr, "mpi_session: the job goes on without rank 1\n");
+}
+
 void leaveWithException(int& argc, char**& argv)
 {
     dfb::MpiSession mpi(argc, argv);
@@ -129,9 +150,9 @@ int main(int argc, char** argv)
     } else if (what == "finalised") {
         dfb::MpiSession mpi(argc, argv);
         MPI_Finalize();
-    } else if (what == "exception") {
+    } else if (what == "exception" || what == "exception_frame") {
         try {
-            leaveWithException(argc, argv);
+            (what == "exception" ? leaveWithException : leaveFrameBuffer)(argc, argv);
         } catch (const std::exception& e) {
             check(!isFinalized(), "MPI is finalised");
             std::printf("mpi_session: caught: %s\n", e.what());

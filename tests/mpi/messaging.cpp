@@ -512,3 +512,38 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     }
     CHECK(goodFrame(fb, s));
 }
+
+// 3 GiB of memory on the first and the last rank.
+TEST_CASE("A message of more than 2 GiB comes whole", "[messaging][.stress]")
+{
+    struct Inbox : dfb::TransportHandler {
+        void receive(int, dfb::Buffer&& message) override
+        {
+            byteCount = message.size();
+            checksum = dfb::crc32c(message.data(), message.size());
+        }
+        void fail(const dfb::ErrorInfo& error) override { failure = error.describe(); }
+        bool failed() const override { return !failure.empty(); }
+        std::size_t byteCount = 0;
+        std::uint32_t checksum = 0;
+        std::string failure;
+    } inbox;
+    const int last = sizeOf(MPI_COMM_WORLD) - 1, rank = rankIn(MPI_COMM_WORLD);
+    const auto pool = dfb::MemoryPool::create();
+    dfb::MpiTransport transport(MPI_COMM_WORLD, pool, dfb::Progress::Caller);
+    transport.start(inbox);
+    const std::size_t byteCount = (std::size_t{5} << 29) + 12345;
+    std::uint32_t checksum = 0;
+    if (rank == 0) {
+        dfb::Buffer message = pool->acquire(byteCount);
+        for (std::size_t i = 0; i < byteCount; ++i)
+            message.data()[i] = std::byte(i * 2654435761u >> 24);
+        checksum = dfb::crc32c(message.data(), byteCount);
+        transport.send(last, std::move(message));
+    }
+    MPI_Bcast(&checksum, 1, MPI_UINT32_T, 0, MPI_COMM_WORLD);
+    transport.stop(true);
+    CHECK(inbox.failure == "");
+    CHECK(inbox.byteCount == (rank == last ? byteCount : 0));
+    CHECK(inbox.checksum == (rank == last ? checksum : 0));
+}

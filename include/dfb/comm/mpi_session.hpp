@@ -67,12 +67,22 @@ public:
     MPI_Comm communicator() const noexcept { return MPI_COMM_WORLD; }
 
 private:
+    // Where one rank's exception is another's, the ranks come here together: waits a moment, so that all can have said
+    // why, the first of all.
     static void abortJob()
     {
-        int finalized = 0;
+        int finalized = 0, done = 0;
         MPI_Finalized(&finalized);
-        if (!finalized)
-            MPI_Abort(MPI_COMM_WORLD, 1);
+        if (finalized)
+            return;
+        MPI_Request request = MPI_REQUEST_NULL;
+        MPI_Ibarrier(MPI_COMM_WORLD, &request);
+        detail::Patience patience;
+        for (const auto limit = std::chrono::steady_clock::now() + std::chrono::milliseconds(500);
+             MPI_Test(&request, &done, MPI_STATUS_IGNORE) == MPI_SUCCESS && !done
+             && std::chrono::steady_clock::now() < limit;)
+            patience.nap();
+        MPI_Abort(MPI_COMM_WORLD, 1);
     }
 
     void finalize()
