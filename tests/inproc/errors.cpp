@@ -96,18 +96,6 @@ using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTran
 template <class TileOp>
 using InspectedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, InspectedTransport>;
 
-// One worker: tasks run in the order of arrival.
-dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
-{
-    dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
-    return config;
-}
-
 bool allSame(const std::vector<std::string>& texts)
 {
     return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
@@ -411,8 +399,8 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
 
 TEST_CASE("Different message pools are refused on every rank", "[errors]")
 {
-    const auto texts = constructed(
-        3, [](int rank, dfb::FrameBufferConfig& c) { c.messagePoolBytes = rank == 1 ? 1 << 28 : 1 << 27; });
+    const auto texts =
+        constructed(3, [](int rank, dfb::FrameBufferConfig& c) { c.messagePoolBytes = rank == 1 ? 1 << 28 : 1 << 27; });
     INFO(joined(texts));
     CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
 }

@@ -67,6 +67,9 @@ void check(const Tally& tally, int frames)
 
 } // namespace
 
-TEST_CASE("Disturbed frames end in the right image or in an error of dfb", "[faults]") { check(faultGroups(1, 2000), 2000); }
+TEST_CASE("Disturbed frames end in the right image or in an error of dfb", "[faults]")
+{
+    check(faultGroups(1, 2000), 2000);
+}
 
 TEST_CASE("Many more disturbed frames", "[faults][.stress]") { check(faultGroups(100000, 40000), 40000); }

@@ -217,7 +217,8 @@ TEST_CASE("Output formats, with and without depth", "[images]")
                 o.depth = depth;
                 o.displayRank = 1;
                 const Picture p = pictureOf(s, o);
-                INFO("loop " << static_cast<int>(loop) << ", format " << static_cast<int>(format) << ", depth " << depth);
+                INFO("loop " << static_cast<int>(loop) << ", format " << static_cast<int>(format) << ", depth "
+                             << depth);
                 CHECK(p.format == format);
                 CHECK(p.depth.empty() == !depth);
                 CHECK(scene::wrongValues(p, expected) == 0);
@@ -255,8 +256,8 @@ TEST_CASE("Background does not travel", "[images]")
         const Picture p = picture<dfb::AlphaBlend>(s, o);
         CHECK(scene::wrongValues(p, scene::referenceOf(s)) == 0);
         CHECK(p.report.tilesTouched == 0);
-        // Per rank but one, of 4: a count of tiles, its part of the reduction that says all have declared (up and down), and
-        // of the verdict (up): at most 4 messages, together less than 512 bytes.
+        // Per rank but one, of 4: a count of tiles, its part of the reduction that says all have declared (up and
+        // down), and of the verdict (up): at most 4 messages, together less than 512 bytes.
         CHECK(p.report.messagesSent <= 3 * 4);
         CHECK(p.report.bytesSent <= 3 * 512);
     }

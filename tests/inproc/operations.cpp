@@ -26,7 +26,8 @@ using Blend = dfb::BasicAlphaBlend<16>;
 template <class TileOp, class PixelOp = dfb::NoPixelOp>
 using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
 
-dfb::FrameBufferConfig configOf(const Scene& s, dfb::OutputFormat format = dfb::OutputFormat::RGBA32F, bool depth = true)
+dfb::FrameBufferConfig configFor(const Scene& s, dfb::OutputFormat format = dfb::OutputFormat::RGBA32F,
+                                 bool depth = true)
 {
     dfb::FrameBufferConfig config;
     config.width = s.width;
@@ -43,16 +44,17 @@ Picture pictureOf(const Scene& s, Loop loop, const PixelOp& op, dfb::OutputForma
 {
     Picture result;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
-        FrameBuffer<TileOp, PixelOp> fb(communicator, configOf(s, format, depth), op);
+        FrameBuffer<TileOp, PixelOp> fb(communicator, configFor(s, format, depth), op);
         const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
         dfb::FrameReport report;
         if (loop == Loop::Declared)
             report = dfb::renderDataParallel(
                 fb, dfb::World(mine), scene::FlatCamera(),
-                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, scene::paramsOf(s), {}, data);
+                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, scene::paramsOf(s),
+                {}, data);
         else
-            report = dfb::renderImageParallel(fb, [&](auto& tile) { scene::renderBrick(s, s.bricks.front(), tile); },
-                                              scene::paramsOf(s), {}, data);
+            report = dfb::renderImageParallel(
+                fb, [&](auto& tile) { scene::renderBrick(s, s.bricks.front(), tile); }, scene::paramsOf(s), {}, data);
         if (fb.isDisplayRank())
             result = Picture(fb.image(), report);
     });
@@ -76,7 +78,8 @@ std::vector<float> toneMapped(const Picture& plain, float exposure)
 
 std::int64_t worstUlps(const Picture& picture, const std::vector<float>& expected)
 {
-    std::int64_t worst = picture.bytes.size() == expected.size() * sizeof(float) ? 0 : std::numeric_limits<std::int64_t>::max();
+    std::int64_t worst =
+        picture.bytes.size() == expected.size() * sizeof(float) ? 0 : std::numeric_limits<std::int64_t>::max();
     for (std::size_t i = 0; worst < 1000000 && i < expected.size(); ++i)
         worst = std::max(worst, reference::ulpsBetween(picture.value(i), expected[i]));
     return worst;
@@ -120,8 +123,8 @@ Watcher makeWatcher(const Scene& s, bool withDepth, bool mark)
     return w;
 }
 
-// A tile operation of a user's: counts the inputs of each pixel, times a factor that comes with the frame; red. Green is the
-// rank that owns the tile, blue the frame, alpha what is given with the frame.
+// A tile operation of a user's: counts the inputs of each pixel, times a factor that comes with the frame; red. Green
+// is the rank that owns the tile, blue the frame, alpha what is given with the frame.
 struct CountInputs {
     static constexpr int tileSize = 16;
     static constexpr dfb::ChannelMask channels = dfb::colorChannel;
@@ -200,8 +203,9 @@ TEST_CASE("ToneMap is Reinhard's operator on the composited float image", "[oper
                        ? pictureOf<Blend>(s, loop, dfb::ToneMap(), format, depth, 3, {exposure})
                        : pictureOf<dfb::BasicImageParallel<16>>(s, loop, dfb::ToneMap(), format, depth, 3, {exposure});
         };
-        const Picture plain = loop == Loop::Declared ? pictureOf<Blend>(s, loop, dfb::NoPixelOp())
-                                                     : pictureOf<dfb::BasicImageParallel<16>>(s, loop, dfb::NoPixelOp());
+        const Picture plain = loop == Loop::Declared
+                                  ? pictureOf<Blend>(s, loop, dfb::NoPixelOp())
+                                  : pictureOf<dfb::BasicImageParallel<16>>(s, loop, dfb::NoPixelOp());
         const auto expected = toneMapped(plain, exposure);
         const Picture floats = mapped(dfb::OutputFormat::RGBA32F, true);
         // ToneMap has 4 roundings in float, of half an ulp each, where the reference has one; none is amplified.
@@ -215,7 +219,8 @@ TEST_CASE("ToneMap is Reinhard's operator on the composited float image", "[oper
             for (std::size_t i = 0; i < expected.size(); ++i) {
                 const reference::Exact v = floats.value(i);
                 const bool srgb = format == dfb::OutputFormat::SRGBA8 && i % 4 != 3;
-                wrong += static_cast<std::uint8_t>(bytes.bytes[i]) != (srgb ? reference::toSrgb8(v) : reference::toUnorm8(v));
+                wrong += static_cast<std::uint8_t>(bytes.bytes[i])
+                         != (srgb ? reference::toSrgb8(v) : reference::toUnorm8(v));
             }
             CHECK(wrong == 0);
         }
@@ -246,7 +251,8 @@ TEST_CASE("PixelOpChain runs the first, then the second, each with its data", "[
     data.first.exposure = 3.0f;
     data.second.exposure = 0.5f;
     const Picture plain = pictureOf<Blend>(s, Loop::Declared, dfb::NoPixelOp());
-    const Picture once = pictureOf<Blend>(s, Loop::Declared, dfb::ToneMap(), dfb::OutputFormat::RGBA32F, true, 3, {3.0f});
+    const Picture once =
+        pictureOf<Blend>(s, Loop::Declared, dfb::ToneMap(), dfb::OutputFormat::RGBA32F, true, 3, {3.0f});
     const Picture both = pictureOf<Blend>(s, Loop::Declared, Chain(), dfb::OutputFormat::RGBA32F, true, 3, data);
     CHECK(worstUlps(both, toneMapped(once, 0.5f)) <= 4);
     CHECK(both.hash() != once.hash());
@@ -257,7 +263,8 @@ TEST_CASE("PixelOpChain runs the first, then the second, each with its data", "[
     using Watched = dfb::PixelOpChain<dfb::ToneMap, Watcher>;
     Watched::FrameData watchedData;
     watchedData.first.exposure = 3.0f;
-    const Picture watched = pictureOf<Blend>(s, Loop::Declared, Watched{{}, watcher}, dfb::OutputFormat::RGBA32F, true, 3, watchedData);
+    const Picture watched =
+        pictureOf<Blend>(s, Loop::Declared, Watched{{}, watcher}, dfb::OutputFormat::RGBA32F, true, 3, watchedData);
     CHECK(watched.hash() == once.hash());
     CHECK(watcher.log->tiles.size() == 28);
 }
@@ -272,15 +279,18 @@ TEST_CASE("A pixel operation that is not pointwise sees every tile of the image 
                     if (loop == Loop::ImageOwned && bricks == 0)
                         continue;
                     const Watcher watcher = makeWatcher(s, true, true);
-                    const Picture p = loop == Loop::Declared
-                                          ? pictureOf<Blend>(s, loop, watcher, format, true, ranks)
-                                          : pictureOf<dfb::BasicImageParallel<16>>(s, loop, watcher, format, true, ranks);
-                    INFO("loop " << static_cast<int>(loop) << ", " << bricks << " bricks, " << ranks << " ranks, format "
-                                 << static_cast<int>(format));
+                    const Picture p =
+                        loop == Loop::Declared
+                            ? pictureOf<Blend>(s, loop, watcher, format, true, ranks)
+                            : pictureOf<dfb::BasicImageParallel<16>>(s, loop, watcher, format, true, ranks);
+                    INFO("loop " << static_cast<int>(loop) << ", " << bricks << " bricks, " << ranks
+                                 << " ranks, format " << static_cast<int>(format));
                     CHECK(watcher.log->wrong == 0);
                     CHECK(watcher.log->tiles.size() == 28);
-                    CHECK(std::all_of(watcher.log->tiles.begin(), watcher.log->tiles.end(), [](const auto& t) { return t.second == 1; }));
-                    CHECK(std::all_of(watcher.log->pixels.begin(), watcher.log->pixels.end(), [](int n) { return n == 1; }));
+                    CHECK(std::all_of(watcher.log->tiles.begin(), watcher.log->tiles.end(),
+                                      [](const auto& t) { return t.second == 1; }));
+                    CHECK(std::all_of(watcher.log->pixels.begin(), watcher.log->pixels.end(),
+                                      [](int n) { return n == 1; }));
                     if (format == dfb::OutputFormat::None) {
                         CHECK(p.bytes.empty());
                         continue;
@@ -301,7 +311,7 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
     std::size_t wrong = 0;
     int framesSeen = 0;
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
-        auto config = configOf(s, dfb::OutputFormat::RGBA32F, false);
+        auto config = configFor(s, dfb::OutputFormat::RGBA32F, false);
         config.displayRank = 2;
         FrameBuffer<CountInputs> fb(communicator, config);
         for (int frame = 1; frame <= 3; ++frame) {
@@ -328,7 +338,8 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
                         for (int y = tile.region.y0; brick.id == input.source && y < tile.region.y1; ++y)
                             for (int x = tile.region.x0; x < tile.region.x1; ++x)
                                 if (const auto sample = scene::sampleOf(s, brick, pass, x, y))
-                                    std::copy(sample->rgba.begin(), sample->rgba.end(), tile.pixel(x - tile.region.x0, y - tile.region.y0));
+                                    std::copy(sample->rgba.begin(), sample->rgba.end(),
+                                              tile.pixel(x - tile.region.x0, y - tile.region.y0));
                     open.setTile(tile);
                 }
             const dfb::FrameReport report = open.end();
@@ -342,7 +353,9 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
                     for (int pass = 0; pass < s.passes; ++pass)
                         for (const dfb::Brick& brick : s.bricks) {
                             const auto sample = scene::sampleOf(s, brick, pass, x, y);
-                            count += sample && (sample->rgba[0] != 0 || sample->rgba[1] != 0 || sample->rgba[2] != 0 || sample->rgba[3] != 0);
+                            count += sample
+                                     && (sample->rgba[0] != 0 || sample->rgba[1] != 0 || sample->rgba[2] != 0
+                                         || sample->rgba[3] != 0);
                         }
                     const std::size_t i = 4 * static_cast<std::size_t>(y * s.width + x);
                     wrong += p.value(i) != static_cast<float>(count * 0.5 * frame);
@@ -370,7 +383,7 @@ TEST_CASE("A tile operation that has enough ends its tile early", "[operations]"
         return count + (p.bytes.empty() ? 1 : 0);
     };
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
-        FrameBuffer<FirstOpaque> fb(communicator, configOf(s));
+        FrameBuffer<FirstOpaque> fb(communicator, configFor(s));
         auto tile = std::make_unique<FrameBuffer<FirstOpaque>::Tile>();
         for (std::size_t frame = 0; frame < 2; ++frame) {
             auto open = fb.begin();
@@ -404,7 +417,7 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
     s.background = {0, 0, 0, 0};
     Picture p;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
-        FrameBuffer<Blend> fb(communicator, configOf(s));
+        FrameBuffer<Blend> fb(communicator, configFor(s));
         const std::vector<dfb::Brick> bricks{{7, {{0, 0, 0}, {97, 61, 1}}}};
         const dfb::World world(fb.rank() == 1 ? bricks : std::vector<dfb::Brick>());
         const auto report = dfb::renderDataParallel(fb, world, scene::FlatCamera(), [](const dfb::Brick&, auto& tile) {

@@ -280,4 +280,16 @@ std::string outcomeOf(const Call& call)
 
 inline bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
+// With one worker, tasks run in the order of arrival.
+inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
+{
+    dfb::FrameBufferConfig config;
+    config.width = s.width;
+    config.height = s.height;
+    config.format = dfb::OutputFormat::RGBA32F;
+    config.depth = true;
+    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+    return config;
+}
+
 } // namespace scene

@@ -1,5 +1,6 @@
 // Frames with a time-out: what is missing fails them with an error that says so, the same on every rank; what can not
 // even be agreed on is a TransportError. Ranks are threads; every test has a time limit.
+#include "board.hpp"
 #include "catch.hpp"
 #include "scene.hpp"
 
@@ -22,8 +23,13 @@
 
 namespace {
 
+using board::Board;
+using board::BoardTransport;
+using board::joined;
+using board::runOn;
 using dfb::detail::MessageHeader;
 using dfb::detail::MessageKind;
+using scene::configOf;
 using scene::has;
 using scene::Loop;
 using scene::outcomeOf;
@@ -31,136 +37,8 @@ using scene::Picture;
 using scene::Scene;
 using Clock = std::chrono::steady_clock;
 
-// Which messages get lost; and the end of it all when time is up.
-struct Board {
-    // True: this message gets lost. Called from any thread.
-    std::function<bool(int from, int to, const MessageHeader&, const dfb::Buffer&)> loses;
-
-    std::mutex mutex;
-    std::vector<dfb::TransportHandler*> handlers;
-    std::atomic<bool> timeIsUp{false};
-
-    // Every rank that waits gets a TransportError.
-    void giveUp()
-    {
-        timeIsUp = true;
-        const std::lock_guard<std::mutex> lock(mutex);
-        for (dfb::TransportHandler* handler : handlers) {
-            dfb::ErrorInfo info;
-            info.kind = dfb::ErrorKind::Transport;
-            info.message = "the test's time limit";
-            handler->fail(info);
-        }
-    }
-};
-
-class LossyTransport {
-public:
-    struct Communicator {
-        dfb::InprocCommunicator inner;
-        std::shared_ptr<Board> board;
-    };
-    [[maybe_unused]] static constexpr const char* name = "lossy";
-
-    LossyTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
-        : board_(c.board), inner_(c.inner, std::move(pool), progress)
-    {
-    }
-    int rank() const { return inner_.rank(); }
-    int size() const { return inner_.size(); }
-    bool needsPolling() const { return inner_.needsPolling(); }
-    bool mayPoll() const { return inner_.mayPoll(); }
-    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
-    bool quiet() const { return inner_.quiet(); }
-    bool poll() { return inner_.poll(); }
-    void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
-    void interrupt() { inner_.interrupt(); }
-    void start(dfb::TransportHandler& handler)
-    {
-        handler_ = &handler;
-        {
-            const std::lock_guard<std::mutex> lock(board_->mutex);
-            board_->handlers.push_back(&handler);
-        }
-        inner_.start(handler);
-    }
-    void stop(bool orderly)
-    {
-        {
-            const std::lock_guard<std::mutex> lock(board_->mutex);
-            auto& all = board_->handlers;
-            all.erase(std::remove(all.begin(), all.end(), handler_), all.end());
-        }
-        inner_.stop(orderly);
-    }
-    void send(int to, dfb::Buffer&& message)
-    {
-        if (board_->loses && board_->loses(rank(), to, dfb::detail::loadAs<MessageHeader>(message.data()), message))
-            const dfb::Buffer lost = std::move(message);
-        else
-            inner_.send(to, std::move(message));
-    }
-
-private:
-    std::shared_ptr<Board> board_;
-    dfb::InprocTransport inner_;
-    dfb::TransportHandler* handler_ = nullptr;
-};
-
-// runRanks() over a board, for at most so long. Says what was thrown; nothing must be.
-void runOn(const std::shared_ptr<Board>& board, int ranks,
-           const std::function<void(const LossyTransport::Communicator&)>& body,
-           std::optional<std::uint64_t> shuffleSeed = std::nullopt,
-           std::chrono::seconds limit = std::chrono::seconds(30))
-{
-    std::promise<void> done;
-    std::thread watch([&, over = done.get_future()] {
-        if (over.wait_for(limit) == std::future_status::ready)
-            return;
-        board->giveUp();
-        if (over.wait_for(std::chrono::seconds(20)) == std::future_status::ready)
-            return;
-        std::fputs("a test hangs even after its transport has failed\n", stderr);
-        std::abort();
-    });
-    std::string thrown;
-    try {
-        dfb::runRanks(
-            ranks,
-            [&](dfb::InprocCommunicator communicator) {
-                body({communicator, board});
-            },
-            shuffleSeed);
-    } catch (const std::exception& e) {
-        thrown = e.what();
-    }
-    done.set_value();
-    watch.join();
-    CHECK(thrown == "");
-    CHECK_FALSE(board->timeIsUp);
-}
-
 using Blend = dfb::BasicAlphaBlend<16>;
-using FrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, LossyTransport>;
-
-dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
-{
-    dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
-    return config;
-}
-
-std::string joined(const std::vector<std::string>& texts)
-{
-    std::string all;
-    for (const std::string& t : texts)
-        all += "\n  " + t;
-    return all;
-}
+using FrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, BoardTransport>;
 
 bool allSame(const std::vector<std::string>& texts)
 {
@@ -215,7 +93,7 @@ Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig c
     Run result;
     result.endings.resize(static_cast<std::size_t>(ranks));
     const Scene s = scene::makeScene(5, 2, config.width, config.height);
-    runOn(board, ranks, [&](const LossyTransport::Communicator& communicator) {
+    runOn(board, ranks, [&](const BoardTransport::Communicator& communicator) {
         auto mine = config;
         mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(communicator, mine);
@@ -600,16 +478,16 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
                 const auto board = std::make_shared<Board>();
                 std::atomic<int> seen{0};
                 std::atomic<bool> armed{false}, lost{false};
-                board->loses = [&](int, int, const MessageHeader& header, const dfb::Buffer& message) {
+                board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
                     const bool isReduction =
                         header.kind == MessageKind::ReduceUp || header.kind == MessageKind::ReduceDown;
                     if (!armed || header.kind != loss.kind || header.number != 1
                         || (isReduction
                             && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) != loss.scope)
                         || seen++ != nth)
-                        return false;
+                        return Board::What::Pass;
                     lost = true;
-                    return true;
+                    return Board::What::Lose;
                 };
                 std::vector<Ending> endings(static_cast<std::size_t>(ranks));
                 std::vector<std::string> after(endings.size());
@@ -665,18 +543,18 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
 TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, and the next frame is right",
           "[timeouts]")
 {
-    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, LossyTransport>;
+    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport>;
     for (const auto kind : {MessageKind::Credit, MessageKind::CreditRequest}) {
         // All of a kind that rank 1 gets or sends: of credit the next would make good for one that is lost. With 9
         // ranks a sender's own part of the pool is less than a message.
         const int ranks = kind == MessageKind::Credit ? 2 : 9;
         const auto board = std::make_shared<Board>();
         std::atomic<bool> lost{false};
-        board->loses = [&](int from, int to, const MessageHeader& header, const dfb::Buffer&) {
+        board->inspect = [&](int from, int to, const MessageHeader& header, dfb::Buffer&) {
             const bool loses =
                 header.kind == kind && header.number == 1 && (kind == MessageKind::Credit ? to == 1 : from == 1);
             lost = lost || loses;
-            return loses;
+            return loses ? Board::What::Lose : Board::What::Pass;
         };
         std::vector<Ending> endings(static_cast<std::size_t>(ranks));
         std::size_t wrong = 1;
@@ -721,10 +599,10 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
 TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()", "[timeouts]")
 {
     const auto board = std::make_shared<Board>();
-    board->loses = [](int, int, const MessageHeader& header, const dfb::Buffer&) {
-        return header.kind == MessageKind::Credit && header.number == 1;
+    board->inspect = [](int, int, const MessageHeader& header, dfb::Buffer&) {
+        return header.kind == MessageKind::Credit && header.number == 1 ? Board::What::Lose : Board::What::Pass;
     };
-    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, LossyTransport>;
+    using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport>;
     std::vector<std::string> texts(2);
     runOn(
         board, 2,
@@ -756,8 +634,8 @@ TEST_CASE("Time-outs in frames of one framebuffer leave the other on the same me
     const Scene s = scene::makeScene(5, 4);
     std::vector<std::string> texts(3);
     std::size_t wrong = 2;
-    runOn(std::make_shared<Board>(), 3, [&](const LossyTransport::Communicator& communicator) {
-        const auto messenger = std::make_shared<dfb::Messenger<LossyTransport>>(communicator);
+    runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
+        const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
         FrameBuffer a(messenger, configOf(s)), b(messenger, configOf(s));
         {
             auto frameB = b.begin(scene::paramsOf(s));

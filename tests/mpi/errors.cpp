@@ -62,25 +62,6 @@ struct FaultyPixelOp {
 
 using FrameBuffer = dfb::DistributedFrameBuffer<Faulty, FaultyPixelOp>;
 
-dfb::FrameBufferConfig configOf(const Scene& s)
-{
-    dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-    return config;
-}
-
-// Whether all ranks have the same text.
-bool sameEverywhere(const std::string& text)
-{
-    std::vector<char> first(1000);
-    std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
-    MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
-    return text.compare(0, first.size() - 1, first.data()) == 0;
-}
-
 // A good frame; whether its image was right.
 template <class Fb>
 bool goodFrame(Fb& fb, const Scene& s)

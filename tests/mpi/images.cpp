@@ -19,17 +19,6 @@ using scene::Scene;
 using Blend = dfb::BasicAlphaBlend<16>;
 using Single = dfb::BasicImageParallel<16>;
 
-dfb::FrameBufferConfig configOf(const Scene& s)
-{
-    dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(2);
-    return config;
-}
-
 // On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
 template <class TileOp, class Transport, class Communicator>
 Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
@@ -84,7 +73,7 @@ TEST_CASE("Every loop gives the reference image, and that of ranks in one proces
     for (const Loop loop : {Loop::Listing3, Loop::Declared, Loop::ImageOwned, Loop::ImageDealt})
         for (const int passes : {1, 3}) {
             const Scene s = sceneFor(loop, 1, passes);
-            const auto config = configOf(s);
+            const auto config = configOf(s, 2);
             const Picture p = overMpi(MPI_COMM_WORLD, s, loop, config);
             INFO("loop " << static_cast<int>(loop) << ", " << passes << " passes");
             if (rankIn(MPI_COMM_WORLD) != 0) {
@@ -101,9 +90,9 @@ TEST_CASE("The image does not depend on configuration", "[images]")
 {
     const int size = sizeOf(MPI_COMM_WORLD);
     const Scene s = sceneFor(Loop::Declared, 5);
-    const std::uint64_t expected = inProcess(1, s, Loop::Declared, configOf(s)).hash();
+    const std::uint64_t expected = inProcess(1, s, Loop::Declared, configOf(s, 2)).hash();
     const auto check = [&](const char* what, const std::function<void(dfb::FrameBufferConfig&)>& change, int deal = 0) {
-        auto config = configOf(s);
+        auto config = configOf(s, 2);
         change(config);
         const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config, deal);
         INFO(what);
@@ -129,7 +118,7 @@ TEST_CASE("Output formats", "[images]")
 {
     const Scene s = sceneFor(Loop::Declared, 6);
     for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8, dfb::OutputFormat::None}) {
-        auto config = configOf(s);
+        auto config = configOf(s, 2);
         config.format = format;
         const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config);
         if (format == dfb::OutputFormat::None || rankIn(MPI_COMM_WORLD) != 0)
@@ -143,17 +132,17 @@ TEST_CASE("Ordinary: an empty view, one pixel, a declaration that is kept", "[im
 {
     for (const Loop loop : {Loop::Listing3, Loop::Declared}) {
         Scene empty = scene::makeScene(0, 1, 600, 600);
-        const Picture none = overMpi(MPI_COMM_WORLD, empty, loop, configOf(empty));
+        const Picture none = overMpi(MPI_COMM_WORLD, empty, loop, configOf(empty, 2));
         Scene one = scene::makeScene(2, 1, 1, 1);
         one.bricks[0].bounds = {{0, 0, 0}, {1, 1, 1}};
-        const Picture pixel = overMpi(MPI_COMM_WORLD, one, loop, configOf(one));
+        const Picture pixel = overMpi(MPI_COMM_WORLD, one, loop, configOf(one, 2));
         if (rankIn(MPI_COMM_WORLD) == 0) {
             CHECK(scene::wrongValues(none, scene::referenceOf(empty)) == 0);
             CHECK(scene::wrongValues(pixel, scene::referenceOf(one)) == 0);
         }
     }
     const Scene s = sceneFor(Loop::Declared, 7);
-    dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s));
+    dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s, 2));
     std::vector<std::int64_t> messages;
     for (int frame = 0; frame < 3; ++frame) {
         const auto report = scene::renderLoop(fb, s, Loop::Declared, 0, 77);
@@ -177,8 +166,8 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
     const Scene all = sceneFor(Loop::Declared, 8),
                 part = sceneFor(Loop::ImageOwned, 9 + static_cast<std::uint64_t>(rank % 2));
     {
-        dfb::DistributedFrameBuffer<Blend> fbAll(MPI_COMM_WORLD, configOf(all));
-        dfb::DistributedFrameBuffer<Single> fbPart(half, configOf(part));
+        dfb::DistributedFrameBuffer<Blend> fbAll(MPI_COMM_WORLD, configOf(all, 2));
+        dfb::DistributedFrameBuffer<Single> fbPart(half, configOf(part, 2));
         for (int i = 0; i < 2; ++i) {
             auto frame = fbAll.begin(scene::paramsOf(all));
             const auto tile = std::make_unique<decltype(fbAll)::Tile>();

@@ -1,5 +1,6 @@
 // Credit, several framebuffers, repeated and damaged messages, time-outs and progress by the caller, over MPI. Any
 // number of ranks; every frame that could hang has a time-out.
+#include "../inproc/flood.hpp"
 #include "../inproc/scene.hpp"
 #include "catch.hpp"
 #include "ranks.hpp"
@@ -21,6 +22,12 @@ namespace {
 
 using dfb::detail::MessageHeader;
 using dfb::detail::MessageKind;
+using flood::Adder;
+using flood::executors;
+using flood::floodConfig;
+using flood::floodFrame;
+using flood::From;
+using flood::wrongSums;
 using scene::has;
 using scene::Loop;
 using scene::outcomeOf;
@@ -77,141 +84,10 @@ private:
     dfb::MpiTransport inner_;
 };
 
-// Colours are added up as inputs come, and none is kept: small whole numbers, so that any order gives the same.
-class Adder {
-public:
-    static constexpr int tileSize = 32;
-    static constexpr dfb::ChannelMask channels = dfb::colorChannel;
-
-    void newFrame(const dfb::TileInfo& info)
-    {
-        region_ = info.region;
-        sum_.assign(static_cast<std::size_t>(4 * region_.width() * region_.height()), 0.0);
-    }
-    void add(dfb::Fragment&& fragment)
-    {
-        dfb::FragmentCursor cursor(fragment);
-        for (int y = 0; y < region_.height(); ++y) {
-            const dfb::FragmentRow row = cursor.next();
-            const float* color = row.color;
-            for (int s = 0; s < row.spanCount; ++s) {
-                double* to = sum_.data() + 4 * (y * region_.width() + row.spans[s].x);
-                for (int i = 0; i < 4 * row.spans[s].count; ++i)
-                    to[i] += static_cast<double>(*color++);
-            }
-        }
-    }
-    void finish(dfb::FinishedTile& out)
-    {
-        for (int y = 0; y < region_.height(); ++y)
-            out.setRow(y, sum_.data() + 4 * y * region_.width(), nullptr);
-    }
-
-private:
-    dfb::Region region_;
-    std::vector<double> sum_;
-};
-static_assert(dfb::is_tile_op_v<Adder>);
-
 using AddingFrameBuffer = dfb::DistributedFrameBuffer<Adder>;
 using Blend = dfb::BasicAlphaBlend<16>;
 template <class TileOp>
 using TamperedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, TamperingTransport>;
-
-int valueOf(int rank, int part, int x, int y, int channel)
-{
-    return 1 + (rank * 7 + part * 11 + x * 3 + y * 5 + channel) % 64;
-}
-
-// Number of values that are not the sum of all inputs.
-std::size_t wrongSums(const dfb::Image& image, int ranks, int parts)
-{
-    const Picture p(image, {});
-    std::size_t wrong = image.empty(), i = 0;
-    for (int y = 0; y < image.height(); ++y)
-        for (int x = 0; x < image.width(); ++x)
-            for (int c = 0; c < 4; ++c) {
-                int sum = 0;
-                for (int rank = 0; rank < ranks; ++rank)
-                    for (int part = 0; part < parts; ++part)
-                        sum += valueOf(rank, part, x, y, c);
-                wrong += p.value(i++) != static_cast<float>(sum);
-            }
-    return wrong;
-}
-
-dfb::FrameBufferConfig floodConfig(int pixels, std::shared_ptr<dfb::Executor> executor)
-{
-    dfb::FrameBufferConfig config;
-    config.width = config.height = pixels;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.messagePoolBytes = 0; // the smallest
-    config.executor = std::move(executor);
-    return config;
-}
-
-enum class From { Loop, Thread };
-
-// One frame in which every rank sends `parts` inputs for every tile.
-template <class Fb>
-dfb::FrameReport floodFrame(Fb& fb, int parts, From from)
-{
-    dfb::FrameParams params;
-    params.declared = true;
-    params.timeoutMs = longMs;
-    auto frame = fb.begin(params);
-    std::vector<dfb::TileInput> inputs;
-    for (int part = 0; part < parts; ++part)
-        for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
-            inputs.push_back({tile, static_cast<std::uint32_t>(fb.rank()), static_cast<std::uint16_t>(part)});
-    frame.declare(inputs);
-    const auto sendOne = [&](std::size_t i) {
-        const auto tile = std::make_unique<typename Fb::Tile>();
-        frame.start(*tile, inputs[i].tile);
-        tile->generation = 1;
-        tile->part = inputs[i].part;
-        for (int y = 0; y < tile->region.height(); ++y)
-            for (int x = 0; x < tile->region.width(); ++x)
-                for (int c = 0; c < 4; ++c)
-                    tile->pixel(x, y)[c] = static_cast<float>(
-                        valueOf(fb.rank(), inputs[i].part, tile->region.x0 + x, tile->region.y0 + y, c));
-        frame.setTile(*tile);
-    };
-    if (from == From::Loop)
-        fb.executor().parallelFor(inputs.size(), sendOne);
-    else
-        for (std::size_t i = 0; i < inputs.size(); ++i)
-            sendOne(i);
-    return frame.end();
-}
-
-struct NamedExecutor {
-    std::string name;
-    std::shared_ptr<dfb::Executor> executor;
-};
-
-std::vector<NamedExecutor> executors()
-{
-    std::vector<NamedExecutor> all;
-    for (const int workers : {1, 2}) {
-        all.push_back({std::to_string(workers) + " workers", std::make_shared<dfb::ThreadExecutor>(workers)});
-#if defined(DFB_HAS_TBB)
-        all.push_back({std::to_string(workers) + " workers of oneTBB", std::make_shared<dfb::TbbExecutor>(workers)});
-#endif
-    }
-    return all;
-}
-
-dfb::FrameBufferConfig configOf(const Scene& s)
-{
-    dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-    return config;
-}
 
 Scene sceneFor(int bricks, std::uint64_t seed)
 {
@@ -228,28 +104,20 @@ bool goodFrame(Fb& fb, const Scene& s, Loop loop = Loop::Declared)
     return !fb.isDisplayRank() || scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0;
 }
 
-bool sameEverywhere(const std::string& text)
-{
-    std::vector<char> first(4000);
-    std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
-    MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
-    return text.compare(0, first.size() - 1, first.data()) == 0;
-}
-
 } // namespace
 
 TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
 {
     const int ranks = sizeOf(MPI_COMM_WORLD), parts = 2;
-    for (const NamedExecutor& e : executors())
+    for (const flood::NamedExecutor& e : executors())
         for (const From from : {From::Loop, From::Thread}) {
-            auto config = floodConfig(256, e.executor);
+            auto config = floodConfig(256, e.make());
             config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
             config.displayRank = ranks - 1;
             AddingFrameBuffer fb(MPI_COMM_WORLD, config);
             dfb::FrameReport report;
             for (int i = 0; i < 2; ++i) {
-                report = floodFrame(fb, parts, from);
+                report = floodFrame(fb, parts, from, longMs);
                 if (fb.isDisplayRank())
                     CHECK(wrongSums(fb.image(), ranks, parts) == 0);
                 CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messagePoolBytes));
@@ -271,14 +139,14 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
 TEST_CASE("Everybody floods everybody, and the display rank is flooded by finished tiles", "[messaging]")
 {
     const int ranks = sizeOf(MPI_COMM_WORLD);
-    for (const NamedExecutor& e : executors())
+    for (const flood::NamedExecutor& e : executors())
         for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd})
             for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
-                auto config = floodConfig(384, e.executor); // 2.4 MB of finished tiles
+                auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
                 config.gather = gather;
                 config.progress = progress;
                 AddingFrameBuffer fb(MPI_COMM_WORLD, config);
-                const auto report = floodFrame(fb, 2, From::Loop);
+                const auto report = floodFrame(fb, 2, From::Loop, longMs);
                 INFO(e.name);
                 if (fb.isDisplayRank())
                     CHECK(wrongSums(fb.image(), ranks, 2) == 0);

@@ -1,7 +1,11 @@
-// Rank and size of a communicator as values.
+// Ranks and what they have in common. All but the first two are collective over MPI_COMM_WORLD.
 #pragma once
 
 #include <mpi.h>
+
+#include <algorithm>
+#include <string>
+#include <vector>
 
 inline int rankIn(MPI_Comm communicator)
 {
@@ -15,4 +19,13 @@ inline int sizeOf(MPI_Comm communicator)
     int size = 0;
     MPI_Comm_size(communicator, &size);
     return size;
+}
+
+// Whether all ranks have the same text, or the same 4000 characters of it.
+inline bool sameEverywhere(const std::string& text)
+{
+    std::vector<char> first(4000);
+    std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
+    MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
+    return text.compare(0, first.size() - 1, first.data()) == 0;
 }

@@ -1,0 +1,191 @@
+// A board that all messages of in-process ranks pass: tests watch them there, hold them back, lose, repeat or change
+// them. And a time limit for all that runs over it.
+#pragma once
+
+#include "catch.hpp"
+
+#include <dfb/dfb.hpp>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <functional>
+#include <future>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+namespace board {
+
+using dfb::detail::MessageHeader;
+
+// What happens to the messages of all ranks; and the end of it all when time is up.
+struct Board {
+    enum class What { Pass, Hold, Lose, Twice, CopyHeld };
+    // Called for each message to another rank, from any thread.
+    std::function<What(int from, int to, const MessageHeader&, dfb::Buffer&)> inspect;
+    // Called when it has been passed on.
+    std::function<void(int from, int to, const MessageHeader&)> passed;
+
+    std::mutex mutex;
+    std::vector<std::function<void()>> held;
+    bool released = false;
+    std::vector<dfb::TransportHandler*> handlers;
+    std::atomic<bool> timeIsUp{false};
+    std::shared_ptr<dfb::MemoryPool> pool = dfb::MemoryPool::create();
+
+    // Until release().
+    void hold(std::function<void()> send)
+    {
+        std::unique_lock<std::mutex> lock(mutex);
+        if (!released) {
+            held.push_back(std::move(send));
+            return;
+        }
+        lock.unlock();
+        send();
+    }
+    void release()
+    {
+        std::vector<std::function<void()>> all;
+        {
+            const std::lock_guard<std::mutex> lock(mutex);
+            released = true;
+            all.swap(held);
+        }
+        for (const auto& send : all)
+            send();
+    }
+    // Every rank that waits gets a TransportError.
+    void giveUp()
+    {
+        timeIsUp = true;
+        const std::lock_guard<std::mutex> lock(mutex);
+        for (dfb::TransportHandler* handler : handlers) {
+            dfb::ErrorInfo info;
+            info.kind = dfb::ErrorKind::Transport;
+            info.message = "the test's time limit";
+            handler->fail(info);
+        }
+    }
+};
+
+class BoardTransport {
+public:
+    struct Communicator {
+        dfb::InprocCommunicator inner;
+        std::shared_ptr<Board> board;
+    };
+    [[maybe_unused]] static constexpr const char* name = "board";
+
+    BoardTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
+        : board_(c.board), inner_(c.inner, std::move(pool), progress)
+    {
+    }
+    int rank() const { return inner_.rank(); }
+    int size() const { return inner_.size(); }
+    bool needsPolling() const { return inner_.needsPolling(); }
+    bool mayPoll() const { return inner_.mayPoll(); }
+    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
+    bool quiet() const { return inner_.quiet(); }
+    bool poll() { return inner_.poll(); }
+    void nap(std::chrono::nanoseconds limit) { inner_.nap(limit); }
+    void interrupt() { inner_.interrupt(); }
+    void start(dfb::TransportHandler& handler)
+    {
+        handler_ = &handler;
+        {
+            const std::lock_guard<std::mutex> lock(board_->mutex);
+            board_->handlers.push_back(&handler);
+        }
+        inner_.start(handler);
+    }
+    void stop(bool orderly)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(board_->mutex);
+            auto& all = board_->handlers;
+            all.erase(std::remove(all.begin(), all.end(), handler_), all.end());
+        }
+        inner_.stop(orderly);
+    }
+    void send(int to, dfb::Buffer&& message)
+    {
+        const auto header = dfb::detail::loadAs<MessageHeader>(message.data());
+        const auto what = board_->inspect ? board_->inspect(rank(), to, header, message) : Board::What::Pass;
+        if (what == Board::What::Lose) {
+            const dfb::Buffer lost = std::move(message);
+        } else if (what == Board::What::Hold) {
+            const auto kept = std::make_shared<dfb::Buffer>(std::move(message));
+            board_->hold([this, to, kept] { inner_.send(to, std::move(*kept)); });
+        } else {
+            const auto copy = std::make_shared<dfb::Buffer>();
+            if (what != Board::What::Pass) {
+                *copy = board_->pool->acquire(message.size());
+                std::memcpy(copy->data(), message.data(), message.size());
+            }
+            inner_.send(to, std::move(message));
+            if (what == Board::What::Twice)
+                inner_.send(to, std::move(*copy));
+            else if (what == Board::What::CopyHeld)
+                board_->hold([this, to, copy] { inner_.send(to, std::move(*copy)); });
+            if (board_->passed)
+                board_->passed(rank(), to, header);
+        }
+    }
+
+private:
+    std::shared_ptr<Board> board_;
+    dfb::InprocTransport inner_;
+    dfb::TransportHandler* handler_ = nullptr;
+};
+
+// runRanks() over a board, for at most so long.
+inline void runOn(const std::shared_ptr<Board>& board, int ranks,
+                  const std::function<void(const BoardTransport::Communicator&)>& body,
+                  std::optional<std::uint64_t> shuffleSeed = std::nullopt,
+                  std::chrono::seconds limit = std::chrono::seconds(30))
+{
+    std::promise<void> done;
+    std::thread watch([&, over = done.get_future()] {
+        if (over.wait_for(limit) == std::future_status::ready)
+            return;
+        board->giveUp();
+        if (over.wait_for(std::chrono::seconds(20)) == std::future_status::ready)
+            return;
+        std::fputs("a test hangs even after its transport has failed\n", stderr);
+        std::abort();
+    });
+    std::string thrown;
+    try {
+        dfb::runRanks(
+            ranks,
+            [&](dfb::InprocCommunicator communicator) {
+                body({communicator, board});
+            },
+            shuffleSeed);
+    } catch (const std::exception& e) {
+        thrown = e.what();
+    }
+    done.set_value();
+    watch.join();
+    CHECK(thrown == "");
+    CHECK_FALSE(board->timeIsUp);
+}
+inline std::string joined(const std::vector<std::string>& texts)
+{
+    std::string all;
+    for (const std::string& t : texts)
+        all += "\n  " + t;
+    return all;
+}
+
+} // namespace board

@@ -1,0 +1,458 @@
+// Credit: whatever the ranks send, what is on the way to a rank and in its inbox stays within its message pool, and it
+// ends. Ranks are threads; every test has a time limit.
+#include "flood.hpp"
+#include "board.hpp"
+#include "catch.hpp"
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <future>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using board::Board;
+using board::BoardTransport;
+using board::joined;
+using board::runOn;
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using flood::Adder;
+using flood::executors;
+using flood::fillTile;
+using flood::floodConfig;
+using flood::floodFrame;
+using flood::From;
+using flood::valueOf;
+using flood::wrongSums;
+using scene::configOf;
+using scene::has;
+using scene::Loop;
+using scene::outcomeOf;
+using scene::Picture;
+using scene::Scene;
+
+using AddingFrameBuffer = dfb::DistributedFrameBuffer<Adder, dfb::NoPixelOp, BoardTransport>;
+template <class TileOp>
+using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, BoardTransport>;
+using Blend = dfb::BasicAlphaBlend<16>;
+
+std::size_t blockBytes(std::size_t bytes) // as MemoryPool rounds up
+{
+    std::size_t block = 256;
+    while (block < bytes)
+        block = block + block / 2 >= bytes ? block + block / 2 : 2 * block;
+    return block;
+}
+
+// Bytes of the message of a full tile of Adder.
+constexpr std::size_t fullMessage = dfb::detail::fragmentPrefix + 16 * Adder::tileSize * Adder::tileSize;
+Scene sceneFor(Loop loop, std::uint64_t seed = 1)
+{
+    Scene s = scene::makeScene(scene::isDataParallel(loop) ? 6 : 1, seed);
+    if (!scene::isDataParallel(loop))
+        s.bricks[0].bounds = {{0, 0, 0}, {97, 61, 1}};
+    return s;
+}
+
+} // namespace
+
+TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging][flood]")
+{
+    for (const int ranks : {2, 4, 8})
+        for (const auto& [name, makeExecutor] : executors())
+            for (const From from : {From::Loop, From::Thread}) {
+                INFO(ranks << " ranks, " << name << (from == From::Loop ? ", from a loop" : ", from a thread"));
+                const int parts = 16 / ranks;
+                std::size_t wrong = 1;
+                std::vector<dfb::FrameReport> reports;
+                std::size_t pool = 0;
+                int threads = 0;
+                runOn(std::make_shared<Board>(), ranks, [&, &make = makeExecutor](const auto& communicator) {
+                    auto config = floodConfig(256, make());
+                    config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                    AddingFrameBuffer fb(communicator, config);
+                    for (int i = 0; i < 2; ++i) {
+                        const auto report = floodFrame(fb, parts, from);
+                        if (fb.rank() == 0) {
+                            wrong = wrongSums(fb.image(), ranks, parts);
+                            reports.push_back(report);
+                            pool = fb.config().messagePoolBytes;
+                            threads = fb.executor().concurrency() + 1;
+                        }
+                    }
+                });
+                CHECK(wrong == 0);
+                CHECK(pool == std::size_t{1} << 20); // 4 batches of finished tiles
+                std::size_t otherMessages = 0;
+                for (const dfb::FrameReport& r : reports) {
+                    const std::int64_t inputs = 64 * parts * (ranks - 1);
+                    CHECK(r.peakInboxBytes > 0);
+                    CHECK(r.peakInboxBytes <= static_cast<std::int64_t>(pool));
+                    CHECK(r.messagesSent > inputs);
+                    CHECK(r.messagesSent < 4 * inputs); // requests and credits
+                    otherMessages += static_cast<std::size_t>(r.messagesSent - inputs);
+                }
+                // A rank's memory: a pool of inputs under way and one more for each thread that sets tiles, those that
+                // threads of the owner are just adding up, the small messages, the image. (In one process a message
+                // stays in the memory of its sender.)
+                const std::size_t blocks = pool / fullMessage + 2 * static_cast<std::size_t>(threads);
+                const std::size_t limit = blocks * blockBytes(fullMessage) + otherMessages * 256
+                                          + blockBytes(256 * 256 * 16) + 64 * blockBytes(4096);
+                REQUIRE(!reports.empty());
+                INFO(reports.back().peakMemoryBytes << " bytes, limit " << limit);
+                CHECK(reports.back().peakMemoryBytes <= static_cast<std::int64_t>(limit));
+            }
+}
+
+TEST_CASE("Everybody floods everybody, with arrivals in order and shuffled", "[messaging][flood]")
+{
+    for (const int ranks : {2, 3, 8})
+        for (const auto& [name, makeExecutor] : executors())
+            for (const bool shuffle : {false, true}) {
+                INFO(ranks << " ranks, " << name << (shuffle ? ", shuffled" : ""));
+                std::size_t wrong = 1;
+                dfb::FrameReport report;
+                runOn(
+                    std::make_shared<Board>(), ranks,
+                    [&, &make = makeExecutor](const auto& communicator) {
+                        AddingFrameBuffer fb(communicator, floodConfig(256, make()));
+                        const auto r = floodFrame(fb, 3, From::Loop);
+                        if (fb.isDisplayRank()) {
+                            wrong = wrongSums(fb.image(), ranks, 3);
+                            report = r;
+                        }
+                    },
+                    shuffle ? std::optional<std::uint64_t>(ranks) : std::nullopt);
+                CHECK(wrong == 0);
+                CHECK(report.peakInboxBytes <= 1 << 20);
+            }
+}
+
+TEST_CASE("A sender waits when a pool is under way; all workers of all ranks may wait at once", "[messaging][flood]")
+{
+    // No input arrives until every worker of every rank waits in setTile().
+    for (const int ranks : {2, 4})
+        for (const int workers : {1, 2}) {
+            const std::int64_t fit = (1 << 20) / static_cast<std::int64_t>(fullMessage); // calls that need not wait
+            const auto board = std::make_shared<Board>();
+            std::atomic<bool> open{false};
+            board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
+                return header.kind == MessageKind::Fragment && !open ? Board::What::Hold : Board::What::Pass;
+            };
+            std::mutex mutex;
+            std::condition_variable changed;
+            std::vector<std::int64_t> begun(static_cast<std::size_t>(ranks)), done(begun), begunThen, doneThen;
+            std::thread referee([&] {
+                std::unique_lock<std::mutex> lock(mutex);
+                changed.wait_for(lock, std::chrono::seconds(20), [&] {
+                    bool all = true;
+                    for (std::size_t rank = 0; rank < begun.size(); ++rank)
+                        all = all && begun[rank] > fit && begun[rank] == done[rank] + workers;
+                    return all;
+                });
+                begunThen = begun;
+                doneThen = done;
+                lock.unlock();
+                open = true;
+                board->release();
+            });
+            std::size_t wrong = 1;
+            runOn(board, ranks, [&](const auto& communicator) {
+                AddingFrameBuffer fb(communicator, floodConfig(256, std::make_shared<dfb::ThreadExecutor>(workers)));
+                const auto rank = static_cast<std::size_t>(fb.rank());
+                floodFrame(fb, 4, From::Loop, [&](int tile, const auto& send) {
+                    if (fb.tileOwner(tile) == fb.rank()) {
+                        send();
+                        return;
+                    }
+                    const auto count = [&](auto& counts) {
+                        const std::lock_guard<std::mutex> lock(mutex);
+                        ++counts[rank];
+                        changed.notify_all();
+                    };
+                    count(begun);
+                    send();
+                    count(done);
+                });
+                if (fb.isDisplayRank())
+                    wrong = wrongSums(fb.image(), ranks, 4);
+            });
+            referee.join();
+            INFO(ranks << " ranks, " << workers << " workers");
+            for (std::size_t rank = 0; rank < begunThen.size(); ++rank) {
+                CHECK(begunThen[rank] > fit);
+                CHECK(begunThen[rank] == doneThen[rank] + workers);
+                CHECK(doneThen[rank] <= fit);
+            }
+            CHECK(wrong == 0);
+        }
+}
+
+TEST_CASE("An owner that takes nothing out of its inbox is sent no more than its pool", "[messaging][flood]")
+{
+    for (const int ranks : {2, 5}) {
+        const auto board = std::make_shared<Board>();
+        std::mutex mutex;
+        std::condition_variable changed;
+        std::size_t inputBytes = 0, bytesThen = 0;
+        std::vector<bool> blocked(static_cast<std::size_t>(ranks));
+        bool watching = true;
+        board->inspect = [&](int, int to, const MessageHeader& header, dfb::Buffer& message) {
+            const std::lock_guard<std::mutex> lock(mutex);
+            if (to == 0 && header.kind == MessageKind::Fragment && watching)
+                inputBytes += message.size();
+            return Board::What::Pass;
+        };
+        std::size_t wrong = 1;
+        runOn(board, ranks, [&](const auto& communicator) {
+            auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
+            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            AddingFrameBuffer fb(communicator, config);
+            // The only worker of rank 0, and the thread that calls its framebuffer, are busy with something else until
+            // every other rank has set more than a pool's worth.
+            const auto allBlocked = [&] {
+                std::unique_lock<std::mutex> lock(mutex);
+                changed.wait_for(lock, std::chrono::seconds(20),
+                                 [&] { return std::count(blocked.begin(), blocked.end(), true) == ranks - 1; });
+                if (watching)
+                    bytesThen = inputBytes;
+                watching = false;
+            };
+            if (fb.rank() == 0)
+                fb.executor().submit(allBlocked);
+            std::int64_t begun = 0;
+            if (fb.rank() > 0) {
+                floodFrame(fb, 2, From::Thread, [&](int, const auto& send) {
+                    if (++begun > (1 << 20) / static_cast<std::int64_t>(fullMessage)) {
+                        const std::lock_guard<std::mutex> lock(mutex);
+                        blocked[static_cast<std::size_t>(fb.rank())] = true;
+                        changed.notify_all();
+                    }
+                    send();
+                });
+            } else {
+                dfb::FrameParams params;
+                params.declared = true;
+                auto frame = fb.begin(params);
+                frame.declare({});
+                allBlocked();
+                frame.end();
+                const Picture p(fb.image(), {});
+                int expected = 0;
+                for (int rank = 1; rank < ranks; ++rank)
+                    expected += valueOf(rank, 0, 9, 0, 0) + valueOf(rank, 1, 9, 0, 0);
+                wrong = p.value(4 * 9) != static_cast<float>(expected);
+            }
+        });
+        INFO(ranks << " ranks, " << bytesThen << " bytes");
+        CHECK(bytesThen > 0);
+        CHECK(bytesThen <= std::size_t{1} << 20);
+        CHECK(wrong == 0);
+    }
+}
+
+TEST_CASE("The display rank is flooded by finished tiles, as they come or at the end", "[messaging][flood]")
+{
+    for (const auto& [name, makeExecutor] : executors())
+        for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd}) {
+            INFO(name << (gather == dfb::GatherMode::AtEnd ? ", at the end" : ", in batches"));
+            std::vector<std::size_t> wrong;
+            dfb::FrameReport report;
+            std::size_t pool = 0;
+            runOn(std::make_shared<Board>(), 5, [&, &make = makeExecutor](const auto& communicator) {
+                auto config = floodConfig(800, make());
+                config.gather = gather;
+                config.displayRank = 3;
+                // The display rank has no tile of its own: 10 MB come to it.
+                config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile % 4 == 3 ? 4 : tile % 4; };
+                AddingFrameBuffer fb(communicator, config);
+                for (int i = 0; i < 2; ++i) {
+                    auto frame = fb.begin();
+                    fb.executor().parallelFor(fb.ownedTiles().size(), [&](std::size_t k) {
+                        const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
+                        frame.start(*tile, fb.ownedTiles()[k]);
+                        fillTile(*tile, 0, 0);
+                        frame.setTile(*tile);
+                    });
+                    const auto r = frame.end();
+                    if (fb.isDisplayRank()) {
+                        wrong.push_back(wrongSums(fb.image(), 1, 1));
+                        report = r;
+                        pool = fb.config().messagePoolBytes;
+                    }
+                }
+            });
+            CHECK(wrong == std::vector<std::size_t>(2));
+            CHECK(report.peakInboxBytes > 0);
+            CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(pool));
+        }
+}
+
+TEST_CASE("A flood in a frame that fails: everybody gets the error, and the next frame is right", "[messaging][flood]")
+{
+    for (const int ranks : {2, 5})
+        for (int culprit = 0; culprit < ranks; culprit += 2) {
+            std::vector<std::string> texts(static_cast<std::size_t>(ranks));
+            std::size_t wrong = 1;
+            std::int64_t peakInbox = 0;
+            runOn(std::make_shared<Board>(), ranks, [&](const auto& communicator) {
+                auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
+                config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                AddingFrameBuffer fb(communicator, config);
+                for (int i = 0; i < 3; ++i) {
+                    std::atomic<int> calls{0};
+                    texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+                        auto frame = fb.begin();
+                        fb.executor().parallelFor(64 * 4, [&](std::size_t k) {
+                            if (fb.rank() == culprit && calls++ == 100)
+                                frame.abort(std::make_exception_ptr(std::runtime_error("enough")));
+                            const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
+                            frame.start(*tile, static_cast<int>(k % 64));
+                            tile->generation = 1;
+                            tile->source = static_cast<std::uint32_t>(fb.rank());
+                            tile->part = static_cast<std::uint16_t>(k / 64);
+                            fillTile(*tile, 0, 0);
+                            frame.setTile(*tile);
+                        });
+                        frame.end();
+                    });
+                }
+                floodFrame(fb, 2, From::Loop);
+                if (fb.isDisplayRank())
+                    wrong = wrongSums(fb.image(), ranks, 2);
+                const auto report = floodFrame(fb, 2, From::Loop); // what was left of the failed ones is gone by now
+                if (fb.isDisplayRank())
+                    peakInbox = report.peakInboxBytes;
+            });
+            INFO("rank " << culprit << joined(texts));
+            for (const std::string& text : texts)
+                CHECK((text == texts[0] && has(text, "FrameError") && has(text, "enough")
+                       && has(text, "rank " + std::to_string(culprit))));
+            CHECK(wrong == 0);
+            CHECK(peakInbox > 0);
+            CHECK(peakInbox <= 1 << 20);
+        }
+}
+
+TEST_CASE("What comes for a frame that is over does not take up room in the inbox", "[messaging]")
+{
+    const auto board = std::make_shared<Board>();
+    board->inspect = [](int, int, const MessageHeader& header, dfb::Buffer&) {
+        return header.kind == MessageKind::Fragment && header.number == 1 ? Board::What::Hold : Board::What::Pass;
+    };
+    std::vector<std::int64_t> peaks, late;
+    std::promise<void> allSet;
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        AddingFrameBuffer fb(communicator, config);
+        const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
+        const auto sendOne = [&](AddingFrameBuffer::Frame& frame, int index) {
+            frame.start(*tile, index);
+            tile->generation = 1;
+            fillTile(*tile, 0, 0);
+            frame.setTile(*tile);
+        };
+        dfb::FrameParams params;
+        params.declared = true;
+        {
+            auto frame = fb.begin(params); // left by all
+            if (fb.rank() == 1)
+                for (int index = 0; index < 30; ++index)
+                    sendOne(frame, index);
+            if (fb.rank() == 1)
+                allSet.set_value();
+            else
+                allSet.get_future().wait_for(std::chrono::seconds(20));
+        }
+        fb.allReduce({0}, AddingFrameBuffer::Reduce::Sum);
+        if (fb.rank() == 1)
+            board->release();
+        fb.allReduce({0}, AddingFrameBuffer::Reduce::Sum);
+        std::promise<void> tasksDone; // one worker does them in order
+        fb.executor().submit([&] { tasksDone.set_value(); });
+        tasksDone.get_future().wait();
+        for (int i = 0; i < 2; ++i) {
+            auto frame = fb.begin(params);
+            frame.declare(fb.rank() == 1 ? std::vector<dfb::TileInput>{{3, 1, 0}} : std::vector<dfb::TileInput>());
+            if (fb.rank() == 1)
+                sendOne(frame, 3);
+            const auto report = frame.end();
+            if (fb.rank() == 0) {
+                peaks.push_back(report.peakInboxBytes);
+                late.push_back(report.lateMessages);
+            }
+        }
+    });
+    // With the two words of having left.
+    CHECK((late.size() == 2 && late[0] >= 30 && late[0] <= 32 && late[1] == 0));
+    CHECK(peaks == std::vector<std::int64_t>(2, static_cast<std::int64_t>(fullMessage)));
+}
+
+TEST_CASE("A message pool below the largest message's fourfold is raised to it; a larger one stays", "[messaging]")
+{
+    const Scene s = sceneFor(Loop::Declared);
+    std::vector<std::size_t> pools;
+    for (const std::size_t bytes : {std::size_t{0}, std::size_t{1} << 20, std::size_t{1} << 21, std::size_t{64} << 20})
+        runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
+            auto config = configOf(s);
+            config.messagePoolBytes = bytes;
+            FrameBuffer<Blend> fb(communicator, config);
+            if (fb.rank() == 0)
+                pools.push_back(fb.config().messagePoolBytes);
+        });
+    CHECK(pools
+          == std::vector<std::size_t>{std::size_t{1} << 20, std::size_t{1} << 20, std::size_t{1} << 21,
+                                      std::size_t{64} << 20});
+    std::size_t large = 0;
+    runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
+        auto config = configOf(s);
+        config.messagePoolBytes = 1;
+        FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
+        large = fb.config().messagePoolBytes;
+    });
+    CHECK(large == 4 * dfb::detail::largestFragment(256));
+}
+
+TEST_CASE("A flood with progress by the caller: setTile() makes the progress that it waits for", "[messaging][flood]")
+{
+    for (const int ranks : {2, 4})
+        for (const From from : {From::Thread, From::Loop})
+            for (const bool toOne : {true, false}) {
+                std::size_t wrong = 1;
+                dfb::FrameReport report;
+                runOn(
+                    std::make_shared<Board>(), ranks,
+                    [&](const auto& communicator) {
+                        auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
+                        config.progress = dfb::Progress::Caller;
+                        if (toOne)
+                            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                        AddingFrameBuffer fb(communicator, config);
+                        const auto r = floodFrame(fb, 3, from);
+                        if (fb.isDisplayRank()) {
+                            wrong = wrongSums(fb.image(), ranks, 3);
+                            report = r;
+                        }
+                    },
+                    5);
+                INFO(ranks << " ranks" << (toOne ? ", to one" : "") << (from == From::Loop ? ", from a loop" : ""));
+                CHECK(wrong == 0);
+                CHECK(report.peakInboxBytes <= 1 << 20);
+            }
+}
