@@ -6,8 +6,8 @@ cmake_minimum_required(VERSION 3.21)
 set(level_0 version.hpp fwd.hpp)
 set(level_1 error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
             detail/float_environment.hpp)
-set(level_2 comm/message.hpp comm/reduction.hpp comm/snappy_codec.hpp comm/transport.hpp detail/byte_io.hpp
-            tbb_executor.hpp)
+set(level_2 comm/byte_io.hpp comm/message.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
+            comm/transport.hpp tbb_executor.hpp)
 set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
 set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp

@@ -6,7 +6,7 @@
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
-#include <dfb/detail/byte_io.hpp>
+#include <dfb/comm/byte_io.hpp>
 
 #include <algorithm>
 #include <atomic>

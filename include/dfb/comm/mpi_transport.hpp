@@ -4,12 +4,13 @@
 // block): what has to wait tests and naps. Works on a duplicate of the caller's communicator; never initialises or
 // finalises MPI.
 //
-// Small messages to one rank travel together, in packets of at most 8 KiB, which the libraries send without asking the
-// receiver first. A larger message is announced in a packet, and then sent on its own under the tag that the
-// announcement names, so that it goes straight into the block that the handler gets. Receives of packets are posted
-// beforehand: nothing is ever probed for. They take 64 KiB per transport.
+// Small messages to one rank travel together, in packets (comm/packet.hpp) of at most 8 KiB, which the libraries send
+// without asking the receiver first. A larger message is announced in a packet, and then sent on its own under the tag
+// that the announcement names, so that it goes straight into the block that the handler gets. Receives of packets are
+// posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
 #pragma once
 
+#include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 
 #include <mpi.h>
@@ -71,7 +72,6 @@ public:
     using Communicator = MPI_Comm;
     static constexpr const char* name = "mpi";
 
-    static constexpr std::size_t packetBytes = 8192;                // see above
     static constexpr int postedPackets = 8;                         // receives; together they are what is said above
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
 
@@ -79,7 +79,7 @@ public:
     // at a lower thread level than `progress` needs. At MPI_THREAD_FUNNELED to be called by the thread that initialised
     // MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
-        : pool_(std::move(pool))
+        : pool_(std::move(pool)), packet_(pool_)
     {
         int initialized = 0, finalized = 0;
         MPI_Initialized(&initialized);
@@ -117,7 +117,7 @@ public:
 
         peers_.resize(static_cast<std::size_t>(size_));
         packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
-        packets_ = pool_->acquire(packetBytes * postedPackets);
+        packets_ = pool_->acquire(detail::packetBytes * postedPackets);
         try {
             for (int slot = 0; slot < postedPackets; ++slot)
                 postPacket(slot);
@@ -191,14 +191,7 @@ public:
     }
 
 private:
-    // Precedes each message in a packet, and stands alone for one that is sent on its own.
-    struct Record {
-        enum Kind : std::uint32_t { Message, Announcement, Failure };
-        std::uint64_t byteCount;
-        std::int32_t tag; // of an announced message
-        Kind kind;
-    };
-    static_assert(sizeof(Record) == 16);
+    using Record = detail::PacketRecord;
 
     // Bytes that MPI has in hand. What is longer than a chunk goes on when the chunk has gone.
     struct Transfer {
@@ -256,11 +249,6 @@ private:
 
     void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
 
-    [[noreturn]] void failMalformed(int source) const
-    {
-        throw TransportError("a packet from rank " + std::to_string(source) + " is malformed", rank_);
-    }
-
     [[noreturn]] void failAsTold(std::string text, int source)
     {
         told_ = true;
@@ -295,13 +283,10 @@ private:
     void tellFailure(const std::string& text)
     {
         try {
-            Buffer notice = pool_->acquire(packetBytes);
-            const std::size_t length = std::min(text.size(), packetBytes - sizeof(Record));
-            const Record record{length, 0, Record::Failure};
-            std::memcpy(notice.data(), &record, sizeof record);
-            std::memcpy(notice.data() + sizeof record, text.data(), length);
-            notice.shrink(sizeof record + length);
-            notices_.items.push_back({std::move(notice), 0, -1, 0});
+            const std::size_t length = std::min(text.size(), detail::packetBytes - sizeof(Record));
+            detail::PacketWriter notice(pool_);
+            notice.add({length, 0, Record::Failure}, reinterpret_cast<const std::byte*>(text.data()), length);
+            notices_.items.push_back({notice.take(), 0, -1, 0});
             const Transfer& sent = notices_.items.back();
             for (int peer = 0; peer < size_; ++peer) {
                 MPI_Request request = MPI_REQUEST_NULL;
@@ -383,12 +368,16 @@ private:
             return false;
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
-            if (sizeof(Record) + message.size() <= packetBytes) {
-                pack(destination, {message.size(), 0, Record::Message}, message.data());
+            const bool isSmall = detail::PacketWriter::canHold(message.size());
+            const std::size_t payloadBytes = isSmall ? message.size() : 0;
+            if (!packet_.hasRoom(payloadBytes))
+                sendPacket(destination);
+            if (isSmall) {
+                packet_.add({message.size(), 0, Record::Message}, message.data(), payloadBytes);
                 continue;
             }
             peer.tag = peer.tag % lastTag_ + 1;
-            pack(destination, {message.size(), peer.tag, Record::Announcement}, nullptr);
+            packet_.add({message.size(), peer.tag, Record::Announcement}, nullptr, 0);
             bodies_.push_back({std::move(message), 0, destination, peer.tag});
             ++peer.inFlight;
         }
@@ -400,32 +389,12 @@ private:
         return true;
     }
 
-    // `payload` of record.byteCount bytes, or none. Records begin at multiples of 16.
-    void pack(int destination, const Record& record, const std::byte* payload)
-    {
-        const std::size_t payloadBytes = payload ? static_cast<std::size_t>(record.byteCount) : 0;
-        const std::size_t end = sizeof record + payloadBytes;
-        const std::size_t paddedEnd = (end + sizeof record - 1) / sizeof record * sizeof record;
-        if (packed_ + paddedEnd > packetBytes)
-            sendPacket(destination);
-        if (packed_ == 0)
-            packing_ = pool_->acquire(packetBytes);
-        std::byte* to = packing_.data() + packed_;
-        std::memcpy(to, &record, sizeof record);
-        if (payloadBytes > 0)
-            std::memcpy(to + sizeof record, payload, payloadBytes);
-        std::memset(to + end, 0, paddedEnd - end);
-        packed_ += paddedEnd;
-    }
-
     void sendPacket(int destination)
     {
-        if (packed_ == 0)
+        if (packet_.empty())
             return;
-        packing_.shrink(packed_);
-        packed_ = 0;
         ++peers_[static_cast<std::size_t>(destination)].inFlight;
-        addSend({std::move(packing_), 0, destination, 0});
+        addSend({packet_.take(), 0, destination, 0});
     }
 
     void addSend(Transfer&& transfer)
@@ -463,11 +432,11 @@ private:
 
     // --- receiving
 
-    std::byte* packetAt(int slot) { return packets_.data() + static_cast<std::size_t>(slot) * packetBytes; }
+    std::byte* packetAt(int slot) { return packets_.data() + static_cast<std::size_t>(slot) * detail::packetBytes; }
 
     void postPacket(int slot)
     {
-        check(MPI_Irecv(packetAt(slot), static_cast<int>(packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm_,
+        check(MPI_Irecv(packetAt(slot), static_cast<int>(detail::packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm_,
                         &packetRequests_[static_cast<std::size_t>(slot)]),
               "MPI_Irecv");
     }
@@ -485,36 +454,24 @@ private:
     }
 
     // An empty packet says goodbye, see finish().
-    void unpack(int source, const std::byte* from, std::size_t left)
+    void unpack(int source, const std::byte* packet, std::size_t byteCount)
     {
-        while (left > 0) {
-            Record record;
-            if (left < sizeof record)
-                failMalformed(source);
-            std::memcpy(&record, from, sizeof record);
-            from += sizeof record;
-            left -= sizeof record;
-            if (record.kind == Record::Announcement) {
-                if (record.tag < 1 || record.byteCount == 0)
-                    failMalformed(source);
-                announced_.push({source, record.tag, record.byteCount});
-                continue;
-            }
-            if (record.kind > Record::Failure || record.byteCount > left)
-                failMalformed(source);
-            const auto byteCount = static_cast<std::size_t>(record.byteCount);
-            if (record.kind == Record::Failure)
-                failAsTold(std::string(reinterpret_cast<const char*>(from), byteCount), source);
-            Buffer message = pool_->acquire(byteCount);
-            if (byteCount > 0)
-                std::memcpy(message.data(), from, byteCount);
-            deliver(source, std::move(message));
-            const std::size_t padded = (byteCount + sizeof record - 1) / sizeof record * sizeof record;
-            if (padded > left)
-                failMalformed(source);
-            from += padded;
-            left -= padded;
-        }
+        const bool isPacket =
+            detail::readPacket(packet, byteCount, [&](const Record& record, const std::byte* payload) {
+                const auto payloadBytes = static_cast<std::size_t>(record.byteCount);
+                if (record.kind == Record::Announcement) {
+                    announced_.push({source, record.tag, record.byteCount});
+                } else if (record.kind == Record::Failure) {
+                    failAsTold(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
+                } else {
+                    Buffer message = pool_->acquire(payloadBytes);
+                    if (payloadBytes > 0)
+                        std::memcpy(message.data(), payload, payloadBytes);
+                    deliver(source, std::move(message));
+                }
+            });
+        if (!isPacket)
+            throw TransportError("a packet from rank " + std::to_string(source) + " is malformed", rank_);
     }
 
     bool receiveBodies()
@@ -720,9 +677,8 @@ private:
     std::vector<std::pair<int, Buffer>> starting_;
     std::vector<Peer> peers_;
     std::vector<int> waitingPeers_; // those with messages that wait
-    Buffer packing_;                // the packet that is being filled, and how far
-    std::size_t packed_ = 0;
-    std::vector<Transfer> bodies_; // to follow it
+    detail::PacketWriter packet_;   // that is being filled
+    std::vector<Transfer> bodies_;  // to follow it
     Transfers sends_, receives_, notices_;
     Fifo<Announced> announced_;
     Buffer packets_; // the posted ones

@@ -5,7 +5,7 @@
 // acknowledged enters a reduction, and when that is done every manifest has arrived everywhere.
 #pragma once
 
-#include <dfb/detail/byte_io.hpp>
+#include <dfb/comm/byte_io.hpp>
 
 #include <cstddef>
 #include <cstdint>

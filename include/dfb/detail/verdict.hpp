@@ -3,7 +3,7 @@
 // made with.
 #pragma once
 
-#include <dfb/detail/byte_io.hpp>
+#include <dfb/comm/byte_io.hpp>
 #include <dfb/frame.hpp>
 
 #include <algorithm>

@@ -1,0 +1,100 @@
+// Packets: several small messages to one rank as one message of the network. Each stands behind a record; a large
+// message, which travels by itself, leaves its record alone as an announcement.
+#pragma once
+
+#include <dfb/buffer.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <utility>
+
+namespace dfb::detail {
+
+struct PacketRecord {
+    enum Kind : std::uint32_t { Message, Announcement, Failure };
+    std::uint64_t byteCount;
+    std::int32_t tag; // of an announced message
+    Kind kind;
+};
+static_assert(sizeof(PacketRecord) == 16);
+
+constexpr std::size_t packetBytes = 8192; // at most
+
+// Fills one packet after the other. Records begin at multiples of 16.
+class PacketWriter {
+public:
+    explicit PacketWriter(std::shared_ptr<MemoryPool> pool) : pool_(std::move(pool)) {}
+
+    // Whether a message can travel in a packet at all, and whether the present one has room for that many bytes.
+    static constexpr bool canHold(std::size_t payloadBytes) { return padded(payloadBytes) <= packetBytes; }
+    bool hasRoom(std::size_t payloadBytes) const noexcept { return used_ + padded(payloadBytes) <= packetBytes; }
+    bool empty() const noexcept { return used_ == 0; }
+
+    // Needs room.
+    void add(const PacketRecord& record, const std::byte* payload, std::size_t payloadBytes)
+    {
+        if (empty())
+            packet_ = pool_->acquire(packetBytes);
+        std::byte* to = packet_.data() + used_;
+        std::memcpy(to, &record, sizeof record);
+        if (payloadBytes > 0)
+            std::memcpy(to + sizeof record, payload, payloadBytes);
+        const std::size_t end = sizeof record + payloadBytes;
+        std::memset(to + end, 0, padded(payloadBytes) - end);
+        used_ += padded(payloadBytes);
+    }
+
+    // The packet, and begins the next.
+    Buffer take()
+    {
+        packet_.shrink(std::exchange(used_, 0));
+        return std::move(packet_);
+    }
+
+private:
+    static constexpr std::size_t padded(std::size_t payloadBytes)
+    {
+        return (2 * sizeof(PacketRecord) - 1 + payloadBytes) / sizeof(PacketRecord) * sizeof(PacketRecord);
+    }
+
+    std::shared_ptr<MemoryPool> pool_;
+    Buffer packet_;
+    std::size_t used_ = 0;
+};
+
+// Calls `visit(record, payload)` for each record; an announcement has no payload. False if the bytes, which need not be
+// trusted, are no packet: then what came before has been visited. An empty packet is one.
+template <class Visit>
+bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
+{
+    constexpr std::size_t step = sizeof(PacketRecord);
+    while (left > 0) {
+        PacketRecord record;
+        if (left < step)
+            return false;
+        std::memcpy(&record, from, step);
+        from += step;
+        left -= step;
+        if (record.kind > PacketRecord::Failure)
+            return false;
+        if (record.kind == PacketRecord::Announcement) {
+            if (record.tag < 1 || record.byteCount == 0)
+                return false;
+            visit(record, static_cast<const std::byte*>(nullptr));
+            continue;
+        }
+        if (record.byteCount > left)
+            return false;
+        const std::size_t paddedBytes = (static_cast<std::size_t>(record.byteCount) + step - 1) / step * step;
+        if (paddedBytes > left)
+            return false;
+        visit(record, from);
+        from += paddedBytes;
+        left -= paddedBytes;
+    }
+    return true;
+}
+
+} // namespace dfb::detail
