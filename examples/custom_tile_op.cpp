@@ -1,0 +1,143 @@
+// A tile operation of your own, and no renderer: a field on three levels of refinement, as simulations with adaptive
+// meshes have it. Patches lie on any rank. A patch announces how many finer ones refine it, wherever those are: level l
+// is generation l of the tile's tree. The operation keeps the finest value of each pixel and drops the rest.
+//   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
+#include <algorithm>
+#include <cmath>
+#include <cstring>
+#include <dfb/dfb.hpp>
+#include <fstream>
+#include <iostream>
+#include <memory>
+#include <vector>
+
+constexpr int width = 640, height = 448, levels = 3;
+constexpr int patchSize[levels] = {64, 32, 16}, cellSize[levels] = {16, 4, 1}; // pixels
+
+class FinestLevel {
+public:
+    static constexpr int tileSize = patchSize[0];
+    static constexpr dfb::ChannelMask channels = dfb::colorChannel;
+
+    void newFrame(const dfb::TileInfo& info)
+    {
+        region_ = info.region;
+        const auto pixels = static_cast<std::size_t>(region_.width() * region_.height());
+        color_.assign(4 * pixels, 0.0);
+        level_.assign(pixels, -1);
+    }
+
+    void add(dfb::Fragment&& fragment) // in any order
+    {
+        const int level = fragment.header().generation;
+        dfb::FragmentCursor rows(fragment);
+        for (int y = 0; y < region_.height(); ++y) {
+            const dfb::FragmentRow row = rows.next();
+            const float* color = row.color;
+            for (int s = 0; s < row.spanCount; ++s)
+                for (int x = row.spans[s].x; x < row.spans[s].x + row.spans[s].count; ++x, color += 4) {
+                    const auto pixel = static_cast<std::size_t>(y * region_.width() + x);
+                    if (level <= level_[pixel])
+                        continue;
+                    level_[pixel] = level;
+                    std::copy_n(color, 4, &color_[4 * pixel]);
+                }
+        }
+    }
+
+    void finish(dfb::FinishedTile& out)
+    {
+        for (int y = 0; y < out.height(); ++y)
+            out.setRow(y, &color_[static_cast<std::size_t>(4 * y * out.width())], nullptr);
+    }
+
+private:
+    dfb::Region region_;
+    std::vector<double> color_;
+    std::vector<int> level_; // of the value that a pixel has
+};
+static_assert(dfb::is_tile_op_v<FinestLevel>);
+
+// The field: a spiral wave that gets finer towards the middle.
+double field(double x, double y)
+{
+    const double u = x - width / 2.0, v = y - height / 2.0, r = std::hypot(u, v);
+    return std::exp(-r / 120) * std::sin(600 / (r + 12) + 2 * std::atan2(v, u));
+}
+
+// Patch (i, j) of a level is there if the field varies too much in it for the level above.
+bool exists(int level, int i, int j)
+{
+    if (level == 0)
+        return true;
+    if (!exists(level - 1, i / 2, j / 2))
+        return false;
+    double lowest = 1, highest = -1;
+    for (int y = 0; y <= 4; ++y)
+        for (int x = 0; x <= 4; ++x) {
+            const double value = field((i + x / 4.0) * patchSize[level], (j + y / 4.0) * patchSize[level]);
+            lowest = std::min(lowest, value), highest = std::max(highest, value);
+        }
+    return highest - lowest > 0.2;
+}
+
+// The colour of a pixel on a level: that of its cell's middle.
+void colorOf(int level, int x, int y, float* rgba)
+{
+    const int cell = cellSize[level];
+    const auto value = static_cast<float>(field((x / cell + 0.5) * cell, (y / cell + 0.5) * cell));
+    rgba[0] = std::max(value, 0.0f);
+    rgba[1] = 0.1f + 0.2f * static_cast<float>(level);
+    rgba[2] = std::max(-value, 0.0f);
+    rgba[3] = 1;
+}
+
+int main(int argc, char** argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    using FrameBuffer = dfb::DistributedFrameBuffer<FinestLevel>;
+    FrameBuffer fb(mpi.communicator(), {width, height, dfb::OutputFormat::SRGBA8});
+    dfb::FrameParams params;
+    params.timeoutMs = 10000; // a patch that was announced and does not come is an error then
+    auto frame = fb.begin(params);
+    const auto tile = std::make_unique<FrameBuffer::Tile>();
+    for (int level = 0; level < levels; ++level)
+        for (int j = 0; j < height / patchSize[level]; ++j)
+            for (int i = 0; i < width / patchSize[level]; ++i) {
+                if ((3 * i + 5 * j + level) % fb.size() != fb.rank() || !exists(level, i, j))
+                    continue; // another rank has it
+                const int perTile = patchSize[0] / patchSize[level];
+                frame.start(*tile, j / perTile * (width / patchSize[0]) + i / perTile);
+                tile->generation = level;
+                tile->part = static_cast<std::uint16_t>(j % perTile * perTile + i % perTile);
+                for (int child = 0; child < 4 && level + 1 < levels; ++child)
+                    tile->children += exists(level + 1, 2 * i + child % 2, 2 * j + child / 2);
+                tile->forEachPixel([&](int x, int y, float* rgba) {
+                    if (x / patchSize[level] == i && y / patchSize[level] == j)
+                        colorOf(level, x, y, rgba);
+                });
+                frame.setTile(*tile);
+            }
+    frame.end();
+    if (!fb.isDisplayRank())
+        return 0;
+
+    std::ofstream file("custom_tile_op.ppm", std::ios::binary);
+    file << "P6 " << width << ' ' << height << " 255\n";
+    int wrong = 0;
+    for (int y = 0; y < height; ++y)
+        for (int x = 0; x < width; ++x) {
+            const std::uint8_t* pixel = fb.image().rgba8() + 4 * (y * width + x);
+            file.write(reinterpret_cast<const char*>(pixel), 3);
+            int level = levels - 1;
+            while (!exists(level, x / patchSize[level], y / patchSize[level]))
+                --level;
+            float rgba[4];
+            std::byte expected[4];
+            colorOf(level, x, y, rgba);
+            dfb::convertPixels(rgba, 1, dfb::OutputFormat::SRGBA8, expected);
+            wrong += std::memcmp(pixel, expected, 4) != 0;
+        }
+    std::cout << "wrote custom_tile_op.ppm; " << wrong << " pixels differ from the field as one process sees it\n";
+    return wrong != 0;
+}
