@@ -2,10 +2,11 @@
 // meshes have it. Patches lie on any rank. A patch announces how many finer ones refine it, wherever those are: level l
 // is generation l of the tile's tree. The operation keeps the finest value of each pixel and drops the rest.
 //   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
+#include <dfb/dfb.hpp>
+
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <dfb/dfb.hpp>
 #include <fstream>
 #include <iostream>
 #include <memory>
