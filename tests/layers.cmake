@@ -4,7 +4,7 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp fwd.hpp)
-set(level_1 error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
+set(level_1 channels.hpp error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
             detail/float_environment.hpp)
 set(level_2 comm/byte_io.hpp comm/message.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
             comm/transport.hpp tbb_executor.hpp)

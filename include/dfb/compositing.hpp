@@ -18,17 +18,51 @@
 
 namespace dfb {
 
+// An id, and the depth of the layer that it comes from.
+struct NearestId {
+    std::uint32_t id = noId;
+    float depth = std::numeric_limits<float>::infinity();
+};
+
+// The auxiliary channels of a row of pixels, or of a tile's pixels; of each only if it is wanted. See channels.hpp.
+struct AuxPixels {
+    std::vector<double> normal, albedo; // 3 a pixel, premultiplied
+    std::vector<double> weight;         // of those two: the alpha without the background
+    std::vector<float> position;        // 3 a pixel
+    std::vector<NearestId> primitiveId, instanceId;
+
+    void reset(std::size_t pixels, ChannelMask wanted)
+    {
+        const auto count = [&](ChannelMask channel, std::size_t each) { return wanted & channel ? each * pixels : 0; };
+        normal.assign(count(normalChannel, 3), 0.0);
+        albedo.assign(count(albedoChannel, 3), 0.0);
+        weight.assign(count(normalChannel | albedoChannel, 1), 0.0);
+        position.assign(count(positionChannel, 3), 0.0f);
+        primitiveId.assign(count(primitiveIdChannel, 1), {});
+        instanceId.assign(count(instanceIdChannel, 1), {});
+    }
+};
+
 // One row of pixels being composited: `width` pixels.
 struct CompositeRow {
     std::vector<double> rgba;          // 4 * width, premultiplied
     std::vector<double> transmittance; // width
     std::vector<float> depth;          // width: of the nearest layer with alpha > 0, else +infinity
+    AuxPixels aux;
+    // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
+    std::vector<float> reach;             // width, or empty
+    std::vector<std::uint8_t> isUndefined; // width, or empty
 
-    void reset(int width)
+    // `wanted`: of the auxiliary channels.
+    void reset(int width, ChannelMask wanted = 0)
     {
-        rgba.assign(4 * static_cast<std::size_t>(width), 0.0);
-        transmittance.assign(static_cast<std::size_t>(width), 1.0);
-        depth.assign(static_cast<std::size_t>(width), std::numeric_limits<float>::infinity());
+        const auto pixels = static_cast<std::size_t>(width);
+        rgba.assign(4 * pixels, 0.0);
+        transmittance.assign(pixels, 1.0);
+        depth.assign(pixels, std::numeric_limits<float>::infinity());
+        aux.reset(pixels, wanted);
+        reach.assign(wanted & farChannel ? pixels : 0, -std::numeric_limits<float>::infinity());
+        isUndefined.assign(reach.size(), 0);
     }
 };
 
@@ -36,6 +70,12 @@ struct CompositeRow {
 struct Layer {
     const float* color = nullptr;
     const float* depth = nullptr;
+    const detail::ConstPlanes* aux = nullptr; // null: there is nothing else, or it is not wanted
+
+    Layer from(int pixel) const
+    {
+        return {color + 4 * static_cast<std::ptrdiff_t>(pixel), depth ? depth + pixel : nullptr, aux};
+    }
 };
 
 // Composites `count` pixels of a layer under what is already in `row` at pixels [x, x + count).
@@ -60,10 +100,61 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
     }
 }
 
-// Composites a constant premultiplied colour under a whole row (the background).
-inline void overConstant(CompositeRow& row, const float (&rgba)[4])
+// The same for the auxiliary channels that `row` has; to be called before over(), of which it needs what was there
+// before. `aux`: of the first pixel.
+inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux)
+{
+    const auto first = static_cast<std::size_t>(x);
+    const auto blend = [&](std::vector<double>& to, const std::byte* plane) {
+        if (to.empty() || !plane)
+            return;
+        const float* from = detail::floatsOf(plane);
+        double* out = to.data() + 3 * first;
+        for (int i = 0; i < 3 * count; ++i)
+            out[i] += row.transmittance[first + static_cast<std::size_t>(i / 3)] * static_cast<double>(from[i]);
+    };
+    blend(row.aux.normal, aux.at[detail::Normal]);
+    blend(row.aux.albedo, aux.at[detail::Albedo]);
+    const auto isNearest = [&](int i) { // of those whose alpha counts
+        return layer.color[4 * i + 3] > 0.0f && layer.depth && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
+    };
+    if (!row.aux.position.empty() && aux.at[detail::Position]) {
+        const float* from = detail::floatsOf(aux.at[detail::Position]);
+        for (int i = 0; i < count; ++i)
+            if (isNearest(i))
+                std::copy_n(from + 3 * i, 3, row.aux.position.data() + 3 * (first + static_cast<std::size_t>(i)));
+    }
+    const auto takeId = [&](std::vector<NearestId>& to, const std::byte* plane) {
+        if (to.empty() || !plane)
+            return;
+        const std::uint32_t* from = detail::idsOf(plane);
+        for (int i = 0; i < count; ++i) {
+            NearestId& id = to[first + static_cast<std::size_t>(i)];
+            if (id.id == noId && from[i] != noId && layer.color[4 * i + 3] > 0.0f)
+                id = {from[i], layer.depth ? layer.depth[i] : 0.0f};
+        }
+    };
+    takeId(row.aux.primitiveId, aux.at[detail::PrimitiveId]);
+    takeId(row.aux.instanceId, aux.at[detail::InstanceId]);
+    if (row.reach.empty() || !aux.at[detail::Far] || !layer.depth)
+        return;
+    const float* farDepth = detail::floatsOf(aux.at[detail::Far]);
+    for (int i = 0; i < count; ++i) {
+        if (!(layer.color[4 * i + 3] > 0.0f))
+            continue;
+        float& reach = row.reach[first + static_cast<std::size_t>(i)];
+        if (layer.depth[i] < reach)
+            row.isUndefined[first + static_cast<std::size_t>(i)] = 1;
+        reach = std::max({reach, layer.depth[i], farDepth[i]});
+    }
+}
+
+// Composites a constant premultiplied colour under a whole row: the background, after all else.
+inline void overBackground(CompositeRow& row, const float (&rgba)[4])
 {
     const std::size_t width = row.transmittance.size();
+    for (std::size_t x = 0; x < row.aux.weight.size(); ++x)
+        row.aux.weight[x] = row.rgba[4 * x + 3];
     for (std::size_t x = 0; x < width; ++x)
         for (std::size_t c = 0; c < 4; ++c)
             row.rgba[4 * x + c] += row.transmittance[x] * static_cast<double>(rgba[c]);
@@ -104,9 +195,10 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     const std::size_t n = layers.size();
     auto blend = [&](int begin, int end) {
         for (int layer : order) {
-            const Layer& l = layers[static_cast<std::size_t>(layer)];
-            over(row, x + begin, end - begin,
-                 {l.color + 4 * static_cast<std::ptrdiff_t>(begin), l.depth ? l.depth + begin : nullptr});
+            const Layer l = layers[static_cast<std::size_t>(layer)].from(begin);
+            if (l.aux)
+                overAux(row, x + begin, end - begin, l, l.aux->from(static_cast<std::size_t>(begin)));
+            over(row, x + begin, end - begin, l);
         }
     };
     order.resize(n);
@@ -143,10 +235,45 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     }
 }
 
+// Composites `count` pixels of several layers under `row` at [x, x + count), in their order, whatever their depth.
+inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
+{
+    for (const Layer& layer : layers) {
+        if (layer.aux)
+            overAux(row, x, count, layer, *layer.aux);
+        over(row, x, count, layer);
+    }
+}
+
+// Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
+// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there. Nothing may be in the row yet.
+inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
+{
+    for (int i = 0; i < count; ++i) {
+        const Layer* nearest = nullptr;
+        for (const Layer& layer : layers)
+            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i]))
+                nearest = &layer;
+        const Layer l = nearest->from(i);
+        if (l.aux)
+            overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)));
+        over(row, x + i, 1, l);
+    }
+}
+
+// How the inputs of a pixel become one.
+enum class BlendRule {
+    SortByDepth, // sortAndBlend
+    InOrder,     // over, in the order of the fragments
+    Nearest      // keepNearest
+};
+
 // Composites the fragments of one tile and pass, row by row. The fragments' order decides between equal depths:
 // sort them by (source, part) first.
 class FragmentCompositor {
 public:
+    explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
+
     // `begin` to `end` are iterators of pointers to fragments, which must outlive this.
     template <class Iterator>
     void start(Iterator begin, Iterator end)
@@ -162,6 +289,9 @@ public:
     {
         active_.clear();
         edges_.clear();
+        const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
+                              || !row.aux.position.empty() || !row.aux.primitiveId.empty()
+                              || !row.aux.instanceId.empty();
         for (FragmentCursor& cursor : cursors_) {
             const FragmentRow r = cursor.next();
             if (r.spanCount == 0)
@@ -178,28 +308,41 @@ public:
         for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
             const int x0 = edges_[e], x1 = edges_[e + 1];
             layers_.clear();
+            aux_.resize(wantsAux ? active_.size() : 0); // before anybody points into it
             for (FragmentRow& r : active_) {
                 while (r.spanCount > 0 && r.spans->x + r.spans->count <= x0) {
                     r.color += 4 * static_cast<std::ptrdiff_t>(r.spans->count);
                     if (r.depth)
                         r.depth += r.spans->count;
+                    if (wantsAux)
+                        r.aux.advance(r.spans->count);
                     ++r.spans;
                     --r.spanCount;
                 }
                 if (r.spanCount > 0 && r.spans->x <= x0) {
                     const int offset = x0 - r.spans->x;
-                    layers_.push_back(
-                        {r.color + 4 * static_cast<std::ptrdiff_t>(offset), r.depth ? r.depth + offset : nullptr});
+                    layers_.push_back(Layer{r.color, r.depth, nullptr}.from(offset));
+                    if (wantsAux) {
+                        aux_[layers_.size() - 1] = r.aux.from(static_cast<std::size_t>(offset));
+                        layers_.back().aux = &aux_[layers_.size() - 1];
+                    }
                 }
             }
-            if (!layers_.empty())
-                sortAndBlend(row, x0, x1 - x0, layers_, order_);
+            if (layers_.empty())
+                continue;
+            switch (rule_) {
+            case BlendRule::SortByDepth: sortAndBlend(row, x0, x1 - x0, layers_, order_); break;
+            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_); break;
+            case BlendRule::Nearest: keepNearest(row, x0, x1 - x0, layers_); break;
+            }
         }
     }
 
 private:
+    BlendRule rule_;
     std::vector<FragmentCursor> cursors_;
     std::vector<FragmentRow> active_;
+    std::vector<detail::ConstPlanes> aux_; // of layers_
     std::vector<int> edges_;
     std::vector<Layer> layers_;
     std::vector<int> order_;

@@ -66,6 +66,16 @@ public:
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
         bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
 
+        // How many samples a tile gets in this frame, and which.
+        TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
+
+        // Adds to what FrameReport::figures has for this key, on all ranks. For what a renderer measures and all ranks
+        // must know alike, such as the cost of a brick: it travels with the verdict. From any thread.
+        void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
+
+        // Makes FrameReport::mergeErrorBound at least this. From any thread.
+        void noteMergeError(double bound) const { engine_->noteMergeError(bound); }
+
         // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
         bool failed() const noexcept { return engine_->failed(); }
 

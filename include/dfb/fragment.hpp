@@ -17,12 +17,20 @@ struct Span {
 };
 
 // The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its
-// colour at color + 4 * k and its depth at depth + k.
+// colour at color + 4 * k and its depth at depth + k. What did not travel is null.
 struct FragmentRow {
     const Span* spans = nullptr;
     int spanCount = 0;
     const float* color = nullptr;
-    const float* depth = nullptr; // null where the depth channel did not travel
+    const float* depth = nullptr;
+    detail::ConstPlanes aux; // all but colour and depth
+
+    const float* normal() const noexcept { return detail::floatsOf(aux.at[detail::Normal]); }     // 3 a pixel
+    const float* albedo() const noexcept { return detail::floatsOf(aux.at[detail::Albedo]); }     // 3 a pixel
+    const float* position() const noexcept { return detail::floatsOf(aux.at[detail::Position]); } // 3 a pixel
+    const std::uint32_t* primitiveId() const noexcept { return detail::idsOf(aux.at[detail::PrimitiveId]); }
+    const std::uint32_t* instanceId() const noexcept { return detail::idsOf(aux.at[detail::InstanceId]); }
+    const float* farDepth() const noexcept { return detail::floatsOf(aux.at[detail::Far]); }
 };
 
 // How the pixels of a fragment are stored.
@@ -42,9 +50,11 @@ public:
         std::uint32_t activePixels = 0;               // that contribute, also where fewer are stored
         const std::uint16_t* rowSpanCounts = nullptr; // Sparse: one per row in [rowBegin, rowEnd)
         const Span* spans = nullptr;                  // Sparse: all spans, row by row; else one full-width span
+        ChannelMask channels = colorChannel;
         const float* color = nullptr;
         const float* depth = nullptr;
-        Span fullRow; // Dense and Constant
+        detail::ConstPlanes aux; // all but colour and depth
+        Span fullRow;            // Dense and Constant
     };
 
     Fragment() = default;
@@ -59,6 +69,7 @@ public:
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
     std::uint32_t activePixels() const noexcept { return parts_.activePixels; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr; }
+    ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
 
 private:
@@ -73,7 +84,8 @@ class FragmentCursor {
 public:
     explicit FragmentCursor(const Fragment& fragment)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
-          depth_(fragment.parts_.depth)
+          depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
+          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0)
     {
     }
 
@@ -84,13 +96,13 @@ public:
         if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
             return {};
         if (parts_->encoding != FragmentEncoding::Sparse) {
-            const FragmentRow result{&parts_->fullRow, 1, color_, depth_};
+            const FragmentRow result{&parts_->fullRow, 1, color_, depth_, aux_};
             if (parts_->encoding == FragmentEncoding::Dense)
                 advance(parts_->fullRow.count);
             return result;
         }
         const int count = parts_->rowSpanCounts[row - parts_->rowBegin];
-        const FragmentRow result{span_, count, color_, depth_};
+        const FragmentRow result{span_, count, color_, depth_, aux_};
         std::size_t pixels = 0;
         for (int i = 0; i < count; ++i)
             pixels += span_[i].count;
@@ -105,12 +117,16 @@ private:
         color_ += 4 * pixels;
         if (depth_)
             depth_ += pixels;
+        if (hasAux_)
+            aux_.advance(pixels);
     }
 
     const Fragment::Parts* parts_;
     const Span* span_;
     const float* color_;
     const float* depth_;
+    detail::ConstPlanes aux_;
+    bool hasAux_;
     int row_ = 0;
 };
 

@@ -1,6 +1,7 @@
 // What goes into a frame and what comes out of it: configuration, parameters, report.
 #pragma once
 
+#include <dfb/channels.hpp>
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/exec.hpp>
@@ -10,6 +11,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <vector>
 
 namespace dfb {
 
@@ -25,6 +27,7 @@ struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
     bool depth = false;                        // the image has depth as well
+    ChannelMask aux = 0;                       // and these of imageAuxChannels, which the tile operation must have
     int displayRank = 0;
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
@@ -38,10 +41,20 @@ struct FrameBufferConfig {
     bool checksums = false; // a CRC-32C in each message: whoever does not trust the network pays for it
 };
 
+// The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.
+struct TileSamples {
+    int first = 0, count = 1;
+};
+using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
+
 // What a frame begins with; the same on all ranks, which is checked in the verdict.
 struct FrameParams {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
     int passes = 1;                              // samples a pixel, each a pass
+    // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile operation
+    // that keepsState may a tile have none or not begin with sample 0.
+    SamplePlan samples;
+    std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
     // True: each rank says with Frame::declare() what it will send, and owners count on that.
     bool declared = false;
@@ -52,6 +65,18 @@ struct FrameParams {
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
     // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
     int timeoutMs = 0;
+};
+
+// What its operation says of a tile that was finished in a frame.
+struct TileError {
+    int tile = 0;
+    double error = 0; // TileReport::error
+};
+
+// A number that a renderer wants to know of all ranks when the frame ends, such as the cost of a brick.
+struct Figure {
+    std::uint64_t key = 0;
+    double value = 0;
 };
 
 // Figures of a finished frame. "All" are sums or maxima over the ranks and the same everywhere, up to the moment when
@@ -67,6 +92,10 @@ struct FrameReport {
     std::int64_t tilesTotal = 0;       // in the image
     std::int64_t tilesTouched = 0;     // all: tiles that had an input
     std::int64_t nonFinitePixels = 0;  // all: input pixels with an infinity or NaN (see detail/wire.hpp)
+    std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
+    double mergeErrorBound = 0;        // all: the largest that Frame::noteMergeError() was given
+    std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
+    std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key
     std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict
     std::int64_t repeatedMessages = 0; // all: came twice, dropped since the last verdict
     std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messagePoolBytes

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/buffer.hpp>
+#include <dfb/channels.hpp>
 #include <dfb/error.hpp>
 
 #include <algorithm>
@@ -129,13 +130,16 @@ void convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* 
 class Image {
 public:
     Image() = default;
-    Image(MemoryPool& pool, int width, int height, OutputFormat format, bool withDepth)
+    // `channels`: beside the colour.
+    Image(MemoryPool& pool, int width, int height, OutputFormat format, ChannelMask channels)
         : width_(width), height_(height), format_(format)
     {
-        if (format != OutputFormat::None)
-            color_ = pool.acquire(pixelCount() * bytesPerPixel(format));
-        if (withDepth && format != OutputFormat::None)
-            depth_ = pool.acquire(pixelCount() * sizeof(float));
+        if (format == OutputFormat::None)
+            return;
+        planes_[detail::Color] = pool.acquire(pixelCount() * bytesPerPixel(format));
+        for (std::size_t c = detail::Depth; c < detail::channelCount; ++c)
+            if (detail::hasChannel(channels, c))
+                planes_[c] = pool.acquire(pixelCount() * 4 * static_cast<std::size_t>(detail::channelWords[c]));
     }
 
     int width() const noexcept { return width_; }
@@ -145,34 +149,44 @@ public:
     {
         return static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
     }
-    bool empty() const noexcept { return color_.empty(); }
-    bool hasDepth() const noexcept { return !depth_.empty(); }
+    bool empty() const noexcept { return planes_[detail::Color].empty(); }
+    bool hasDepth() const noexcept { return !planes_[detail::Depth].empty(); }
 
-    std::byte* bytes() noexcept { return color_.data(); }
-    const std::byte* bytes() const noexcept { return color_.data(); }
+    std::byte* bytes() noexcept { return planes_[detail::Color].data(); }
+    const std::byte* bytes() const noexcept { return planes_[detail::Color].data(); }
 
     // 4 bytes a pixel. Throws InvalidArgument unless the format is RGBA8 or SRGBA8.
     const std::uint8_t* rgba8() const
     {
         require(format_ == OutputFormat::RGBA8 || format_ == OutputFormat::SRGBA8, "8-bit pixels");
-        return reinterpret_cast<const std::uint8_t*>(color_.data());
+        return reinterpret_cast<const std::uint8_t*>(bytes());
     }
     // 4 floats a pixel. Throws InvalidArgument unless the format is RGBA32F.
     const float* rgba32f() const
     {
         require(format_ == OutputFormat::RGBA32F, "float pixels");
-        return reinterpret_cast<const float*>(color_.data());
+        return reinterpret_cast<const float*>(bytes());
     }
-    // One float a pixel, +infinity where nothing was hit. Throws InvalidArgument if depth was not asked for.
-    const float* depth() const
+    // One float a pixel, +infinity where nothing was hit. This and the next throw InvalidArgument if the channel was not
+    // asked for. What they mean where inputs were blended: channels.hpp.
+    const float* depth() const { return detail::floatsOf(plane(detail::Depth, "depth")); }
+    const float* normal() const { return detail::floatsOf(plane(detail::Normal, "normals")); }         // 3 a pixel
+    const float* albedo() const { return detail::floatsOf(plane(detail::Albedo, "albedo")); }          // 3 a pixel
+    const float* position() const { return detail::floatsOf(plane(detail::Position, "positions")); }   // 3 a pixel
+    // noId where there is none.
+    const std::uint32_t* primitiveId() const { return detail::idsOf(plane(detail::PrimitiveId, "primitive ids")); }
+    const std::uint32_t* instanceId() const { return detail::idsOf(plane(detail::InstanceId, "instance ids")); }
+
+    // Where pixel `first` of each plane is; null where there is none.
+    detail::Planes planesAt(std::size_t first) noexcept
     {
-        require(hasDepth(), "depth");
-        return reinterpret_cast<const float*>(depth_.data());
-    }
-    float* depth()
-    {
-        require(hasDepth(), "depth");
-        return reinterpret_cast<float*>(depth_.data());
+        detail::Planes planes;
+        for (std::size_t c = detail::Depth; c < detail::channelCount; ++c)
+            if (!planes_[c].empty())
+                planes.at[c] = planes_[c].data() + 4 * first * static_cast<std::size_t>(detail::channelWords[c]);
+        if (!empty())
+            planes.at[detail::Color] = bytes() + first * bytesPerPixel(format_);
+        return planes;
     }
 
 private:
@@ -183,10 +197,15 @@ private:
                                   + " (only the display rank has an image, in the format it was configured for)");
     }
 
+    const std::byte* plane(detail::Channel channel, const char* what) const
+    {
+        require(!planes_[channel].empty(), what);
+        return planes_[channel].data();
+    }
+
     int width_ = 0, height_ = 0;
     OutputFormat format_ = OutputFormat::None;
-    Buffer color_;
-    Buffer depth_;
+    std::array<Buffer, detail::channelCount> planes_;
 };
 
 } // namespace dfb

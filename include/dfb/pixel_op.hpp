@@ -17,6 +17,7 @@
 #include <dfb/tile_op.hpp>
 
 #include <cstddef>
+#include <cstdint>
 #include <type_traits>
 #include <utility>
 
@@ -27,7 +28,9 @@ struct PixelTile {
     int tile = 0;
     Region region;
     float* color = nullptr;       // 4 a pixel, premultiplied linear RGBA
-    const float* depth = nullptr; // 1 a pixel; null unless the output has depth
+    const float* depth = nullptr; // 1 a pixel; null unless the image has depth
+    AuxRow aux{};                 // of all pixels; null what the image does not have
+    std::int64_t frame = 0;       // its number
 
     std::size_t pixelCount() const noexcept
     {

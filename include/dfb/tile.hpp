@@ -2,66 +2,160 @@
 // channels fixed at compile time.
 #pragma once
 
+#include <dfb/channels.hpp>
 #include <dfb/image.hpp>
 
+#include <algorithm>
+#include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <limits>
 
 namespace dfb {
 
-// A set of channels, one bit each.
-using ChannelMask = std::uint16_t;
-inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats a pixel
-inline constexpr ChannelMask depthChannel = 2; // distance along the ray or any monotone function of it, 1 float
-
-// Floats that the channels of a mask take per pixel.
-constexpr int floatsPerPixel(ChannelMask channels) noexcept
-{
-    return (channels & colorChannel ? 4 : 0) + (channels & depthChannel ? 1 : 0);
-}
-
 // Who an input of a tile is. (tile, pass, generation, source, part) is unique in a frame.
 struct TileHeader {
     std::int64_t frame = -1;  // set by Frame::start
     int tile = -1;            // index in the TileLayout
     Region region;            // its pixels; at the right and lower border smaller than the tile
-    int pass = 0;             // sample index: passes are composited each by itself, then averaged
+    int pass = 0;             // passes are composited each by itself, then averaged
     int generation = 0;       // level in the tile's dependency tree
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id; the rank where there are no bricks
     std::uint16_t part = 0;   // to tell apart several inputs of one source
+    int sample = 0;           // of the pixel, over all frames that accumulate: the index to seed with; set by start
 };
 
 namespace detail {
-template <bool Present, int FloatCount>
+
+// The arrays of a tile, each there if the tile has the channel.
+template <bool Present, int PixelCount>
 struct DepthPlane {
-    float depth[FloatCount];
+    float depth[PixelCount];
 };
-template <int FloatCount>
-struct DepthPlane<false, FloatCount> {
+template <bool Present, int PixelCount>
+struct NormalPlane {
+    float normal[3 * PixelCount];
 };
+template <bool Present, int PixelCount>
+struct AlbedoPlane {
+    float albedo[3 * PixelCount];
+};
+template <bool Present, int PixelCount>
+struct PositionPlane {
+    float position[3 * PixelCount];
+};
+template <bool Present, int PixelCount>
+struct PrimitiveIdPlane {
+    std::uint32_t primitiveId[PixelCount];
+};
+template <bool Present, int PixelCount>
+struct InstanceIdPlane {
+    std::uint32_t instanceId[PixelCount];
+};
+template <bool Present, int PixelCount>
+struct FarPlane {
+    float farDepth[PixelCount];
+};
+template <int PixelCount>
+struct DepthPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct NormalPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct AlbedoPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct PositionPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct PrimitiveIdPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct InstanceIdPlane<false, PixelCount> {
+};
+template <int PixelCount>
+struct FarPlane<false, PixelCount> {
+};
+
+template <ChannelMask Channels, int PixelCount>
+struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
+                    NormalPlane<hasChannel(Channels, Normal), PixelCount>,
+                    AlbedoPlane<hasChannel(Channels, Albedo), PixelCount>,
+                    PositionPlane<hasChannel(Channels, Position), PixelCount>,
+                    PrimitiveIdPlane<hasChannel(Channels, PrimitiveId), PixelCount>,
+                    InstanceIdPlane<hasChannel(Channels, InstanceId), PixelCount>,
+                    FarPlane<hasChannel(Channels, Far), PixelCount> {
+    float color[4 * PixelCount];
+
+    ConstPlanes planes() const noexcept
+    {
+        ConstPlanes p;
+        const auto set = [&p](Channel channel, const void* data) { p.at[channel] = static_cast<const std::byte*>(data); };
+        set(Color, color);
+        if constexpr (hasChannel(Channels, Depth))
+            set(Depth, this->depth);
+        if constexpr (hasChannel(Channels, Normal))
+            set(Normal, this->normal);
+        if constexpr (hasChannel(Channels, Albedo))
+            set(Albedo, this->albedo);
+        if constexpr (hasChannel(Channels, Position))
+            set(Position, this->position);
+        if constexpr (hasChannel(Channels, PrimitiveId))
+            set(PrimitiveId, this->primitiveId);
+        if constexpr (hasChannel(Channels, InstanceId))
+            set(InstanceId, this->instanceId);
+        if constexpr (hasChannel(Channels, Far))
+            set(Far, this->farDepth);
+        return p;
+    }
+};
+
 } // namespace detail
 
-// Pixel (x, y) of the tile, counted from region.x0 and region.y0, is color[4 * (y * size + x)] and
-// depth[y * size + x]. Pixels outside the region are never read.
+// Pixel (x, y) of the tile, counted from region.x0 and region.y0, is pixel i = y * size + x: color[4 * i], and as far as
+// the tile has the channels depth[i], normal[3 * i], albedo[3 * i], position[3 * i], primitiveId[i], instanceId[i],
+// farDepth[i]. Pixels outside the region are never read.
 template <ChannelMask Channels, int Size>
-struct Tile : TileHeader, detail::DepthPlane<(Channels & depthChannel) != 0, Size * Size> {
+struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     static_assert(Size >= 8 && Size <= 256, "dfb: the tile size must be 8 to 256 pixels");
     static_assert(Channels & colorChannel, "dfb: a tile has at least the colour channel");
 
     static constexpr int size = Size;
     static constexpr ChannelMask channels = Channels;
     static constexpr bool hasDepth = (Channels & depthChannel) != 0;
+    using detail::TilePlanes<Channels, Size * Size>::color;
 
-    float color[4 * Size * Size];
-
-    // All pixels: nothing here (colour 0, depth +infinity).
-    void clear()
+    // All pixels: nothing here (all 0, depth +infinity, no id). Channels that are not in `which` are left as they are.
+    void clear(ChannelMask which = Channels)
     {
+        const auto has = [which](ChannelMask channel) { return (which & channel) != 0; };
+        constexpr std::size_t count = static_cast<std::size_t>(Size) * Size;
+        const float infinity = std::numeric_limits<float>::infinity();
         std::memset(color, 0, sizeof color);
+        (void)has;
         if constexpr (hasDepth)
-            std::fill_n(this->depth, Size * Size, std::numeric_limits<float>::infinity());
+            if (has(depthChannel))
+                std::fill_n(this->depth, count, infinity);
+        if constexpr ((Channels & normalChannel) != 0)
+            if (has(normalChannel))
+                std::memset(this->normal, 0, sizeof this->normal);
+        if constexpr ((Channels & albedoChannel) != 0)
+            if (has(albedoChannel))
+                std::memset(this->albedo, 0, sizeof this->albedo);
+        if constexpr ((Channels & positionChannel) != 0)
+            if (has(positionChannel))
+                std::memset(this->position, 0, sizeof this->position);
+        if constexpr ((Channels & primitiveIdChannel) != 0)
+            if (has(primitiveIdChannel))
+                std::fill_n(this->primitiveId, count, noId);
+        if constexpr ((Channels & instanceIdChannel) != 0)
+            if (has(instanceIdChannel))
+                std::fill_n(this->instanceId, count, noId);
+        if constexpr ((Channels & farChannel) != 0)
+            if (has(farChannel))
+                std::fill_n(this->farDepth, count, -infinity); // nobody has said: no farther than the depth
     }
 
     // All pixels: one premultiplied RGBA colour at one depth.

@@ -16,13 +16,18 @@
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
+//   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
+//                                                in a frame, and the image keeps its pixels
+//   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
 #include <dfb/fragment.hpp>
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <type_traits>
 #include <utility>
 
@@ -35,49 +40,72 @@ struct TileInfo {
     int tile = 0;
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
-    bool wantsDepth = false;                     // the output has a depth channel
+    int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
+    std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
+    ChannelMask wanted = 0;                      // what the image has beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
+};
+
+// One row of the auxiliary channels of a finished tile; see channels.hpp for what they hold. Null: nothing anywhere.
+struct AuxRow {
+    const float* normal = nullptr;
+    const float* albedo = nullptr;
+    const float* position = nullptr;
+    const std::uint32_t* primitiveId = nullptr;
+    const std::uint32_t* instanceId = nullptr;
 };
 
 // Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way.
 class FinishedTile {
 public:
-    // Rows of `region.width()` pixels: colour in `format` at color + y * colorStride, depth (may be null) at
-    // depth + y * depthStride.
-    FinishedTile(const Region& region, OutputFormat format, std::byte* color, std::size_t colorStride, float* depth,
-                 std::size_t depthStride)
-        : region_(region), format_(format), color_(color), colorStride_(colorStride), depth_(depth),
-          depthStride_(depthStride)
+    // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
+    FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride)
+        : region_(region), format_(format), to_(to), stride_(stride)
     {
     }
 
     const Region& region() const noexcept { return region_; }
     int width() const noexcept { return region_.width(); }
     int height() const noexcept { return region_.height(); }
-    bool wantsDepth() const noexcept { return depth_ != nullptr; }
+    bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
     // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
-    // all +infinity). Every row must be set once.
-    void setRow(int y, const double* rgba, const float* depth)
+    // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once.
+    void setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
     {
-        if (color_)
-            convertPixels(rgba, width(), format_, color_ + static_cast<std::size_t>(y) * colorStride_);
-        if (!depth_)
-            return;
-        float* out = depth_ + static_cast<std::size_t>(y) * depthStride_;
-        if (depth)
-            std::copy(depth, depth + width(), out);
-        else
-            std::fill(out, out + width(), std::numeric_limits<float>::infinity());
+        const std::size_t first = static_cast<std::size_t>(y) * stride_;
+        if (to_.at[detail::Color])
+            convertPixels(rgba, width(), format_, to_.at[detail::Color] + first * bytesPerPixel(format_));
+        const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
+            if (!to_.at[channel])
+                return;
+            const auto words = static_cast<std::size_t>(detail::channelWords[channel]);
+            const std::size_t count = words * static_cast<std::size_t>(width());
+            auto* out = reinterpret_cast<decltype(empty)*>(to_.at[channel]) + words * first;
+            if (from)
+                std::copy(from, from + count, out);
+            else
+                std::fill(out, out + count, empty);
+        };
+        set(detail::Depth, depth, std::numeric_limits<float>::infinity());
+        set(detail::Normal, aux.normal, 0.0f);
+        set(detail::Albedo, aux.albedo, 0.0f);
+        set(detail::Position, aux.position, 0.0f);
+        set(detail::PrimitiveId, aux.primitiveId, noId);
+        set(detail::InstanceId, aux.instanceId, noId);
     }
 
 private:
     Region region_;
     OutputFormat format_;
-    std::byte* color_;
-    std::size_t colorStride_;
-    float* depth_;
-    std::size_t depthStride_;
+    detail::Planes to_;
+    std::size_t stride_;
+};
+
+// What a TileOp says of a tile that it has finished, if it has a member report().
+struct TileReport {
+    double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
+    std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
 };
 
 struct NoFrameData {};
@@ -146,6 +174,21 @@ struct HasFinish : std::false_type {
 };
 template <class T>
 struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> : std::true_type {
+};
+
+template <class T, class = void>
+struct KeepsState : std::false_type {
+};
+template <class T>
+struct KeepsState<T, std::void_t<decltype(T::keepsState)>> : std::bool_constant<T::keepsState> {
+};
+
+template <class T, class = void>
+struct HasReport : std::false_type {
+};
+template <class T>
+struct HasReport<T, std::void_t<decltype(std::declval<const T&>().report(std::declval<TileReport&>()))>>
+    : std::true_type {
 };
 
 template <class T, class = void>

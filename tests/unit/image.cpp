@@ -141,7 +141,7 @@ TEST_CASE("An image shows what it has and says what it has not", "[image]")
     CHECK_THROWS_AS(none.rgba32f(), dfb::InvalidArgument);
     CHECK_THROWS_AS(none.depth(), dfb::InvalidArgument);
 
-    const dfb::Image bytes(*pool, 3, 5, dfb::OutputFormat::SRGBA8, false);
+    const dfb::Image bytes(*pool, 3, 5, dfb::OutputFormat::SRGBA8, 0);
     CHECK(bytes.pixelCount() == 15);
     CHECK_FALSE(bytes.empty());
     CHECK_FALSE(bytes.hasDepth());
@@ -149,7 +149,7 @@ TEST_CASE("An image shows what it has and says what it has not", "[image]")
     CHECK_THROWS_AS(bytes.rgba32f(), dfb::InvalidArgument);
     CHECK_THROWS_AS(bytes.depth(), dfb::InvalidArgument);
 
-    const dfb::Image floats(*pool, 3, 5, dfb::OutputFormat::RGBA32F, true);
+    const dfb::Image floats(*pool, 3, 5, dfb::OutputFormat::RGBA32F, dfb::depthChannel);
     CHECK(floats.rgba32f() != nullptr);
     CHECK(floats.depth() != nullptr);
     CHECK_THROWS_AS(floats.rgba8(), dfb::InvalidArgument);

@@ -78,7 +78,7 @@ Output runOp(const Inputs<Op::tileSize>& in, const std::vector<std::size_t>& ord
     info.tile = in.tile;
     info.region = region;
     info.passes = in.passes;
-    info.wantsDepth = withDepth;
+    info.wanted = withDepth ? dfb::depthChannel : 0;
     info.background = in.background;
     Op op;
     Output out;
@@ -90,13 +90,16 @@ Output runOp(const Inputs<Op::tileSize>& in, const std::vector<std::size_t>& ord
             const auto wanted = static_cast<dfb::ChannelMask>(dfb::detail::NeededChannelsOf<Op>::value
                                                               | (withDepth ? dfb::depthChannel : 0));
             dfb::Buffer message = dfb::detail::encodeFragment(*pool, *in.tiles[i], wanted, 0, nullptr, out.nonFinite);
-            op.add(dfb::detail::decodeFragment(*pool, std::move(message), in.layout, in.passes, nullptr));
+            op.add(dfb::detail::decodeFragment(*pool, std::move(message), in.layout, [&](int) { return in.passes; }, nullptr));
         }
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
         const std::size_t stride = width * dfb::bytesPerPixel(format);
         out.color.assign(stride * height, std::byte{0xcd});
         out.depth.assign(withDepth ? width * height : 0, -7.0f);
-        dfb::FinishedTile finished(region, format, out.color.data(), stride, withDepth ? out.depth.data() : nullptr, width);
+        dfb::detail::Planes planes;
+        planes.at[dfb::detail::Color] = out.color.data();
+        planes.at[dfb::detail::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
+        dfb::FinishedTile finished(region, format, planes, width);
         op.finish(finished);
     }
     return out;

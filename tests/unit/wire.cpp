@@ -163,7 +163,7 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             CHECK(header.number == 77);
             CHECK(header.receiver == 9);
             const std::size_t sizeBefore = message.size();
-            const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, 3, codec);
+            const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, codec);
             const dfb::TileHeader& h = fragment.header();
             CHECK((h.frame == 77 && h.tile == index && h.region == tile->region && h.pass == 2 && h.generation == 5
                    && h.children == 3 && h.source == 0xfedcba98u && h.part == 0x7654));
@@ -224,7 +224,7 @@ Outcome tryDecode(const std::vector<std::byte>& bytes, const dfb::TileLayout& la
     std::copy(bytes.begin(), bytes.end(), message.data());
     try {
         dfb::detail::readMessageHeader(message);
-        const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, 3, codec);
+        const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, codec);
         dfb::FragmentCursor cursor(fragment);
         const int width = fragment.header().region.width();
         std::uint32_t pixels = 0;
@@ -302,7 +302,7 @@ TEST_CASE("Depth travels in canonical form, and what is not finite is counted on
     std::uint64_t nonFinite = 0;
     dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, nonFinite);
     CHECK(nonFinite == 3);
-    const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, 3, nullptr);
+    const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, nullptr);
     dfb::FragmentCursor cursor(fragment);
     const dfb::FragmentRow row = cursor.next();
     REQUIRE(row.spanCount == 1);
@@ -334,7 +334,7 @@ TEST_CASE("A message of another version, byte order or codec is named as such", 
         std::copy(bytes.begin(), bytes.end(), message.data());
         try {
             dfb::detail::readMessageHeader(message);
-            dfb::detail::decodeFragment(*pool, std::move(message), layout, 3, nullptr);
+            dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, nullptr);
         } catch (const dfb::Error& e) {
             return std::string(e.what());
         }

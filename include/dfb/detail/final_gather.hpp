@@ -6,6 +6,7 @@
 #include <dfb/detail/wire.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
+#include <dfb/tile_op.hpp>
 
 #include <algorithm>
 #include <array>
@@ -24,7 +25,7 @@ namespace dfb::detail {
 // What the messages to the display rank need to know.
 struct GatherSettings {
     OutputFormat format = OutputFormat::None;
-    bool depth = false;
+    ChannelMask channels = 0; // beside the colour
     std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
     bool atEnd = false; // nothing leaves before flush()
@@ -44,10 +45,8 @@ public:
     };
     // Where a finished tile goes.
     struct Place {
-        std::byte* color = nullptr;
-        std::size_t colorStride = 0; // bytes
-        float* depth = nullptr;
-        std::size_t depthStride = 0; // floats
+        Planes planes;
+        std::size_t stride = 0; // of rows, in pixels
         std::shared_ptr<Batch> batch;
     };
 
@@ -60,7 +59,7 @@ public:
         if (isDisplay_ && enabled())
             tilesOf_ = std::vector<TilesOf>(static_cast<std::size_t>(rankCount_));
         if (isDisplay_ && settings_.format != OutputFormat::None) {
-            image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.depth);
+            image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
             for (auto& s : state_)
                 s = TileState::Undefined;
@@ -89,10 +88,10 @@ public:
     }
 
     // The most that a message to the display rank can have.
-    static std::size_t largestMessage(int tileSize, OutputFormat format, bool depth)
+    static std::size_t largestMessage(int tileSize, OutputFormat format, ChannelMask channels)
     {
         const auto pixels = static_cast<std::size_t>(tileSize) * static_cast<std::size_t>(tileSize);
-        return std::max(batchBytes, prefix + recordBytes(pixels, format, depth));
+        return std::max(batchBytes, prefix + recordBytes(pixels, format, channels));
     }
 
     // Room for a finished tile. write() it, then commit().
@@ -132,13 +131,13 @@ public:
         const auto tileIndex = static_cast<std::int32_t>(tile);
         std::memset(record, 0, recordPrefix);
         std::memcpy(record, &tileIndex, sizeof tileIndex);
-        place.color = record + recordPrefix;
-        place.colorStride = width * bytesPerPixel(settings_.format);
-        if (settings_.depth) {
-            place.depth = reinterpret_cast<float*>(
-                place.color + alignedTo16(place.colorStride * static_cast<std::size_t>(region.height())));
-            place.depthStride = width;
-        }
+        std::byte* plane = record + recordPrefix;
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (travels(c)) {
+                place.planes.at[c] = plane;
+                plane += alignedTo16(pixelBytes(c) * pixelsIn(region));
+            }
+        place.stride = width;
         return place;
     }
 
@@ -257,30 +256,28 @@ public:
     }
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
-    // background before and is of the same colour is left alone.
-    void fillBackground(const std::array<float, 4>& rgba)
+    // background before and is of the same colour is left alone, as are tiles of an earlier frame that are `kept(tile)`.
+    template <class Kept>
+    void fillBackground(const std::array<float, 4>& rgba, const Kept& kept)
     {
         if (image_.empty())
             return;
         const bool same = std::memcmp(&rgba, &background_, sizeof rgba) == 0;
         background_ = rgba;
-        std::byte pixel[16];
-        convertPixels(rgba.data(), 1, settings_.format, pixel);
-        const std::size_t pixelBytes = bytesPerPixel(settings_.format);
+        std::vector<double> row;
         for (int tile = 0; tile < layout_.tileCount(); ++tile) {
             auto& s = state_[static_cast<std::size_t>(tile)];
-            if (s == TileState::Received || (s == TileState::Background && same))
+            if (s == TileState::Received || (s == TileState::Background && same)
+                || (s == TileState::Old && kept(tile)))
                 continue;
             const Region region = layout_.region(tile);
             const Place place = inImage(region);
-            for (int y = 0; y < region.height(); ++y) {
-                std::byte* row = place.color + static_cast<std::size_t>(y) * place.colorStride;
-                for (int x = 0; x < region.width(); ++x)
-                    std::memcpy(row + static_cast<std::size_t>(x) * pixelBytes, pixel, pixelBytes);
-                if (place.depth)
-                    std::fill_n(place.depth + static_cast<std::size_t>(y) * place.depthStride, region.width(),
-                                std::numeric_limits<float>::infinity());
-            }
+            FinishedTile out(region, settings_.format, place.planes, place.stride);
+            row.resize(4 * static_cast<std::size_t>(region.width()));
+            for (std::size_t i = 0; i < row.size(); ++i)
+                row[i] = static_cast<double>(rgba[i % 4]);
+            for (int y = 0; y < region.height(); ++y)
+                out.setRow(y, row.data(), nullptr);
             s = TileState::Background;
         }
     }
@@ -308,15 +305,27 @@ private:
     static constexpr std::size_t recordPrefix = 16;
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
-    static std::size_t recordBytes(std::size_t pixels, OutputFormat format, bool depth)
+    bool travels(std::size_t channel) const { return hasChannel(settings_.channels | colorChannel, channel); }
+    std::size_t pixelBytes(std::size_t channel) const { return pixelBytes(channel, settings_.format); }
+    static std::size_t pixelBytes(std::size_t channel, OutputFormat format)
     {
-        return recordPrefix + alignedTo16(pixels * bytesPerPixel(format))
-               + (depth ? alignedTo16(pixels * sizeof(float)) : 0);
+        return channel == Color ? bytesPerPixel(format) : 4 * static_cast<std::size_t>(channelWords[channel]);
+    }
+    static std::size_t pixelsIn(const Region& region)
+    {
+        return static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
+    }
+    static std::size_t recordBytes(std::size_t pixels, OutputFormat format, ChannelMask channels)
+    {
+        std::size_t bytes = recordPrefix;
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (hasChannel(channels | colorChannel, c))
+                bytes += alignedTo16(pixels * pixelBytes(c, format));
+        return bytes;
     }
     std::size_t recordBytes(const Region& region) const
     {
-        return recordBytes(static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height()),
-                           settings_.format, settings_.depth);
+        return recordBytes(pixelsIn(region), settings_.format, settings_.channels);
     }
     std::size_t maxBatchBytes() const
     {
@@ -326,14 +335,9 @@ private:
     Place inImage(const Region& region)
     {
         Place place;
-        const auto width = static_cast<std::size_t>(layout_.width());
-        const std::size_t first = static_cast<std::size_t>(region.y0) * width + static_cast<std::size_t>(region.x0);
-        place.colorStride = width * bytesPerPixel(settings_.format);
-        place.color = image_.bytes() + first * bytesPerPixel(settings_.format);
-        if (settings_.depth) {
-            place.depth = image_.depth() + first;
-            place.depthStride = width;
-        }
+        place.stride = static_cast<std::size_t>(layout_.width());
+        place.planes =
+            image_.planesAt(static_cast<std::size_t>(region.y0) * place.stride + static_cast<std::size_t>(region.x0));
         return place;
     }
 
@@ -348,14 +352,13 @@ private:
         }
         const Place place = inImage(region);
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
-        const std::size_t rowBytes = width * bytesPerPixel(settings_.format);
-        for (std::size_t y = 0; y < height; ++y)
-            std::memcpy(place.color + y * place.colorStride, pixels + y * rowBytes, rowBytes);
-        if (place.depth) {
-            const std::byte* depth = pixels + alignedTo16(rowBytes * height);
+        for (std::size_t c = 0; c < channelCount; ++c) {
+            if (!place.planes.at[c])
+                continue;
+            const std::size_t rowBytes = width * pixelBytes(c), stride = place.stride * pixelBytes(c);
             for (std::size_t y = 0; y < height; ++y)
-                std::memcpy(place.depth + y * place.depthStride, depth + y * width * sizeof(float),
-                            width * sizeof(float));
+                std::memcpy(place.planes.at[c] + y * stride, pixels + y * rowBytes, rowBytes);
+            pixels += alignedTo16(rowBytes * height);
         }
     }
 

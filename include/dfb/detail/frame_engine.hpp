@@ -15,6 +15,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -52,6 +53,9 @@ public:
             if (config_.displayRank < 0 || config_.displayRank >= size())
                 throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
                                       + std::to_string(size()));
+            if (config_.aux & ~(TileOp::channels & imageAuxChannels))
+                throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
+                                      + ") that the inputs of this tile operation do not have");
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
@@ -92,6 +96,7 @@ public:
             throw InvalidArgument("begin() while a frame is open: end() it first");
         if (params.passes < 1)
             throw InvalidArgument("a frame has at least 1 pass, not " + std::to_string(params.passes));
+        checkSamples(params);
         if (params.declarationKey != 0 && !params.declared)
             throw InvalidArgument("a declarationKey without declared inputs");
         if (params.timeoutMs < 0)
@@ -110,11 +115,12 @@ public:
         info.rank = rank();
         info.frame = gate_.frame() + 1;
         info.passes = params.passes;
-        info.wantsDepth = config_.depth;
+        info.accumulationId = params.accumulationId;
+        info.wanted = Pipeline::imageChannels(config_);
         info.background = params.background;
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, tileData, pixelData);
+            pipeline_->newFrame(info, params.samples, tileData, pixelData);
         } catch (...) {
             userError = std::current_exception();
         }
@@ -123,7 +129,18 @@ public:
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
         renderNs_ = 0;
-        tilesLeft_ = countUnknown + (params.declared ? 0 : static_cast<std::int64_t>(ownedTiles().size()));
+        figures_.clear();
+        mergeErrorBound_ = 0;
+        tilesLeft_ = countUnknown;
+        std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
+        for (const int tile : ownedTiles()) {
+            const bool rendered = pipeline_->table().samples(tile).count > 0;
+            if (!rendered && !IsPointwise<PixelOp>::value)
+                kept.push_back(tile);
+            if (rendered && !params.declared)
+                ++tilesLeft_;
+        }
+        tilesLeft_ += static_cast<std::int64_t>(kept.size());
         beginTime_ = Clock::now();
         frameOpen_ = true;
         messaging_->newEpoch(info.frame);
@@ -133,6 +150,11 @@ public:
         if (userError)
             failWith(userError); // comes out of end(), on all ranks
         failForStray();
+        for (const int tile : kept)
+            if (gate_.enter(info.frame)) {
+                submitFinish(tile);
+                gate_.leave();
+            }
         if (!params.declared)
             tilesLess(countUnknown);
         else if (reuse)
@@ -143,7 +165,8 @@ public:
 
     void setTile(const Tile& tile)
     {
-        checkTile(tile, layout(), pipeline_->table().frameInfo());
+        checkTile(tile, layout(), pipeline_->table().frameInfo(),
+                  [this](int index) { return pipeline_->table().samples(index).count; });
         if (outcome_->failed())
             return;
         Buffer message = pipeline_->encode(tile);
@@ -155,6 +178,21 @@ public:
             arrive(std::move(message), {});
             gate_.leave();
         }
+    }
+
+    // See Frame.
+    TileSamples samples(int tile) const { return pipeline_->table().samples(tile); }
+
+    void addFigure(std::uint64_t key, double value)
+    {
+        const std::lock_guard<std::mutex> lock(figuresMutex_);
+        figures_.push_back({key, value});
+    }
+
+    void noteMergeError(double bound)
+    {
+        const std::lock_guard<std::mutex> lock(figuresMutex_);
+        mergeErrorBound_ = std::max(mergeErrorBound_, bound);
     }
 
     void waitForRoom()
@@ -529,17 +567,57 @@ private:
                            Verdict v;
                            const std::int64_t repeated = messaging_->messenger().duplicates();
                            v.paramsHash = fingerprintOf(params_);
+                           const auto reports = pipeline_->reports();
                            v.sums = {messaging_->bytesSent() - bytesBefore_,
                                      messaging_->messagesSent() - messagesBefore_,
                                      ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
                                      pipeline_->nonFinitePixels(),
                                      gate_.takeLateCount(),
-                                     repeated - repeatedBefore_};
+                                     repeated - repeatedBefore_,
+                                     reports.orderUndefinedPixels};
+                           for (const TileError& e : reports.errors)
+                               v.tileErrors.push_back({static_cast<std::uint64_t>(e.tile), e.error});
+                           sortByKey(v.tileErrors);
+                           {
+                               const std::lock_guard<std::mutex> lock(figuresMutex_);
+                               v.figures = figures_;
+                               v.mergeErrorBound = mergeErrorBound_;
+                           }
+                           sortByKey(v.figures);
+                           v.figures = Verdict::summed(std::move(v.figures));
                            repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
                            return v;
                        });
+    }
+
+    // Of values of one key, too, the order must not be that of the threads: they are added.
+    static void sortByKey(std::vector<Figure>& list)
+    {
+        std::sort(list.begin(), list.end(), [](const Figure& a, const Figure& b) {
+            return a.key != b.key ? a.key < b.key : a.value < b.value;
+        });
+    }
+
+    // Throws InvalidArgument for a plan that this framebuffer can not follow.
+    void checkSamples(const FrameParams& params) const
+    {
+        if (!params.samples)
+            return;
+        if (params.samples->size() != static_cast<std::size_t>(layout().tileCount()))
+            throw InvalidArgument("a plan of the samples of " + std::to_string(params.samples->size())
+                                  + " tiles for an image of " + std::to_string(layout().tileCount()));
+        for (const TileSamples& t : *params.samples) {
+            if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
+                throw InvalidArgument("a tile can not have " + std::to_string(t.count) + " samples from "
+                                      + std::to_string(t.first) + " on");
+            if (!KeepsState<TileOp>::value && (t.count == 0 || t.first > 0))
+                throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
+            if (t.first > 0 && lastFailed_)
+                throw InvalidArgument("the last frame failed, and what was accumulated is not complete: begin again "
+                                      "with sample 0 and another accumulationId");
+        }
     }
 
     // Waits for the verdict and closes the frame, also when it throws TransportError.
@@ -559,7 +637,8 @@ private:
         messaging_->reductions().forget(AllDeclared, gate_.frame());
         messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
-        if (transportError || verdict.error)
+        lastFailed_ = transportError || verdict.error;
+        if (lastFailed_)
             pipeline_->gather().invalidate();
         if (transportError)
             std::rethrow_exception(transportError);
@@ -598,7 +677,10 @@ private:
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
     std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
-    bool frameOpen_ = false;
+    bool frameOpen_ = false, lastFailed_ = false;
+    std::mutex figuresMutex_;
+    std::vector<Figure> figures_; // under figuresMutex_
+    double mergeErrorBound_ = 0;  // under figuresMutex_
     std::mutex strayMutex_;
     std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};

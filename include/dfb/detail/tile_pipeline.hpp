@@ -14,11 +14,15 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <exception>
 #include <limits>
 #include <memory>
+#include <mutex>
+#include <string>
 #include <type_traits>
 #include <utility>
+#include <vector>
 
 namespace dfb::detail {
 
@@ -34,16 +38,27 @@ public:
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
           gather_(pool_, table_.layout(),
-                  {config.format, config.depth, address, config.codec, config.gather == GatherMode::AtEnd},
+                  {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd},
                   rank == config.displayRank, rank, rankCount, std::move(sendToDisplay))
     {
+    }
+
+    // What the image has beside the colour.
+    static ChannelMask imageChannels(const FrameBufferConfig& config)
+    {
+        return static_cast<ChannelMask>(config.aux | (config.depth ? depthChannel : 0));
+    }
+    // What of a tile is read at all: by the operation, or for the image.
+    static ChannelMask travelling(const FrameBufferConfig& config)
+    {
+        return static_cast<ChannelMask>(Tile::channels & (NeededChannelsOf<TileOp>::value | imageChannels(config)));
     }
 
     // The most that one message with pixels can have.
     static std::size_t largestMessage(const FrameBufferConfig& config)
     {
-        return std::max(largestFragment(Tile::size),
-                        FinalGather::largestMessage(Tile::size, config.format, config.depth));
+        return std::max(largestFragment(Tile::size, travelling(config)),
+                        FinalGather::largestMessage(Tile::size, config.format, imageChannels(config)));
     }
 
     TileTable<TileOp>& table() noexcept { return table_; }
@@ -52,12 +67,13 @@ public:
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
-    void newFrame(const TileInfo& info, const typename FrameDataOf<TileOp>::type& tileData,
+    void newFrame(const TileInfo& info, const SamplePlan& plan, const typename FrameDataOf<TileOp>::type& tileData,
                   const typename FrameDataOf<PixelOp>::type& pixelData)
     {
         nonFinite_ = 0;
+        reports_ = {};
         gather_.newFrame(info.frame);
-        table_.newFrame(info, tileData);
+        table_.newFrame(info, plan, tileData);
         if constexpr (HasPixelNewFrame<PixelOp>::value)
             pixelOp_.newFrame(pixelData);
         else
@@ -71,21 +87,26 @@ public:
         if (index < 0 || index >= table_.layout().tileCount())
             throw InvalidArgument("tile " + std::to_string(index) + " of an image of "
                                   + std::to_string(table_.layout().tileCount()) + " tiles");
-        if (pass < 0 || pass >= frame.passes)
-            throw InvalidArgument("pass " + std::to_string(pass) + " of a frame of " + std::to_string(frame.passes));
-        static_cast<TileHeader&>(tile) = {frame.frame, index, table_.layout().region(index),          pass,
-                                          0,           0,     static_cast<std::uint32_t>(frame.rank), 0};
-        tile.clear();
+        const TileSamples samples = table_.samples(index);
+        if (pass < 0 || pass >= samples.count)
+            throw InvalidArgument("pass " + std::to_string(pass) + " of a tile of " + std::to_string(samples.count));
+        TileHeader header;
+        header.frame = frame.frame;
+        header.tile = index;
+        header.region = table_.layout().region(index);
+        header.pass = pass;
+        header.sample = samples.first + pass;
+        header.source = static_cast<std::uint32_t>(frame.rank);
+        static_cast<TileHeader&>(tile) = header;
+        tile.clear(travelling(config_));
     }
 
     // The message for a tile that has been checked; compressed only if it travels.
     Buffer encode(const Tile& tile)
     {
         const FloatEnvironment floatEnvironment;
-        const auto wanted =
-            static_cast<ChannelMask>(NeededChannelsOf<TileOp>::value | (config_.depth ? depthChannel : 0));
         std::uint64_t nonFinite = 0;
-        Buffer message = encodeFragment(*pool_, tile, wanted, address_,
+        Buffer message = encodeFragment(*pool_, tile, travelling(config_), address_,
                                         table_.isMine(tile.tile) ? nullptr : config_.codec.get(), nonFinite);
         if (nonFinite)
             nonFinite_ += static_cast<std::int64_t>(nonFinite);
@@ -96,8 +117,9 @@ public:
     // gets what is known of the place when this throws Error.
     int arrive(Buffer&& message, ErrorInfo& where)
     {
-        Fragment fragment =
-            decodeFragment(*pool_, std::move(message), table_.layout(), table_.frameInfo().passes, config_.codec.get());
+        Fragment fragment = decodeFragment(
+            *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
+            config_.codec.get());
         const TileHeader& h = fragment.header();
         const int tile = h.tile;
         where.tile = tile;
@@ -116,28 +138,47 @@ public:
         const Region region = table_.layout().region(tile);
         if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {
             auto place = gather_.reserve(tile);
-            FinishedTile out(region, config_.format, place.color, place.colorStride, place.depth, place.depthStride);
+            FinishedTile out(region, config_.format, place.planes, place.stride);
             table_.finish(tile, out);
             gather_.commit(tile, std::move(place));
         } else {
             const auto width = static_cast<std::size_t>(region.width()),
                        height = static_cast<std::size_t>(region.height());
-            Buffer color = pool_->acquire(width * height * 4 * sizeof(float));
-            Buffer depth = config_.depth ? pool_->acquire(width * height * sizeof(float)) : Buffer();
-            auto* depthData = reinterpret_cast<float*>(depth.data());
-            FinishedTile out(region, OutputFormat::RGBA32F, color.data(), width * 4 * sizeof(float), depthData, width);
+            const auto channels = static_cast<ChannelMask>(colorChannel | imageChannels(config_));
+            Buffer floats = pool_->acquire(width * height * 4 * static_cast<std::size_t>(wordsPerPixel(channels)));
+            Planes planes;
+            std::byte* plane = floats.data();
+            for (std::size_t c = 0; c < channelCount; ++c)
+                if (hasChannel(channels, c)) {
+                    planes.at[c] = plane;
+                    plane += 4 * width * height * static_cast<std::size_t>(channelWords[c]);
+                }
+            FinishedTile out(region, OutputFormat::RGBA32F, planes, width);
             table_.finish(tile, out);
-            PixelTile pixels{tile, region, reinterpret_cast<float*>(color.data()), depthData};
+            PixelTile pixels;
+            pixels.frame = table_.frameInfo().frame;
+            pixels.tile = tile;
+            pixels.region = region;
+            pixels.color = floatsOf(planes.at[Color]);
+            pixels.depth = floatsOf(planes.at[Depth]);
+            pixels.aux = {floatsOf(planes.at[Normal]), floatsOf(planes.at[Albedo]), floatsOf(planes.at[Position]),
+                          idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
             std::as_const(pixelOp_).process(pixels);
             auto place = gather_.reserve(tile);
-            for (std::size_t y = 0; y < height && place.color; ++y) {
+            for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
                 convertPixels(pixels.color + 4 * width * y, region.width(), config_.format,
-                              place.color + y * place.colorStride);
-                if (place.depth)
-                    std::copy_n(depthData + y * width, width, place.depth + y * place.depthStride);
+                              place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format));
+                for (std::size_t c = Depth; c < channelCount; ++c) {
+                    const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
+                    if (place.planes.at[c])
+                        std::memcpy(place.planes.at[c] + y * place.stride * bytes, planes.at[c] + y * width * bytes,
+                                    width * bytes);
+                }
             }
             gather_.commit(tile, std::move(place));
         }
+        if constexpr (HasReport<TileOp>::value)
+            addReport(tile);
     }
 
     // What the pixel operation makes of the background; throws what it throws.
@@ -146,18 +187,47 @@ public:
         background_ = table_.frameInfo().background;
         if constexpr (IsPointwise<PixelOp>::value) {
             const float depth = std::numeric_limits<float>::infinity();
-            PixelTile pixel{0, {0, 0, 1, 1}, background_.data(), config_.depth ? &depth : nullptr};
+            PixelTile pixel;
+            pixel.frame = table_.frameInfo().frame;
+            pixel.region = {0, 0, 1, 1};
+            pixel.color = background_.data();
+            pixel.depth = config_.depth ? &depth : nullptr;
             std::as_const(pixelOp_).process(pixel);
         }
     }
 
     // On the display rank, when all tiles are there: fills in those that nobody touched.
-    void fillBackground() { gather_.fillBackground(background_); }
+    void fillBackground()
+    {
+        gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
+    }
 
     // Input pixels of this frame, set on this rank, that had an infinity or NaN.
     std::int64_t nonFinitePixels() const noexcept { return nonFinite_; }
 
+    // What the operation has said of this rank's tiles, up to now.
+    struct Reports {
+        std::vector<TileError> errors;
+        std::int64_t orderUndefinedPixels = 0;
+    };
+    Reports reports()
+    {
+        const std::lock_guard<std::mutex> lock(reportsMutex_);
+        return reports_;
+    }
+
 private:
+    void addReport(int tile)
+    {
+        const TileReport report = table_.report(tile);
+        if (report.error < 0 && report.orderUndefinedPixels == 0)
+            return;
+        const std::lock_guard<std::mutex> lock(reportsMutex_);
+        if (report.error >= 0)
+            reports_.errors.push_back({tile, report.error});
+        reports_.orderUndefinedPixels += report.orderUndefinedPixels;
+    }
+
     std::shared_ptr<MemoryPool> pool_;
     const FrameBufferConfig& config_;
     std::uint32_t address_; // of the framebuffer
@@ -166,6 +236,8 @@ private:
     FinalGather gather_;
     std::array<float, 4> background_{};
     std::atomic<std::int64_t> nonFinite_{0};
+    std::mutex reportsMutex_;
+    Reports reports_; // under reportsMutex_
 };
 
 } // namespace dfb::detail

@@ -4,6 +4,7 @@
 
 #include <dfb/dependency_tracker.hpp>
 #include <dfb/detail/manifest.hpp>
+#include <dfb/frame.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
 
@@ -21,7 +22,9 @@
 namespace dfb::detail {
 
 // Throws InvalidArgument for a tile that a renderer can not have meant for this frame.
-inline void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo& frame)
+// `passesOf(tile)`: how many passes that tile has.
+template <class PassesOf>
+void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo& frame, const PassesOf& passesOf)
 {
     std::string wrong;
     if (tile.frame != frame.frame)
@@ -30,8 +33,8 @@ inline void checkTile(const TileHeader& tile, const TileLayout& layout, const Ti
         wrong = "outside the image, which has " + std::to_string(layout.tileCount()) + " tiles";
     else if (tile.region != layout.region(tile.tile))
         wrong = "its region is not that of the tile";
-    else if (tile.pass < 0 || tile.pass >= frame.passes)
-        wrong = "the frame has " + std::to_string(frame.passes) + " passes";
+    else if (tile.pass < 0 || tile.pass >= passesOf(tile.tile))
+        wrong = "the tile has " + std::to_string(passesOf(tile.tile)) + " passes";
     else if (tile.generation < 0 || tile.generation >= DependencyTracker::maxGenerations)
         wrong = "the generation must be in [0, " + std::to_string(DependencyTracker::maxGenerations) + ")";
     else if (tile.children < 0)
@@ -80,11 +83,18 @@ public:
     const TileInfo& frameInfo() const noexcept { return info_; }
 
     // `info` is what all tiles have in common. No other member may be running.
-    void newFrame(const TileInfo& info, const FrameData& data)
+    void newFrame(const TileInfo& info, const SamplePlan& plan, const FrameData& data)
     {
         expected_ = nullptr;
         info_ = info;
+        plan_ = plan;
         data_ = data;
+    }
+
+    // What a tile gets in this frame.
+    TileSamples samples(int tile) const
+    {
+        return plan_ ? (*plan_)[static_cast<std::size_t>(tile)] : TileSamples{info_.firstSample, info_.passes};
     }
 
     // Hands an input to its tile. True if the tile's inputs are now complete: call finish() once.
@@ -122,7 +132,7 @@ public:
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
                 const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-                if (!named && !all && !touched)
+                if ((!named && !all && !touched) || (samples(owned_[i]).count == 0 && !named))
                     continue;
                 Slot& slot = slotFor(owned_[i]);
                 if (!slot.declared)
@@ -137,6 +147,14 @@ public:
 
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
+
+    // What the operation says of a tile that is finished.
+    TileReport report(int tile)
+    {
+        TileReport report;
+        slotFor(tile).op.report(report);
+        return report;
+    }
 
     // What the tiles that are not complete wait for: the first of them, and all in words. `declared`: tiles that nobody
     // named wait for nothing.
@@ -155,10 +173,10 @@ public:
                     inputs = &named->second;
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-            if (touched ? slots_[i]->ready : declared && !inputs)
+            if (touched ? slots_[i]->ready : (declared && !inputs) || samples(tile).count == 0)
                 continue;
             const DependencyTracker untouched;
-            for (int pass = 0; pass < info_.passes; ++pass) {
+            for (int pass = 0; pass < samples(tile).count; ++pass) {
                 const DependencyTracker& tree = touched ? slots_[i]->trees[static_cast<std::size_t>(pass)] : untouched;
                 const auto m = tree.missing();
                 if (!m)
@@ -175,7 +193,7 @@ public:
                 }
                 if (++tiles <= mostTiles)
                     text += (tiles > 1 ? "; tile " : "tile ") + std::to_string(tile)
-                            + (info_.passes > 1 ? " pass " + std::to_string(pass) : "") + ": " + m->text()
+                            + (samples(tile).count > 1 ? " pass " + std::to_string(pass) : "") + ": " + m->text()
                             + namesOf(*m, inputs);
                 break;
             }
@@ -216,12 +234,14 @@ private:
         if (slot->frame != info_.frame) {
             slot->frame = info_.frame;
             slot->ready = slot->touched = slot->declared = false;
-            slot->trees.resize(static_cast<std::size_t>(info_.passes));
+            slot->trees.resize(static_cast<std::size_t>(samples(tile).count));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();
             TileInfo info = info_;
             info.tile = tile;
             info.region = layout_.region(tile);
+            info.passes = samples(tile).count;
+            info.firstSample = samples(tile).first;
             if constexpr (HasNewFrameWithData<TileOp>::value)
                 slot->op.newFrame(info, data_);
             else
@@ -285,6 +305,7 @@ private:
     std::array<std::mutex, 64> mutexes_;
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;
+    SamplePlan plan_; // null: all tiles as info_ says
     FrameData data_{};
 };
 

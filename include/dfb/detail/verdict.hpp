@@ -12,6 +12,7 @@
 #include <cstdint>
 #include <cstring>
 #include <exception>
+#include <iterator>
 #include <optional>
 #include <string>
 #include <utility>
@@ -65,6 +66,10 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
         f.add(bits);
     }
     f.add(static_cast<std::uint64_t>(p.passes));
+    if (p.samples)
+        for (const TileSamples& t : *p.samples)
+            f.add(static_cast<std::uint64_t>(t.first) << 32 | static_cast<std::uint32_t>(t.count));
+    f.add(p.accumulationId);
     f.add(p.declared);
     f.add(p.declarationKey);
     f.add(static_cast<std::uint64_t>(p.timeoutMs));
@@ -74,9 +79,12 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
 struct Verdict {
     std::optional<ErrorInfo> error;
     std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
-    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages.
-    std::array<std::int64_t, 6> sums{};
+    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order.
+    std::array<std::int64_t, 7> sums{};
     std::array<std::int64_t, 3> maxima{}; // peak memory in bytes, rendering in ns, peak of the inbox in bytes
+    double mergeErrorBound = 0;           // the largest
+    std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
+    std::vector<Figure> figures;          // by key; sums
 
     std::vector<std::byte> bytes() const
     {
@@ -87,6 +95,12 @@ struct Verdict {
         out.put(paramsHash);
         out.put(sums);
         out.put(maxima);
+        out.put(mergeErrorBound);
+        for (const auto* list : {&tileErrors, &figures}) {
+            out.put(static_cast<std::uint32_t>(list->size()));
+            for (const Figure& figure : *list)
+                out.put(figure);
+        }
         return out.take();
     }
 
@@ -99,6 +113,10 @@ struct Verdict {
         v.paramsHash = in.get<std::uint64_t>();
         v.sums = in.get<decltype(v.sums)>();
         v.maxima = in.get<decltype(v.maxima)>();
+        v.mergeErrorBound = in.get<double>();
+        for (auto* list : {&v.tileErrors, &v.figures})
+            for (auto left = in.get<std::uint32_t>(); left > 0; --left)
+                list->push_back(in.get<Figure>());
         return v;
     }
 
@@ -114,6 +132,35 @@ struct Verdict {
         report.peakMemoryBytes = maxima[0];
         report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
         report.peakInboxBytes = maxima[2];
+        report.orderUndefinedPixels = sums[6];
+        report.mergeErrorBound = mergeErrorBound;
+        report.tileErrors.clear();
+        for (const Figure& f : tileErrors)
+            report.tileErrors.push_back({static_cast<int>(f.key), f.value});
+        report.figures = figures;
+    }
+
+    // Two lists by key become one; values of the same key are added.
+    static std::vector<Figure> merged(const std::vector<Figure>& a, const std::vector<Figure>& b)
+    {
+        std::vector<Figure> all;
+        all.reserve(a.size() + b.size());
+        std::merge(a.begin(), a.end(), b.begin(), b.end(), std::back_inserter(all),
+                   [](const Figure& x, const Figure& y) { return x.key < y.key; });
+        return summed(std::move(all));
+    }
+    // The same of one list that is ordered by key.
+    static std::vector<Figure> summed(std::vector<Figure> all)
+    {
+        std::size_t count = 0;
+        for (std::size_t i = 0; i < all.size(); ++i) {
+            if (count > 0 && all[count - 1].key == all[i].key)
+                all[count - 1].value += all[i].value;
+            else
+                all[count++] = all[i];
+        }
+        all.resize(count);
+        return all;
     }
 
     static ErrorInfo disagreement()
@@ -121,7 +168,8 @@ struct Verdict {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
         info.message =
-            "the frame was begun with different parameters (background, passes, declared, declarationKey, timeoutMs)";
+            "the frame was begun with different parameters (background, passes, samples, accumulationId, declared, "
+            "declarationKey, timeoutMs)";
         return info;
     }
 
@@ -157,6 +205,9 @@ struct Verdict {
             a.sums[i] += b.sums[i];
         for (std::size_t i = 0; i < a.maxima.size(); ++i)
             a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
+        a.mergeErrorBound = std::max(a.mergeErrorBound, b.mergeErrorBound);
+        a.tileErrors = merged(a.tileErrors, b.tileErrors);
+        a.figures = merged(a.figures, b.figures);
         return a.bytes();
     }
 };
@@ -177,7 +228,7 @@ struct Agreement {
         const auto text = [](auto value) { return std::to_string(value); };
         return {true, "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width)
                           + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
-                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth)
+                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux " + text(c.aux)
                           + ", display rank " + text(c.displayRank) + ", codec " + text(c.codec ? c.codec->id() : 0)
                           + ", gather " + text(static_cast<int>(c.gather)) + ", checksums " + text(c.checksums)
                           + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};

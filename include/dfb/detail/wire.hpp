@@ -1,10 +1,11 @@
 // Wire: the format of messages; a tile to bytes, and bytes to a fragment that is read in place.
 //
 // After the MessageHeader a fragment message goes on with a FragmentHeader and the payload:
-//   Sparse:    uint16 span counts of the rows [rowBegin, rowEnd) | spans | padding to 16 | colour | depth
-//   Dense:     colour | depth, all pixels of the region row by row
-//   Constant:  colour | depth of one pixel
+//   Sparse:    uint16 span counts of the rows [rowBegin, rowEnd) | spans | padding to 16 | planes
+//   Dense:     planes: all pixels of the region row by row
+//   Constant:  planes: one pixel
 //   Empty:     nothing
+// The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ...
 #pragma once
 
 #include <dfb/comm/compression.hpp>
@@ -48,11 +49,11 @@ inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) 
 
 // The most that a fragment message can have. A row's second span costs less than the pixel that parts it from the
 // first.
-inline std::size_t largestFragment(int tileSize)
+inline std::size_t largestFragment(int tileSize, ChannelMask channels)
 {
     const auto side = static_cast<std::size_t>(tileSize), pixels = side * side;
-    const std::size_t perPixel = sizeof(float) * static_cast<std::size_t>(floatsPerPixel(colorChannel | depthChannel));
-    static_assert(sizeof(Span) <= 5 * sizeof(float));
+    const std::size_t perPixel = sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
+    static_assert(sizeof(Span) <= 4 * sizeof(float));
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * side) + pixels * perPixel;
 }
 
@@ -102,15 +103,19 @@ struct ActiveSpans {
     }
 };
 
+// `planes`: of a tile of this type, those that travel.
 template <class TileType>
-bool isConstant(const TileType& tile, bool withDepth)
+bool isConstant(const TileType& tile, const ConstPlanes& planes)
 {
+    const auto size = static_cast<std::size_t>(TileType::size);
     for (int y = 0; y < tile.region.height(); ++y)
-        for (int x = 0; x < tile.region.width(); ++x) {
-            if (std::memcmp(tile.pixel(x, y), tile.color, 4 * sizeof(float)) != 0)
-                return false;
-            if constexpr (TileType::hasDepth)
-                if (withDepth && std::memcmp(tile.depth + y * TileType::size + x, tile.depth, sizeof(float)) != 0)
+        for (std::size_t c = 0; c < channelCount; ++c) {
+            if (!planes.at[c])
+                continue;
+            const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
+            const std::byte* row = planes.at[c] + static_cast<std::size_t>(y) * size * bytes;
+            for (int x = 0; x < tile.region.width(); ++x)
+                if (std::memcmp(row + static_cast<std::size_t>(x) * bytes, planes.at[c], bytes) != 0)
                     return false;
         }
     return true;
@@ -130,7 +135,11 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
 {
     static thread_local ActiveSpans active;
     active.find(tile);
-    const bool withDepth = (wanted & TileType::channels & depthChannel) != 0;
+    const auto channels = static_cast<ChannelMask>((wanted & TileType::channels) | colorChannel);
+    ConstPlanes planes = tile.planes();
+    for (std::size_t c = 0; c < channelCount; ++c)
+        if (!hasChannel(channels, c))
+            planes.at[c] = nullptr;
     const int width = tile.region.width(), height = tile.region.height();
 
     FragmentHeader h;
@@ -140,7 +149,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     h.children = tile.children;
     h.source = tile.source;
     h.part = tile.part;
-    h.channels = static_cast<ChannelMask>(colorChannel | (withDepth ? depthChannel : 0));
+    h.channels = channels;
     h.activePixels = active.pixels;
     h.rowBegin = static_cast<std::uint16_t>(active.rowBegin);
     h.rowEnd = static_cast<std::uint16_t>(active.rowEnd);
@@ -148,7 +157,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     if (active.pixels == 0) {
         h.encoding = FragmentEncoding::Empty;
     } else if (active.pixels == static_cast<std::uint32_t>(width * height)) {
-        h.encoding = isConstant(tile, withDepth) ? FragmentEncoding::Constant : FragmentEncoding::Dense;
+        h.encoding = isConstant(tile, planes) ? FragmentEncoding::Constant : FragmentEncoding::Dense;
         if (h.encoding == FragmentEncoding::Constant)
             stored = 1;
     } else {
@@ -157,7 +166,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
     const std::size_t payload =
-        tableBytes + stored * sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
+        tableBytes + stored * sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
     Buffer message = pool.acquire(fragmentPrefix + payload);
@@ -173,25 +182,43 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         std::memcpy(out + countBytes, active.spans.data(), spanBytes);
         std::memset(out + countBytes + spanBytes, 0, tableBytes - countBytes - spanBytes);
     }
-    auto* color = reinterpret_cast<float*>(out + tableBytes);
-    auto* depth = color + 4 * stored;
+    Planes to;
+    std::byte* section = out + tableBytes;
+    for (std::size_t c = 0; c < channelCount; ++c)
+        if (planes.at[c]) {
+            to.at[c] = section;
+            section += 4 * stored * static_cast<std::size_t>(channelWords[c]);
+        }
+    const bool hasMore = (channels & ~(colorChannel | depthChannel)) != 0;
     const std::uint64_t repeats = h.encoding == FragmentEncoding::Constant ? active.pixels : 1;
     const auto copyPixels = [&](int x, int y, int count) {
         const float* from = tile.pixel(x, y);
-        std::memcpy(color, from, 4 * sizeof(float) * static_cast<std::size_t>(count));
-        color += 4 * count;
+        const std::size_t first = static_cast<std::size_t>(y) * TileType::size + static_cast<std::size_t>(x);
+        std::memcpy(to.at[Color], from, 4 * sizeof(float) * static_cast<std::size_t>(count));
+        to.at[Color] += 4 * sizeof(float) * static_cast<std::size_t>(count);
+        const float* fromDepth = planes.at[Depth] ? floatsOf(planes.at[Depth]) + first : nullptr;
+        auto* depth = floatsOf(to.at[Depth]);
         for (int i = 0; i < count; ++i) {
             bool finite = (from[4 * i] - from[4 * i]) + (from[4 * i + 1] - from[4 * i + 1])
                               + (from[4 * i + 2] - from[4 * i + 2]) + (from[4 * i + 3] - from[4 * i + 3])
                           == 0.0f;
-            if constexpr (TileType::hasDepth)
-                if (withDepth) {
-                    const float d = tile.depth[y * TileType::size + x + i];
-                    finite = finite && d == d;
-                    *depth++ = canonicalDepth(d);
-                }
+            if (fromDepth) {
+                const float d = fromDepth[i];
+                finite = finite && d == d;
+                depth[i] = canonicalDepth(d);
+            }
             nonFinite += finite ? 0 : repeats;
         }
+        if (fromDepth)
+            to.at[Depth] += sizeof(float) * static_cast<std::size_t>(count);
+        if (!hasMore)
+            return;
+        for (std::size_t c = Normal; c < channelCount; ++c)
+            if (planes.at[c]) {
+                const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
+                std::memcpy(to.at[c], planes.at[c] + first * bytes, bytes * static_cast<std::size_t>(count));
+                to.at[c] += bytes * static_cast<std::size_t>(count);
+            }
     };
     if (h.encoding == FragmentEncoding::Sparse) {
         const Span* span = active.spans.data();
@@ -219,10 +246,23 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     return message;
 }
 
+// Where the planes of `pixels` pixels are that start at `data`.
+inline ConstPlanes planesAt(const std::byte* data, ChannelMask channels, std::size_t pixels)
+{
+    ConstPlanes planes;
+    for (std::size_t c = 0; c < channelCount; ++c)
+        if (hasChannel(channels, c)) {
+            planes.at[c] = data;
+            data += 4 * pixels * static_cast<std::size_t>(channelWords[c]);
+        }
+    return planes;
+}
+
 // Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
-// decompressed form). Throws Error (MalformedMessage).
-inline Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, int passes,
-                               const Codec* codec)
+// decompressed form). `passesOf(tile)`: how many passes the tile has. Throws Error (MalformedMessage).
+template <class PassesOf>
+Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
+                        const Codec* codec)
 {
     if (message.size() < fragmentPrefix)
         failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
@@ -230,9 +270,9 @@ inline Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLay
     const auto h = loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader));
     if (h.tile < 0 || h.tile >= layout.tileCount())
         failMalformed("tile index outside the image", layout.tileCount() - 1, h.tile);
-    if (h.pass < 0 || h.pass >= passes)
-        failMalformed("pass outside the frame's", passes - 1, h.pass);
-    if (!(h.channels & colorChannel) || (h.channels & ~(colorChannel | depthChannel)))
+    if (const int passes = passesOf(h.tile); h.pass < 0 || h.pass >= passes)
+        failMalformed("pass outside the tile's", passes - 1, h.pass);
+    if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
 
     TileHeader header;
@@ -247,7 +287,7 @@ inline Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLay
 
     const int width = header.region.width(), height = header.region.height();
     const auto pixelCount = static_cast<std::uint32_t>(width * height);
-    const std::size_t pixelBytes = sizeof(float) * static_cast<std::size_t>(floatsPerPixel(h.channels));
+    const std::size_t pixelBytes = sizeof(float) * static_cast<std::size_t>(wordsPerPixel(h.channels));
     std::size_t stored = h.activePixels, tableBytes = 0;
     switch (h.encoding) {
     case FragmentEncoding::Empty:
@@ -318,23 +358,24 @@ inline Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLay
         if (spans != h.spanCount || pixels != h.activePixels)
             failMalformed("the spans do not add up to the active pixels", h.activePixels, pixels);
     }
-    const auto* color = reinterpret_cast<const float*>(body + tableBytes);
-    parts.color = color;
-    parts.depth = h.channels & depthChannel ? color + 4 * stored : nullptr;
+    ConstPlanes planes = planesAt(body + tableBytes, h.channels, stored);
     if (h.encoding == FragmentEncoding::Constant) {
         // One row that every row reads.
         const auto count = static_cast<std::size_t>(width);
         Buffer row = pool.acquire(count * pixelBytes);
-        auto* rowColor = reinterpret_cast<float*>(row.data());
-        for (std::size_t x = 0; x < count; ++x)
-            std::memcpy(rowColor + 4 * x, color, 4 * sizeof(float));
-        if (parts.depth) {
-            std::fill(rowColor + 4 * count, rowColor + 5 * count, parts.depth[0]);
-            parts.depth = rowColor + 4 * count;
-        }
-        parts.color = rowColor;
+        const ConstPlanes rowPlanes = planesAt(row.data(), h.channels, count);
+        std::byte* out = row.data();
+        for (std::size_t c = 0; c < channelCount; ++c)
+            for (std::size_t x = 0; planes.at[c] && x < count; ++x, out += 4 * channelWords[c])
+                std::memcpy(out, planes.at[c], 4 * static_cast<std::size_t>(channelWords[c]));
+        planes = rowPlanes;
         message = std::move(row);
     }
+    parts.channels = h.channels;
+    parts.color = floatsOf(planes.at[Color]);
+    parts.depth = floatsOf(planes.at[Depth]);
+    planes.at[Color] = planes.at[Depth] = nullptr;
+    parts.aux = planes;
     if (parts.depth && h.encoding != FragmentEncoding::Empty) {
         const std::size_t count = h.encoding == FragmentEncoding::Constant ? static_cast<std::size_t>(width) : stored;
         for (std::size_t i = 0; i < count; ++i)

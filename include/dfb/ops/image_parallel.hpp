@@ -8,15 +8,11 @@
 namespace dfb {
 
 // Expects one input of generation 0 without children per pass. The tile is laid over the background, passes are
-// averaged. Depth travels only if the output has it.
-template <int TileSize = 64>
-class BasicImageParallel {
+// averaged. Of the other channels only what the image has travels.
+template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
+class BasicImageParallel : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
-    static constexpr int tileSize = TileSize;
-    static constexpr ChannelMask channels = colorChannel | depthChannel;
     static constexpr ChannelMask neededChannels = colorChannel;
-
-    void newFrame(const TileInfo& info) { store_.newFrame(info); }
 
     void add(Fragment&& fragment)
     {
@@ -25,13 +21,8 @@ public:
                                   "generation "
                                   + std::to_string(fragment.header().generation) + " and has "
                                   + std::to_string(fragment.header().children));
-        store_.add(std::move(fragment));
+        this->store_.add(std::move(fragment));
     }
-
-    void finish(FinishedTile& out) { store_.finish(out); }
-
-private:
-    detail::FragmentStore store_;
 };
 
 using ImageParallel = BasicImageParallel<>;

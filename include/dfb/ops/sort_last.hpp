@@ -1,5 +1,5 @@
-// AlphaBlend: sort-last compositing of transparent fragments, per pixel in order of (depth, source, part)
-// (Listing 4 of the paper).
+// Sort-last operations: the inputs of a tile are layers of one scene. AlphaBlend sorts them per pixel (Listing 4 of
+// the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
 #include <dfb/compositing.hpp>
@@ -7,7 +7,9 @@
 
 #include <algorithm>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
+#include <string>
 #include <tuple>
 #include <utility>
 #include <vector>
@@ -16,15 +18,101 @@ namespace dfb {
 
 namespace detail {
 
+// Sums over passes of composited pixels, and what is the mean of them.
+class PixelSums {
+public:
+    // `wanted`: of the auxiliary channels.
+    void reset(std::size_t pixels, ChannelMask wanted)
+    {
+        rgba_.assign(4 * pixels, 0.0);
+        depth_.assign(pixels, std::numeric_limits<float>::infinity());
+        aux_.reset(pixels, wanted);
+    }
+
+    // Adds a row, with its background, to pixels [first, first + width).
+    void add(std::size_t first, const CompositeRow& row)
+    {
+        const auto sum = [](std::vector<double>& to, const std::vector<double>& from, std::size_t at) {
+            for (std::size_t i = 0; !to.empty() && i < from.size(); ++i)
+                to[at + i] += from[i];
+        };
+        sum(rgba_, row.rgba, 4 * first);
+        sum(aux_.normal, row.aux.normal, 3 * first);
+        sum(aux_.albedo, row.aux.albedo, 3 * first);
+        sum(aux_.weight, row.aux.weight, first);
+        for (std::size_t i = 0; i < row.depth.size(); ++i) {
+            if (row.depth[i] < depth_[first + i] && !aux_.position.empty())
+                std::copy_n(row.aux.position.data() + 3 * i, 3, aux_.position.data() + 3 * (first + i));
+            depth_[first + i] = std::min(depth_[first + i], row.depth[i]);
+        }
+        const auto nearest = [first](std::vector<NearestId>& to, const std::vector<NearestId>& from) {
+            for (std::size_t i = 0; !to.empty() && i < from.size(); ++i)
+                if (from[i].id != noId && (to[first + i].id == noId || from[i].depth < to[first + i].depth))
+                    to[first + i] = from[i];
+        };
+        nearest(aux_.primitiveId, row.aux.primitiveId);
+        nearest(aux_.instanceId, row.aux.instanceId);
+    }
+
+    const double* rgba(std::size_t pixel) const noexcept { return rgba_.data() + 4 * pixel; }
+
+    // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y.
+    void write(FinishedTile& out, int y, std::size_t first, std::int64_t count)
+    {
+        const auto width = static_cast<std::size_t>(out.width());
+        row_.resize(4 * width);
+        for (std::size_t i = 0; i < row_.size(); ++i)
+            row_[i] = rgba_[4 * first + i] / static_cast<double>(count);
+        AuxRow aux;
+        const auto weighted = [&](std::vector<float>& to, const std::vector<double>& from) -> const float* {
+            if (from.empty())
+                return nullptr;
+            to.resize(3 * width);
+            for (std::size_t i = 0; i < to.size(); ++i) {
+                const double weight = aux_.weight[first + i / 3];
+                to[i] = weight > 0 ? static_cast<float>(from[3 * first + i] / weight) : 0.0f;
+            }
+            return to.data();
+        };
+        const auto ids = [&](std::vector<std::uint32_t>& to, const std::vector<NearestId>& from) -> const std::uint32_t* {
+            if (from.empty())
+                return nullptr;
+            to.resize(width);
+            for (std::size_t i = 0; i < width; ++i)
+                to[i] = from[first + i].id;
+            return to.data();
+        };
+        aux.normal = weighted(normal_, aux_.normal);
+        aux.albedo = weighted(albedo_, aux_.albedo);
+        aux.position = aux_.position.empty() ? nullptr : aux_.position.data() + 3 * first;
+        aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
+        aux.instanceId = ids(instanceId_, aux_.instanceId);
+        out.setRow(y, row_.data(), depth_.data() + first, aux);
+    }
+
+private:
+    std::vector<double> rgba_; // 4 a pixel
+    std::vector<float> depth_; // the nearest
+    AuxPixels aux_;
+    std::vector<double> row_; // the rest: scratch of write()
+    std::vector<float> normal_, albedo_;
+    std::vector<std::uint32_t> primitiveId_, instanceId_;
+};
+
 // The inputs of one tile, kept until they are all there; then composited pass by pass over the background, and
 // the passes averaged, in double.
+template <BlendRule Rule>
 class FragmentStore {
 public:
-    void newFrame(const TileInfo& info)
+    // `channels`: of the operation.
+    void newFrame(const TileInfo& info, ChannelMask channels)
     {
         info_ = info;
+        tracked_ = static_cast<ChannelMask>((info.wanted & imageAuxChannels) | (channels & farChannel));
         fragments_.clear();
+        undefinedPixels_ = 0;
     }
+    const TileInfo& info() const noexcept { return info_; }
 
     void add(Fragment&& fragment)
     {
@@ -32,15 +120,22 @@ public:
             fragments_.push_back(std::move(fragment));
     }
 
-    void finish(FinishedTile& out)
+    // Calls passDone(y, pass, row) for each row and pass, row by row, with the background below.
+    template <class PassDone>
+    void compositePasses(const PassDone& passDone)
     {
         static thread_local Scratch scratch; // so that a frame after the first allocates nothing
         std::sort(fragments_.begin(), fragments_.end(), [](const Fragment& a, const Fragment& b) {
             const TileHeader &x = a.header(), &y = b.header();
-            return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
+            if constexpr (Rule == BlendRule::InOrder)
+                return std::tie(x.pass, x.generation) < std::tie(y.pass, y.generation);
+            else
+                return std::tie(x.pass, x.source, x.part, x.generation)
+                       < std::tie(y.pass, y.source, y.part, y.generation);
         });
         const std::size_t passes = static_cast<std::size_t>(info_.passes);
-        scratch.compositors.resize(std::max(scratch.compositors.size(), passes));
+        while (scratch.compositors.size() < passes)
+            scratch.compositors.emplace_back(Rule);
         std::size_t next = 0;
         for (std::size_t pass = 0; pass < passes; ++pass) {
             scratch.pointers.clear();
@@ -50,70 +145,126 @@ public:
         }
         const float background[4] = {info_.background[0], info_.background[1], info_.background[2],
                                      info_.background[3]};
-        for (int y = 0; y < out.height(); ++y) {
+        const int width = info_.region.width();
+        for (int y = 0; y < info_.region.height(); ++y) {
+            scratch.isUndefined.assign(tracked_ & farChannel ? static_cast<std::size_t>(width) : 0, 0);
             for (std::size_t pass = 0; pass < passes; ++pass) {
-                scratch.row.reset(out.width());
+                scratch.row.reset(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
-                overConstant(scratch.row, background);
-                if (passes > 1)
-                    accumulate(scratch, pass == 0);
+                overBackground(scratch.row, background);
+                for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
+                    scratch.isUndefined[x] |= scratch.row.isUndefined[x];
+                passDone(y, static_cast<int>(pass), std::as_const(scratch.row));
             }
-            if (passes > 1) {
-                for (double& value : scratch.sum)
-                    value /= static_cast<double>(passes);
-                out.setRow(y, scratch.sum.data(), scratch.nearest.data());
-            } else {
-                out.setRow(y, scratch.row.rgba.data(), scratch.row.depth.data());
-            }
+            undefinedPixels_ += std::count(scratch.isUndefined.begin(), scratch.isUndefined.end(), 1);
         }
         fragments_.clear();
     }
+
+    // Writes the mean of the passes.
+    void finish(FinishedTile& out)
+    {
+        static thread_local PixelSums sums;
+        const int last = info_.passes - 1;
+        const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
+        compositePasses([&](int y, int pass, const CompositeRow& row) {
+            if (direct) {
+                out.setRow(y, row.rgba.data(), row.depth.data());
+                return;
+            }
+            if (pass == 0)
+                sums.reset(static_cast<std::size_t>(out.width()), tracked_);
+            sums.add(0, row);
+            if (pass == last)
+                sums.write(out, y, 0, info_.passes);
+        });
+    }
+
+    // Pixels in which inputs of the last finished frame overlapped in depth.
+    std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
 
 private:
     struct Scratch {
         std::vector<const Fragment*> pointers;
         std::vector<FragmentCompositor> compositors;
         CompositeRow row;
-        std::vector<double> sum;
-        std::vector<float> nearest;
+        std::vector<std::uint8_t> isUndefined;
     };
 
-    static void accumulate(Scratch& s, bool first)
+    TileInfo info_;
+    ChannelMask tracked_ = 0;
+    std::vector<Fragment> fragments_;
+    std::int64_t undefinedPixels_ = 0;
+};
+
+// What the sort-last operations have in common.
+template <BlendRule Rule, int TileSize, ChannelMask Channels>
+class SortLast {
+public:
+    static constexpr int tileSize = TileSize;
+    static constexpr ChannelMask channels = Channels;
+
+    void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
+    void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
+    void finish(FinishedTile& out) { store_.finish(out); }
+    void report(TileReport& report) const { report.orderUndefinedPixels = store_.undefinedPixels(); }
+
+    // For operations on top of this one: calls passDone(y, pass, row) for each composited row and pass, row by row.
+    template <class PassDone>
+    void compositePasses(const PassDone& passDone)
     {
-        if (first) {
-            s.sum = s.row.rgba;
-            s.nearest = s.row.depth;
-            return;
-        }
-        for (std::size_t i = 0; i < s.sum.size(); ++i)
-            s.sum[i] += s.row.rgba[i];
-        for (std::size_t i = 0; i < s.nearest.size(); ++i)
-            s.nearest[i] = std::min(s.nearest[i], s.row.depth[i]);
+        store_.compositePasses(passDone);
     }
 
-    TileInfo info_;
-    std::vector<Fragment> fragments_;
+protected:
+    FragmentStore<Rule> store_;
 };
 
 } // namespace detail
 
-// Accepts any tree. Empty inputs (a background tile that only announces children, "nothing here") count for the tree
-// and cost nothing. Accuracy: see compositing.hpp; the mean over n passes adds at most n * 2^-53 relative.
-template <int TileSize = 64>
-class BasicAlphaBlend {
+// Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
+// announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over n
+// passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
+// order is undefined. Of `Channels` beside colour, depth and farChannel what the image does not have does not travel.
+template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
+class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
+    static_assert((Channels & depthChannel) != 0, "dfb: AlphaBlend sorts by depth");
+
 public:
-    static constexpr int tileSize = TileSize;
-    static constexpr ChannelMask channels = colorChannel | depthChannel;
+    static constexpr ChannelMask neededChannels = Channels & (colorChannel | depthChannel | farChannel);
+};
 
-    void newFrame(const TileInfo& info) { store_.newFrame(info); }
-    void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
-    void finish(FinishedTile& out) { store_.finish(out); }
+// Blends inputs in the order of their generation, front to back: for where there is an order of the bricks that is
+// right for all pixels of a tile. Nothing is sorted, and no depth travels unless the image has it. The tree is a list:
+// each input announces 1 child but the last, which announces none; a tile without any has one empty input of generation
+// 0. See renderOrdered().
+template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
+class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
+public:
+    static constexpr ChannelMask neededChannels = colorChannel;
 
-private:
-    detail::FragmentStore store_;
+    void add(Fragment&& fragment)
+    {
+        if (fragment.header().children > 1)
+            throw InvalidArgument("inputs in order form a list: at most 1 child each, not "
+                                  + std::to_string(fragment.header().children));
+        this->store_.add(std::move(fragment));
+    }
+};
+
+// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry; what is behind it is not
+// blended, whatever its alpha. Accepts any tree.
+template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
+class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
+    static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");
+
+public:
+    static constexpr ChannelMask neededChannels = Channels & (colorChannel | depthChannel);
 };
 
 using AlphaBlend = BasicAlphaBlend<>;
-static_assert(is_tile_op_v<AlphaBlend>);
+using OrderedBlend = BasicOrderedBlend<>;
+using DepthComposite = BasicDepthComposite<>;
+static_assert(is_tile_op_v<AlphaBlend> && is_tile_op_v<OrderedBlend> && is_tile_op_v<DepthComposite>);
 
 } // namespace dfb

@@ -1,0 +1,84 @@
+// Channels: what a pixel can have, how wide it is, and how it is blended.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+
+namespace dfb {
+
+// A set of channels, one bit each. Unless a tile operation says otherwise, the inputs of a pixel are blended front to
+// back, and channel by channel as said here; a mean over passes is one of the blended passes.
+using ChannelMask = std::uint16_t;
+inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
+// Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
+inline constexpr ChannelMask depthChannel = 2;
+// Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they come
+// out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
+inline constexpr ChannelMask normalChannel = 4;       // 3 floats times alpha: over; comes out shorter than 1 where normals differ
+inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
+inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the input that gives the depth
+inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the nearest input with alpha > 0 that has one
+inline constexpr ChannelMask instanceIdChannel = 64;  // the same
+// How far back the input reaches, 1 float in the units of depth: the interval [depth, far] holds all that was blended
+// into the pixel. It is compared, never blended and no part of an image.
+inline constexpr ChannelMask farChannel = 128;
+
+// What an image can have beside colour and depth.
+inline constexpr ChannelMask imageAuxChannels =
+    normalChannel | albedoChannel | positionChannel | primitiveIdChannel | instanceIdChannel;
+inline constexpr ChannelMask allChannels = colorChannel | depthChannel | imageAuxChannels | farChannel;
+
+// Where there is no primitive or instance.
+inline constexpr std::uint32_t noId = 0xffffffffu;
+
+namespace detail {
+
+inline constexpr int channelCount = 8;
+inline constexpr int channelWords[channelCount] = {4, 1, 3, 3, 3, 1, 1, 1}; // of 4 bytes
+enum Channel : std::size_t { Color, Depth, Normal, Albedo, Position, PrimitiveId, InstanceId, Far };
+
+constexpr bool hasChannel(ChannelMask channels, std::size_t channel) noexcept { return (channels >> channel) & 1; }
+
+// One pointer per channel; null where there is none.
+template <class Byte>
+struct BasicPlanes {
+    std::array<Byte*, channelCount> at{};
+
+    // Steps over so many pixels.
+    void advance(std::size_t pixels) noexcept
+    {
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (at[c])
+                at[c] += 4 * pixels * static_cast<std::size_t>(channelWords[c]);
+    }
+    BasicPlanes from(std::size_t pixels) const noexcept
+    {
+        BasicPlanes result = *this;
+        result.advance(pixels);
+        return result;
+    }
+};
+using Planes = BasicPlanes<std::byte>;
+using ConstPlanes = BasicPlanes<const std::byte>;
+
+inline const float* floatsOf(const std::byte* plane) noexcept { return reinterpret_cast<const float*>(plane); }
+inline float* floatsOf(std::byte* plane) noexcept { return reinterpret_cast<float*>(plane); }
+inline const std::uint32_t* idsOf(const std::byte* plane) noexcept
+{
+    return reinterpret_cast<const std::uint32_t*>(plane);
+}
+inline std::uint32_t* idsOf(std::byte* plane) noexcept { return reinterpret_cast<std::uint32_t*>(plane); }
+
+} // namespace detail
+
+// Words of 4 bytes that the channels of a mask take per pixel.
+constexpr int wordsPerPixel(ChannelMask channels) noexcept
+{
+    int words = 0;
+    for (std::size_t c = 0; c < detail::channelCount; ++c)
+        words += detail::hasChannel(channels, c) ? detail::channelWords[c] : 0;
+    return words;
+}
+
+} // namespace dfb

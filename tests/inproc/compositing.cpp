@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/compositing.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/compositing.hpp"
