@@ -6,9 +6,11 @@
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/image_parallel.hpp>
 #include <dfb/ops/pixel_ops.hpp>
+#include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/data_parallel.hpp>
 #include <dfb/render/image_parallel.hpp>
+#include <dfb/render/sampling.hpp>
 
 #if defined(DFB_HAS_MPI)
 #include <dfb/comm/mpi_session.hpp>

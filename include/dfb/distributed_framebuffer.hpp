@@ -69,6 +69,12 @@ public:
         // How many samples a tile gets in this frame, and which.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
+        // A range of jobs for this rank out of [0, count), all of which every rank could do; over all ranks each comes up
+        // once. Empty: there are no more, or the frame has failed. `count` must be the same on all ranks and calls; only by
+        // the thread that began the frame, and not in a task: waits for the answer of another rank, which is asked while
+        // the range before is worked on. Throws TransportError.
+        JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
+
         // Adds to what FrameReport::figures has for this key, on all ranks. For what a renderer measures and all ranks
         // must know alike, such as the cost of a brick: it travels with the verdict. From any thread.
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }

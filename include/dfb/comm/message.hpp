@@ -24,6 +24,8 @@ enum class MessageKind : std::uint8_t {
     Abort,         // the frame has failed on the sender
     CreditRequest, // the sender has more for this rank than it may send
     Credit,        // how much the receiver of this may send
+    JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
+    Jobs,          // a range of them
     Failure        // the sender's messenger can not go on, nor can anybody who waits for it
 };
 

@@ -4,6 +4,7 @@
 
 #include <dfb/comm/messaging.hpp>
 #include <dfb/detail/frame_gate.hpp>
+#include <dfb/detail/job_share.hpp>
 #include <dfb/detail/manifest.hpp>
 #include <dfb/detail/outcome.hpp>
 #include <dfb/detail/tile_pipeline.hpp>
@@ -124,6 +125,7 @@ public:
         } catch (...) {
             userError = std::current_exception();
         }
+        jobs_.newFrame();
         outcome_->newFrame();
         ownTilesDone_ = endCalled_ = false;
         bytesBefore_ = messaging_->bytesSent();
@@ -189,6 +191,18 @@ public:
         figures_.push_back({key, value});
     }
 
+    JobRange nextJobs(std::int64_t count)
+    {
+        std::optional<JobRange> range = jobs_.take(count, rank(), size());
+        askForJobs(count); // for the next time, while this one is worked on
+        if (!range) {
+            messaging_->wait([this] { return jobs_.ready() || outcome_->failed(); });
+            range = jobs_.take(count, rank(), size());
+            askForJobs(count);
+        }
+        return range.value_or(JobRange{});
+    }
+
     void noteMergeError(double bound)
     {
         const std::lock_guard<std::mutex> lock(figuresMutex_);
@@ -239,6 +253,7 @@ public:
             throw FrameError(*verdict.error);
         pipeline_->fillBackground();
         lastKey_ = params_.declarationKey;
+        lastAccumulationId_ = params_.accumulationId;
 
         const double nsPerMs = 1e6;
         FrameReport report;
@@ -297,6 +312,27 @@ private:
             messaging_->flow().consumed(source, byteCount);
         guarded([&] { handle(source, header, std::move(message)); }, messageFrom(source));
         gate_.leave();
+    }
+
+    // By the rank after the display rank, which has enough to do.
+    int jobServer() const { return (config_.displayRank + 1) % size(); }
+
+    void askForJobs(std::int64_t count)
+    {
+        if (!jobs_.shouldAsk())
+            return;
+        const JobRequest request{count, config_.executor->concurrency(), 0};
+        if (jobServer() == rank())
+            jobs_.receive(jobs_.give(request, size()));
+        else
+            sendBody(jobServer(), MessageKind::JobRequest, request);
+    }
+
+    template <class Body>
+    void sendBody(int to, MessageKind kind, const Body& body)
+    {
+        const auto* first = reinterpret_cast<const std::byte*>(&body);
+        messaging_->send(to, kind, gate_.frame(), Bytes(first, first + sizeof body));
     }
 
     void failForStray()
@@ -379,6 +415,17 @@ private:
         case MessageKind::ManifestAck:
             if (manifests_.acknowledged())
                 enterAllDeclared();
+            break;
+        case MessageKind::JobRequest: {
+            const auto request = bodyAs<JobRequest>(message);
+            if (request.count < 0 || request.workers < 1)
+                failMalformed("a request for jobs that can not be");
+            sendBody(source, MessageKind::Jobs, jobs_.give(request, size()));
+            break;
+        }
+        case MessageKind::Jobs:
+            jobs_.receive(bodyAs<JobRange>(message));
+            messaging_->notify();
             break;
         case MessageKind::FinishedTiles:
             pipeline_->gather().receiveTiles(source, std::move(message));
@@ -614,9 +661,9 @@ private:
                                       + std::to_string(t.first) + " on");
             if (!KeepsState<TileOp>::value && (t.count == 0 || t.first > 0))
                 throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
-            if (t.first > 0 && lastFailed_)
-                throw InvalidArgument("the last frame failed, and what was accumulated is not complete: begin again "
-                                      "with sample 0 and another accumulationId");
+            if ((t.first > 0 || t.count == 0) && (lastFailed_ || params.accumulationId != lastAccumulationId_))
+                throw InvalidArgument("what was accumulated is of no use, as the last frame failed or had another "
+                                      "accumulationId: begin again with sample 0 of each tile");
         }
     }
 
@@ -671,12 +718,14 @@ private:
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
     ManifestExchange manifests_;
+    JobShare jobs_;
 
     // The frame.
     FrameGate gate_;
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
     std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
+    std::uint64_t lastAccumulationId_ = 0;
     bool frameOpen_ = false, lastFailed_ = false;
     std::mutex figuresMutex_;
     std::vector<Figure> figures_; // under figuresMutex_

@@ -132,7 +132,7 @@ public:
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
                 const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-                if ((!named && !all && !touched) || (samples(owned_[i]).count == 0 && !named))
+                if ((!named && !all && !touched) || samples(owned_[i]).count == 0)
                     continue;
                 Slot& slot = slotFor(owned_[i]);
                 if (!slot.declared)

@@ -27,16 +27,18 @@ FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera
     const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
     if (frame.wantsDeclaration())
         frame.declare(inputsOf(world, pairs));
-    const auto passes = static_cast<std::size_t>(params.passes);
-    return detail::runTileJobs(fb, frame, pairs.size() * passes, [&](std::size_t i, auto& tile) {
-        const BrickInTile& pair = pairs[i / passes];
-        const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)];
-        frame.start(tile, pair.tile, static_cast<int>(i % passes));
+    const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
+    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
+        const auto job = jobs.at(static_cast<std::int64_t>(i));
+        const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];
+        frame.start(tile, pairs[job.item].tile, job.pass);
         tile.generation = 1;
         tile.source = brick.id;
         renderBrick(brick, tile);
         frame.setTile(tile);
     });
+    return frame.end();
 }
 
 } // namespace dfb

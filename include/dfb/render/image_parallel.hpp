@@ -1,18 +1,29 @@
-// The image-parallel rendering loop (Listing 2 of the paper): all ranks have the scene, each tile is rendered by
-// one of them.
+// The image-parallel rendering loop (Listing 2 of the paper): all ranks have the scene, each tile and pass is
+// rendered by one of them.
 #pragma once
 
+#include <dfb/frame.hpp>
 #include <dfb/render/tile_loop.hpp>
 
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace dfb {
 
+// Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many samples
+// is rendered by many ranks; the image does not depend on who renders what.
+enum class WorkDistribution : std::uint8_t {
+    Owned,      // a rank renders the tiles that it owns: no input travels
+    Linear,     // equal contiguous shares in the order of tiles
+    RoundRobin, // dealt out one by one
+    Dynamic     // one half as with Linear, the other handed out on demand, in shares that shrink
+};
+
 // Collective. Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and ends
-// the frame. `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass; it
-// writes the pixels of tile.region into the cleared tile. Throws what Frame::end() throws; an exception of renderTile
-// becomes a FrameError on all ranks.
+// the frame. `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and
+// tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what Frame::end() throws; an exception of
+// renderTile becomes a FrameError on all ranks.
 template <class FrameBuffer, class RenderTile>
 FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigned, const RenderTile& renderTile,
                                 FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
@@ -21,15 +32,61 @@ FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigne
     params.declared = false;
     params.declarationKey = 0;
     auto frame = fb.begin(params, tileData, pixelData);
-    const auto passes = static_cast<std::size_t>(params.passes);
-    return detail::runTileJobs(fb, frame, assigned.size() * passes, [&](std::size_t i, auto& tile) {
-        frame.start(tile, assigned[i / passes], static_cast<int>(i % passes));
+    const detail::PassJobs jobs(assigned.size(), [&](std::size_t i) { return frame.samples(assigned[i]).count; });
+    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
+        const auto job = jobs.at(static_cast<std::int64_t>(i));
+        frame.start(tile, assigned[job.item], job.pass);
         renderTile(tile);
         frame.setTile(tile);
     });
+    return frame.end();
 }
 
-// The same, each rank rendering the tiles that it owns: no input travels.
+// The same, the tiles and passes distributed in one of these ways, the same on all ranks.
+template <class FrameBuffer, class RenderTile>
+FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, const RenderTile& renderTile,
+                                FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    if (distribution == WorkDistribution::Owned)
+        return renderImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
+    params.declared = false;
+    params.declarationKey = 0;
+    auto frame = fb.begin(params, tileData, pixelData);
+    const detail::PassJobs jobs(static_cast<std::size_t>(fb.layout().tileCount()),
+                                [&](std::size_t tile) { return frame.samples(static_cast<int>(tile)).count; });
+    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    const auto render = [&](std::int64_t job, auto& tile) {
+        const auto at = jobs.at(job);
+        frame.start(tile, static_cast<int>(at.item), at.pass);
+        renderTile(tile);
+        frame.setTile(tile);
+    };
+    const std::int64_t count = jobs.count(), rank = fb.rank(), size = fb.size();
+    const auto renderRange = [&](std::int64_t begin, std::int64_t end) {
+        loop.run(static_cast<std::size_t>(end - begin),
+                 [&](std::size_t i, auto& tile) { render(begin + static_cast<std::int64_t>(i), tile); });
+    };
+    switch (distribution) {
+    case WorkDistribution::Linear: renderRange(count * rank / size, count * (rank + 1) / size); break;
+    case WorkDistribution::RoundRobin:
+        loop.run(static_cast<std::size_t>((count - rank + size - 1) / size),
+                 [&](std::size_t i, auto& tile) { render(rank + static_cast<std::int64_t>(i) * size, tile); });
+        break;
+    case WorkDistribution::Dynamic:
+        loop.guard([&] {
+            for (JobRange jobsHere = frame.nextJobs(count); jobsHere.begin < jobsHere.end && !frame.failed();
+                 jobsHere = frame.nextJobs(count))
+                renderRange(jobsHere.begin, jobsHere.end);
+        });
+        break;
+    case WorkDistribution::Owned: break;
+    }
+    return frame.end();
+}
+
+// The same, each rank rendering the tiles that it owns.
 template <class FrameBuffer, class RenderTile>
 FrameReport renderImageParallel(FrameBuffer& fb, const RenderTile& renderTile, const FrameParams& params = {},
                                 const typename FrameBuffer::TileFrameData& tileData = {},

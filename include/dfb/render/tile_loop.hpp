@@ -1,10 +1,10 @@
 // TileLoop: what the rendering loops have in common: tiles to render into, a job per tile and pass on all
-// workers, and the end of a frame in which a renderer may have thrown.
+// workers, and a frame in which a renderer may throw.
 #pragma once
 
-#include <dfb/frame.hpp>
-
+#include <algorithm>
 #include <cstddef>
+#include <cstdint>
 #include <exception>
 #include <memory>
 #include <mutex>
@@ -13,37 +13,89 @@
 
 namespace dfb::detail {
 
-// Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own, then ends the
-// frame. An exception of a job makes the frame fail on all ranks. Throws what Frame::end() throws.
-template <class FrameBuffer, class Job>
-FrameReport runTileJobs(FrameBuffer& fb, typename FrameBuffer::Frame& frame, std::size_t count, const Job& job)
-{
-    using Tile = typename FrameBuffer::Tile;
-    std::mutex mutex;
-    std::vector<std::unique_ptr<Tile>> spare;
-    try {
-        fb.executor().parallelFor(count, [&](std::size_t i) {
-            if (frame.failed())
-                return;
-            // Not one per thread: a renderer that waits inside a job may be given another job on the same thread.
-            std::unique_ptr<Tile> tile;
-            {
-                const std::lock_guard<std::mutex> lock(mutex);
-                if (!spare.empty()) {
-                    tile = std::move(spare.back());
-                    spare.pop_back();
-                }
-            }
-            if (!tile)
-                tile.reset(new Tile); // start() clears it
-            job(i, *tile);
-            const std::lock_guard<std::mutex> lock(mutex);
-            spare.push_back(std::move(tile));
-        });
-    } catch (...) {
-        frame.abort(std::current_exception());
+// A job for each pass of each of some items, numbered item by item.
+class PassJobs {
+public:
+    // `passesOf(item)`: how many passes an item has.
+    template <class PassesOf>
+    PassJobs(std::size_t itemCount, const PassesOf& passesOf) : firstJob_(itemCount + 1, 0)
+    {
+        for (std::size_t i = 0; i < itemCount; ++i)
+            firstJob_[i + 1] = firstJob_[i] + passesOf(i);
     }
-    return frame.end();
-}
+
+    std::int64_t count() const noexcept { return firstJob_.back(); }
+
+    struct Job {
+        std::size_t item = 0;
+        int pass = 0;
+    };
+    Job at(std::int64_t job) const
+    {
+        const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
+        const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
+        return {item, static_cast<int>(job - firstJob_[item])};
+    }
+
+private:
+    std::vector<std::int64_t> firstJob_;
+};
+
+// An exception of a job makes the frame fail on all ranks; then no further job is begun. Lives as long as the frame is
+// rendered, on the thread that began it.
+template <class FrameBuffer>
+class TileLoop {
+    using Tile = typename FrameBuffer::Tile;
+
+public:
+    TileLoop(FrameBuffer& fb, typename FrameBuffer::Frame& frame) : fb_(fb), frame_(frame) {}
+
+    // Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own.
+    template <class Job>
+    void run(std::size_t count, const Job& job)
+    {
+        guard([&] {
+            fb_.executor().parallelFor(count, [&](std::size_t i) {
+                if (frame_.failed())
+                    return;
+                // Not one per thread: a renderer that waits inside a job may be given another job on the same thread.
+                std::unique_ptr<Tile> tile = take();
+                job(i, *tile);
+                const std::lock_guard<std::mutex> lock(mutex_);
+                spare_.push_back(std::move(tile));
+            });
+        });
+    }
+
+    // Calls body(); what it throws makes the frame fail.
+    template <class Body>
+    void guard(const Body& body)
+    {
+        try {
+            body();
+        } catch (...) {
+            frame_.abort(std::current_exception());
+        }
+    }
+
+private:
+    std::unique_ptr<Tile> take()
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (!spare_.empty()) {
+                std::unique_ptr<Tile> tile = std::move(spare_.back());
+                spare_.pop_back();
+                return tile;
+            }
+        }
+        return std::unique_ptr<Tile>(new Tile); // start() clears it
+    }
+
+    FrameBuffer& fb_;
+    typename FrameBuffer::Frame& frame_;
+    std::mutex mutex_;
+    std::vector<std::unique_ptr<Tile>> spare_; // under mutex_
+};
 
 } // namespace dfb::detail

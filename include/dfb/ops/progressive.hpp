@@ -1,0 +1,113 @@
+// Progressive: accumulates what another operation composites over the passes of many frames, and says how far the
+// mean may be off (section 4.1.1 of the paper).
+#pragma once
+
+#include <dfb/moments.hpp>
+#include <dfb/ops/sort_last.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <string>
+#include <type_traits>
+#include <vector>
+
+namespace dfb {
+
+// `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The image
+// is the mean of all samples since FrameParams::accumulationId changed or a tile began with sample 0; a tile must get its
+// samples in order, in each frame those that follow. A tile without samples in a frame costs nothing and keeps its pixels.
+// For each finished tile TileReport::error is the standard error of its pixels' mean (root mean square over pixels and
+// RGBA) in the worst of its blocks of 8x8 pixels, so that a bright corner counts however dark the rest is; infinite before
+// the second sample. Memory: 45 bytes a pixel of a tile that is owned and was touched, and 36 with normals and albedo more.
+template <class Base>
+class Progressive {
+public:
+    static constexpr int tileSize = detail::TileSizeOf<Base>::value;
+    static constexpr ChannelMask channels = Base::channels;
+    static constexpr ChannelMask neededChannels = detail::NeededChannelsOf<Base>::value;
+    static constexpr bool keepsState = true;
+
+    void newFrame(const TileInfo& info)
+    {
+        base_.newFrame(info);
+        info_ = info;
+        if (isFresh_ || info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)) {
+            isFresh_ = false;
+            accumulationId_ = info.accumulationId;
+            samples_ = 0;
+            sums_.reset(pixelCount(), info.wanted);
+            m2_.assign(pixelCount(), 0.0);
+        }
+        if (info.passes > 0 && info.firstSample != samples_)
+            throw InvalidArgument("the tile has accumulated " + std::to_string(samples_)
+                                  + " samples, the frame gives it those from " + std::to_string(info.firstSample)
+                                  + " on");
+    }
+
+    void add(Fragment&& fragment) { base_.add(std::move(fragment)); }
+
+    void finish(FinishedTile& out)
+    {
+        const auto width = static_cast<std::size_t>(out.width());
+        base_.compositePasses([&](int y, int pass, const CompositeRow& row) {
+            const std::size_t first = static_cast<std::size_t>(y) * width;
+            for (std::size_t x = 0; x < width; ++x)
+                m2_[first + x] += Moments::growth(samples_ + pass, sums_.rgba(first + x), 1, row.rgba.data() + 4 * x);
+            sums_.add(first, row);
+        });
+        samples_ += info_.passes;
+        for (int y = 0; y < out.height(); ++y)
+            sums_.write(out, y, static_cast<std::size_t>(y) * width, std::max<std::int64_t>(1, samples_));
+    }
+
+    void report(TileReport& report) const
+    {
+        base_.report(report);
+        report.error = samples_ > 1 ? std::sqrt(worstBlock() / (4 * static_cast<double>(samples_ - 1)
+                                                                * static_cast<double>(samples_)))
+                                    : std::numeric_limits<double>::infinity();
+    }
+
+private:
+    std::size_t pixelCount() const
+    {
+        return static_cast<std::size_t>(info_.region.width()) * static_cast<std::size_t>(info_.region.height());
+    }
+
+    // The largest mean of M2 over the pixels of a block. A value that is not a number counts for its pixel alone: it
+    // would have the tile rendered for ever.
+    double worstBlock() const
+    {
+        constexpr int side = 8;
+        const int width = info_.region.width(), height = info_.region.height();
+        double worst = 0;
+        for (int y0 = 0; y0 < height; y0 += side)
+            for (int x0 = 0; x0 < width; x0 += side) {
+                double sum = 0;
+                int count = 0;
+                for (int y = y0; y < std::min(height, y0 + side); ++y)
+                    for (int x = x0; x < std::min(width, x0 + side); ++x, ++count) {
+                        const double m2 = m2_[static_cast<std::size_t>(y) * static_cast<std::size_t>(width)
+                                              + static_cast<std::size_t>(x)];
+                        sum += std::isfinite(m2) ? m2 : 0;
+                    }
+                worst = std::max(worst, sum / count);
+            }
+        return worst;
+    }
+
+    Base base_;
+    TileInfo info_;
+    bool isFresh_ = true;
+    std::uint64_t accumulationId_ = 0;
+    std::int64_t samples_ = 0;
+    detail::PixelSums sums_;
+    std::vector<double> m2_; // per pixel, see Moments
+};
+
+static_assert(is_tile_op_v<Progressive<AlphaBlend>>);
+
+} // namespace dfb

@@ -1,0 +1,155 @@
+// AdaptiveSampler: how many samples each tile gets in the next frame, from what the owners said of the last ones
+// (section 4.1.1 of the paper).
+#pragma once
+
+#include <dfb/frame.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace dfb {
+
+struct SamplingSettings {
+    // A tile is done when its TileReport::error, a standard error in units of colour, is at most this. 0: never.
+    double maxError = 0;
+    int firstSamples = 8;  // of each tile, before its error is believed; at least 2
+    int maxSamples = 1024; // of each tile, in all
+    int frameSamples = 64; // the most that a tile gets in one frame; what waits for compositing grows with it
+};
+
+// Used alike on all ranks: what it decides is a function of the frames' reports, which are the same everywhere; a rank
+// that decides otherwise is found by the frame's verdict. The operation is a Progressive one:
+//
+//   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
+//   while (!sampler.done())
+//       sampler.update(dfb::renderImageParallel(fb, renderTile, sampler.next()));
+//
+// A frame that throws FrameError must be followed by reset(): what was accumulated is lost.
+class AdaptiveSampler {
+public:
+    // Throws InvalidArgument for settings that can not be.
+    AdaptiveSampler(const TileLayout& layout, const SamplingSettings& settings) : layout_(layout), settings_(settings)
+    {
+        if (settings.firstSamples < 2 || settings.maxSamples < settings.firstSamples || settings.frameSamples < 1
+            || !(settings.maxError >= 0))
+            throw InvalidArgument("sampling goes from 2 first samples or more up to as many at least, "
+                                  "in frames of 1 or more");
+        reset();
+    }
+
+    // Begins again; on all ranks.
+    void reset()
+    {
+        ++accumulationId_;
+        taken_.assign(static_cast<std::size_t>(layout_.tileCount()), 0);
+        error_.assign(taken_.size(), std::numeric_limits<double>::infinity());
+        decide();
+    }
+
+    // Whether no tile needs more.
+    bool done() const
+    {
+        return std::all_of(plan_.begin(), plan_.end(), [](const TileSamples& t) { return t.count == 0; });
+    }
+
+    // What the next frame is to begin with; the rest is as in `params`.
+    FrameParams next(FrameParams params = {}) const
+    {
+        params.samples = std::make_shared<const std::vector<TileSamples>>(plan_);
+        params.accumulationId = accumulationId_;
+        return params;
+    }
+
+    // Takes note of the frame that was begun with next().
+    void update(const FrameReport& report)
+    {
+        for (std::size_t t = 0; t < plan_.size(); ++t)
+            if (taken_[t] == 0)
+                error_[t] = untouched; // unless somebody says otherwise
+        for (const TileError& e : report.tileErrors) {
+            const auto t = static_cast<std::size_t>(e.tile);
+            taken_[t] += plan_[t].count;
+            error_[t] = e.error;
+        }
+        decide();
+    }
+
+    // Samples of pixels: taken in all, and those fewer than if each tile had as many as the one that has most.
+    std::int64_t samplesTaken() const
+    {
+        std::int64_t sum = 0;
+        for (std::size_t t = 0; t < taken_.size(); ++t)
+            sum += taken_[t] * pixelsOf(t);
+        return sum;
+    }
+    std::int64_t samplesSaved() const
+    {
+        const int most = *std::max_element(taken_.begin(), taken_.end());
+        std::int64_t all = 0;
+        for (std::size_t t = 0; t < taken_.size(); ++t)
+            all += most * pixelsOf(t);
+        return all - samplesTaken();
+    }
+    // Of one tile.
+    int samplesOf(int tile) const { return taken_[static_cast<std::size_t>(tile)]; }
+
+private:
+    static constexpr double untouched = -1; // nothing projects to the tile
+
+    std::int64_t pixelsOf(std::size_t tile) const
+    {
+        const Region r = layout_.region(static_cast<int>(tile));
+        return static_cast<std::int64_t>(r.width()) * r.height();
+    }
+
+    void decide()
+    {
+        plan_.resize(taken_.size());
+        for (std::size_t t = 0; t < taken_.size(); ++t)
+            plan_[t] = {taken_[t], 0};
+        for (std::size_t t = 0; t < taken_.size(); ++t)
+            plan_[t].count = std::min(wanted(t), settings_.maxSamples) - taken_[t];
+        // What is rare may not have been seen yet: a tile beside one that needs many samples gets a quarter of what that
+        // one has, so that an edge that only just reaches into it is not lost.
+        for (int row = 0; row < layout_.tilesY(); ++row)
+            for (int column = 0; column < layout_.tilesX(); ++column) {
+                const auto tile = static_cast<std::size_t>(layout_.tileAt(column, row));
+                int most = 0;
+                for (int y = std::max(0, row - 1); y <= std::min(layout_.tilesY() - 1, row + 1); ++y)
+                    for (int x = std::max(0, column - 1); x <= std::min(layout_.tilesX() - 1, column + 1); ++x)
+                        most = std::max(most, taken_[static_cast<std::size_t>(layout_.tileAt(x, y))]);
+                const int count = std::max(plan_[tile].count, most / 4 - taken_[tile]);
+                plan_[tile].count = error_[tile] == untouched ? 0 : std::clamp(count, 0, settings_.frameSamples);
+            }
+    }
+
+    // How many samples the tile needs in all, as far as can be told: the error falls with the root of their number. At
+    // most twice what it has, since an error from few samples is itself uncertain.
+    int wanted(std::size_t t) const
+    {
+        if (taken_[t] < settings_.firstSamples)
+            return settings_.firstSamples;
+        if (error_[t] <= settings_.maxError && settings_.maxError > 0)
+            return taken_[t];
+        if (settings_.maxError == 0)
+            return settings_.maxSamples;
+        const double ratio = error_[t] / settings_.maxError;
+        const double needed = static_cast<double>(taken_[t]) * std::min(2.0, ratio * ratio);
+        return static_cast<int>(std::min(std::ceil(needed), 2e9));
+    }
+
+    TileLayout layout_;
+    SamplingSettings settings_;
+    std::uint64_t accumulationId_ = 0;
+    std::vector<int> taken_;    // per tile
+    std::vector<double> error_; // per tile
+    std::vector<TileSamples> plan_;
+};
+
+} // namespace dfb
