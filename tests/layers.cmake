@@ -15,13 +15,13 @@ set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
 set(level_5 tile.hpp)
 set(level_6 dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/wire.hpp render/visibility.hpp)
-set(level_8 pixel_op.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
+set(level_8 pixel_op.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
             detail/final_gather.hpp detail/tile_table.hpp detail/verdict.hpp)
-set(level_9 ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/image_parallel.hpp
+set(level_9 ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
             detail/outcome.hpp)
 set(level_10 detail/tile_pipeline.hpp)
 set(level_11 detail/frame_engine.hpp)
-set(level_12 distributed_framebuffer.hpp)
+set(level_12 display_wall.hpp distributed_framebuffer.hpp)
 set(level_13 dfb.hpp)
 set(last_level 13)
 
@@ -33,7 +33,7 @@ set(door_of_tbb tbb_executor.hpp)
 # Who must not see whom, however many includes are in between: pixels and operations know nothing of messages and
 # threads; messages know nothing of pixels (that one follows from the levels, too, as long as they stay so).
 set(pixels_and_operations "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|compositing|tile_op|pixel_op|ops/.*)\\.hpp$")
-set(messages_and_threads "^(comm/.*|exec|tbb_executor|frame|detail/.*|distributed_framebuffer)\\.hpp$")
+set(messages_and_threads "^(comm/.*|exec|tbb_executor|frame|detail/.*|display_wall|distributed_framebuffer)\\.hpp$")
 set(messages "^comm/.*\\.hpp$")
 set(pixels "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|compositing|tile_op|pixel_op|ops/.*|render/.*)\\.hpp$")
 

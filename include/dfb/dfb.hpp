@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/comm/inproc_transport.hpp>
+#include <dfb/display_wall.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/image_parallel.hpp>
 #include <dfb/ops/pixel_ops.hpp>
@@ -10,6 +11,7 @@
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/data_parallel.hpp>
 #include <dfb/render/image_parallel.hpp>
+#include <dfb/render/mixed_parallel.hpp>
 #include <dfb/render/sampling.hpp>
 
 #if defined(DFB_HAS_MPI)

@@ -159,6 +159,12 @@ public:
         });
     }
 
+    // Collective, outside frames: the bytes of each rank, by rank, on all ranks.
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
+    {
+        return engine_.allGather(bytes);
+    }
+
 private:
     Engine engine_;
 };

@@ -287,6 +287,28 @@ public:
         return messaging_->allReduce(values, operation);
     }
 
+    std::vector<Bytes> allGather(const Bytes& own)
+    {
+        ByteWriter out; // of each rank: which it is, the size, the bytes
+        out.put(static_cast<std::int32_t>(rank()));
+        out.put(static_cast<std::uint64_t>(own.size()));
+        Bytes mine = out.take();
+        mine.insert(mine.end(), own.begin(), own.end());
+        const Bytes all = messaging_->reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
+            Bytes both = a;
+            both.insert(both.end(), b.begin(), b.end());
+            return both;
+        });
+        std::vector<Bytes> result(static_cast<std::size_t>(size()));
+        for (ByteReader in(all); in.left() > 0;) {
+            const auto from = static_cast<std::size_t>(in.get<std::int32_t>());
+            result.at(from).resize(static_cast<std::size_t>(in.get<std::uint64_t>()));
+            for (std::byte& byte : result[from])
+                byte = in.get<std::byte>();
+        }
+        return result;
+    }
+
 private:
     using Clock = std::chrono::steady_clock;
     enum Scope : std::uint32_t { AllDeclared = Messaging<Transport>::ownScope + 1, FrameVerdict };

@@ -1,0 +1,369 @@
+// DisplayWall: finished tiles straight from their owners to the ranks that drive the displays (section 4.4 of the
+// paper). The framebuffer's own image format is None: no rank gets the pixels of another's displays.
+#pragma once
+
+#include <dfb/comm/messaging.hpp>
+#include <dfb/detail/verdict.hpp>
+#include <dfb/exec.hpp>
+#include <dfb/fwd.hpp>
+#include <dfb/image.hpp>
+#include <dfb/pixel_op.hpp>
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// Displays of equal size in columns and rows, 0 at the upper left, row by row. The framebuffer has the pixels of all of
+// them and those behind the bezels between them, so that a line that crosses a bezel goes on straight.
+struct WallLayout {
+    int columns = 1, rows = 1;
+    int displayWidth = 0, displayHeight = 0; // pixels
+    int bezelX = 0, bezelY = 0;              // pixels that are not seen between two displays
+    std::vector<int> ranks;                  // that drives each display; any number of displays each, from none to all
+
+    // Of the framebuffer.
+    int width() const noexcept { return columns * displayWidth + (columns - 1) * bezelX; }
+    int height() const noexcept { return rows * displayHeight + (rows - 1) * bezelY; }
+    int displayCount() const noexcept { return columns * rows; }
+
+    // What a display shows of the framebuffer.
+    Region region(int display) const noexcept
+    {
+        const int x0 = display % columns * (displayWidth + bezelX), y0 = display / columns * (displayHeight + bezelY);
+        return {x0, y0, x0 + displayWidth, y0 + displayHeight};
+    }
+};
+
+template <class Transport>
+class DisplayWall;
+
+// The pixel operation that sends tiles to a wall. Works after every tile operation, and as the last of a PixelOpChain.
+template <class Transport = MpiTransport>
+struct ToWall {
+    DisplayWall<Transport>* wall = nullptr; // outlives the framebuffer
+
+    void process(PixelTile& tile) const { wall->put(tile); }
+};
+
+// One object per rank, over the messenger that the framebuffer uses as well:
+//
+//   auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(communicator);
+//   dfb::DisplayWall<> wall(messenger, layout, dfb::OutputFormat::SRGBA8);
+//   dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::ToWall<>> fb(messenger, wall.frameBufferConfig(), {&wall});
+//   const auto report = dfb::renderDataParallel(fb, ...);
+//   wall.finish(report.frame);
+//   ... wall.image(display) on the rank that drives it
+//
+// Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them at
+// most `poolBytes` each.
+template <class Transport = MpiTransport>
+class DisplayWall final : private detail::MessageHandler {
+public:
+    // Collective, in the same order as the framebuffers of the messenger. `format`: of the displays' images. Throws
+    // InvalidArgument on all ranks if the layout is none, or is not the same on all.
+    DisplayWall(std::shared_ptr<Messenger<Transport>> messenger, const WallLayout& layout, OutputFormat format,
+                std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20)
+        : layout_(layout), format_(format), pool_(messenger->pool())
+    {
+        if (!executor)
+            executor = std::make_shared<ThreadExecutor>();
+        const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
+        detail::MessageHandler& self = *this;
+        messaging_ = std::make_unique<detail::Messaging<Transport>>(std::move(messenger), std::move(executor),
+                                                                    std::max(poolBytes, 4 * largest), self);
+        messaging_->start();
+        detail::Agreement mine{true, describe()};
+        if (const std::string wrong = whatIsWrong(); !wrong.empty())
+            mine = {false, wrong};
+        const auto all =
+            detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
+        if (!all.fine) {
+            messaging_.reset();
+            throw InvalidArgument(all.text);
+        }
+        for (int d = 0; d < layout_.displayCount(); ++d)
+            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank())
+                shown_.emplace(d, Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0));
+    }
+
+    DisplayWall(const DisplayWall&) = delete;
+    DisplayWall& operator=(const DisplayWall&) = delete;
+    // Collective. After the framebuffers whose pixel operation sends here.
+    ~DisplayWall() = default;
+
+    const WallLayout& layout() const noexcept { return layout_; }
+
+    // A configuration of the wall's size whose image goes nowhere else.
+    FrameBufferConfig frameBufferConfig() const
+    {
+        FrameBufferConfig config;
+        config.width = layout_.width();
+        config.height = layout_.height();
+        config.format = OutputFormat::None;
+        return config;
+    }
+
+    // Collective, after the frame of that number has ended well on all ranks: returns when all displays have it, which is
+    // the moment to show it on all of them. If some display has not got all of it within `timeoutMs` (0: no limit), throws
+    // Error (TimedOut), the same on all ranks. Throws TransportError.
+    void finish(std::int64_t frame, int timeoutMs = 0)
+    {
+        messaging_->messenger().expectMessages(true);
+        bool complete = true;
+        std::string missing;
+        try {
+            std::optional<std::chrono::steady_clock::time_point> deadline;
+            if (timeoutMs > 0)
+                deadline = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs);
+            complete = messaging_->wait([&] { return hasAll(frame) || hasError(); }, deadline) && !hasError();
+            missing = complete ? "" : whatIsMissing(frame);
+        } catch (...) {
+            messaging_->messenger().expectMessages(false);
+            throw;
+        }
+        detail::Agreement mine{complete, complete ? "" : missing};
+        const auto all =
+            detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
+        messaging_->messenger().expectMessages(false);
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
+            for (auto& [display, picture] : *done->second)
+                std::swap(shown_.at(display), picture.image);
+        coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
+        last_ = frame;
+        if (!all.fine) {
+            error_.clear();
+            ErrorInfo info;
+            info.kind = ErrorKind::TimedOut;
+            info.frame = frame;
+            info.message = all.text;
+            throw Error(std::move(info));
+        }
+    }
+
+    // What this rank's display shows: the last finished frame. Throws InvalidArgument if another rank drives it.
+    const Image& image(int display) const
+    {
+        const auto found = shown_.find(display);
+        if (found == shown_.end())
+            throw InvalidArgument("display " + std::to_string(display) + " is not driven by this rank");
+        return found->second;
+    }
+
+    // Called by ToWall, from any thread.
+    void put(const PixelTile& tile)
+    {
+        const std::size_t pixelBytes = bytesPerPixel(format_);
+        const auto tileWidth = static_cast<std::size_t>(tile.region.width());
+        for (int d = 0; d < layout_.displayCount(); ++d) {
+            const Region display = layout_.region(d), part = intersection(display, tile.region);
+            if (part.empty())
+                continue;
+            detail::MessageHeader header;
+            header.kind = detail::MessageKind::FinishedTiles;
+            header.receiver = messaging_->address();
+            header.number = tile.frame;
+            const PartHeader where{d,
+                                   {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0,
+                                    part.y1 - display.y0}};
+            const auto width = static_cast<std::size_t>(part.width());
+            Buffer message =
+                pool_->acquire(prefix + width * static_cast<std::size_t>(part.height()) * pixelBytes);
+            std::memcpy(message.data(), &header, sizeof header);
+            std::memcpy(message.data() + sizeof header, &where, sizeof where);
+            std::byte* out = message.data() + prefix;
+            for (int y = part.y0; y < part.y1; ++y, out += width * pixelBytes) {
+                const std::size_t first = static_cast<std::size_t>(y - tile.region.y0) * tileWidth
+                                          + static_cast<std::size_t>(part.x0 - tile.region.x0);
+                convertPixels(tile.color + 4 * first, part.width(), format_, out);
+            }
+            messaging_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
+        }
+    }
+
+private:
+    struct PartHeader {
+        std::int32_t display = 0;
+        Region region; // in the display
+        std::int32_t reserved = 0;
+    };
+    static constexpr std::size_t prefix = sizeof(detail::MessageHeader) + sizeof(PartHeader);
+
+    struct Picture {
+        Image image;
+        std::int64_t pixelsLeft = 0;
+    };
+    using Pictures = std::map<int, Picture>; // by display
+
+    std::string describe() const
+    {
+        const auto text = [](auto value) { return std::to_string(value); };
+        std::string all = "a wall of " + text(layout_.columns) + 'x' + text(layout_.rows) + " displays of "
+                          + text(layout_.displayWidth) + 'x' + text(layout_.displayHeight) + ", bezels "
+                          + text(layout_.bezelX) + ' ' + text(layout_.bezelY) + ", format "
+                          + text(static_cast<int>(format_)) + ", ranks";
+        for (const int rank : layout_.ranks)
+            all += ' ' + text(rank);
+        return all;
+    }
+
+    std::string whatIsWrong() const
+    {
+        if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
+            || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
+            return "this is no wall: " + describe();
+        if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
+            return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
+                   + std::to_string(layout_.ranks.size()) + " ranks";
+        for (const int rank : layout_.ranks)
+            if (rank < 0 || rank >= messaging_->size())
+                return "a display of the wall is driven by rank " + std::to_string(rank) + " of "
+                       + std::to_string(messaging_->size());
+        return "";
+    }
+
+    void incoming(int source, const detail::MessageHeader& header, Buffer&& message) override
+    {
+        const std::size_t byteCount = message.size();
+        if (source != messaging_->rank() && messaging_->needsCredit(header.kind))
+            messaging_->flow().consumed(source, byteCount);
+        try {
+            switch (header.kind) {
+            case detail::MessageKind::CreditRequest:
+                messaging_->flow().requested(source, bodyAs<detail::FlowControl::Request>(message));
+                break;
+            case detail::MessageKind::Credit:
+                messaging_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
+                break;
+            case detail::MessageKind::FinishedTiles: store(header.number, message); break;
+            default: break;
+            }
+        } catch (const Error& e) {
+            undecodable(source, e.info());
+        }
+    }
+
+    void undecodable(int source, const ErrorInfo& error) override
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            error_ = error.message + ", in a message from rank " + std::to_string(source) + " to the wall";
+        }
+        messaging_->notify();
+    }
+
+    template <class Body>
+    static Body bodyAs(const Buffer& message)
+    {
+        if (message.size() != sizeof(detail::MessageHeader) + sizeof(Body))
+            detail::failMalformed("wrong message size");
+        return detail::loadAs<Body>(message.data() + sizeof(detail::MessageHeader));
+    }
+
+    void store(std::int64_t frame, const Buffer& message)
+    {
+        if (message.size() < prefix)
+            detail::failMalformed("a part of a display is too short");
+        const auto where = detail::loadAs<PartHeader>(message.data() + sizeof(detail::MessageHeader));
+        const Region whole{0, 0, layout_.displayWidth, layout_.displayHeight}, part = where.region;
+        if (shown_.count(where.display) == 0 || part.empty() || intersection(whole, part) != part)
+            detail::failMalformed("a part of a display that this rank does not drive, or outside of it");
+        const std::size_t pixelBytes = bytesPerPixel(format_), rowBytes = static_cast<std::size_t>(part.width()) * pixelBytes;
+        if (message.size() != prefix + rowBytes * static_cast<std::size_t>(part.height()))
+            detail::failMalformed("a part of a display has the wrong size");
+        std::shared_ptr<Pictures> pictures; // finish() may drop those of a frame that failed
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (frame <= last_)
+                return;
+            pictures = picturesOf(frame);
+        }
+        Picture& picture = pictures->at(where.display);
+        std::byte* pixels = picture.image.bytes();
+        const std::byte* in = message.data() + prefix;
+        for (int y = part.y0; y < part.y1; ++y, in += rowBytes)
+            std::memcpy(pixels + (static_cast<std::size_t>(y) * static_cast<std::size_t>(layout_.displayWidth)
+                                  + static_cast<std::size_t>(part.x0)) * pixelBytes,
+                        in, rowBytes);
+        bool complete = false;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            picture.pixelsLeft -= static_cast<std::int64_t>(part.width()) * part.height();
+            complete = picture.pixelsLeft == 0;
+        }
+        if (complete)
+            messaging_->notify();
+    }
+
+    // Of all displays of this rank; under mutex_.
+    std::shared_ptr<Pictures> picturesOf(std::int64_t frame)
+    {
+        std::shared_ptr<Pictures>& pictures = coming_[frame];
+        if (!pictures) {
+            pictures = std::make_shared<Pictures>();
+            for (const auto& [d, shown] : shown_)
+                pictures->emplace(d, Picture{Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0),
+                                             static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight});
+        }
+        return pictures;
+    }
+
+    bool hasAll(std::int64_t frame)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (shown_.empty())
+            return true;
+        const auto found = coming_.find(frame);
+        return found != coming_.end()
+               && std::all_of(found->second->begin(), found->second->end(),
+                              [](const auto& p) { return p.second.pixelsLeft == 0; });
+    }
+    bool hasError()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return !error_.empty();
+    }
+
+    std::string whatIsMissing(std::int64_t frame)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (!error_.empty())
+            return error_;
+        std::string text;
+        for (const auto& [display, image] : shown_) {
+            const std::int64_t left = picturesOf(frame)->at(display).pixelsLeft;
+            if (left > 0)
+                text += (text.empty() ? "display " : ", display ") + std::to_string(display) + " of rank "
+                        + std::to_string(messaging_->rank()) + " misses " + std::to_string(left) + " pixels";
+        }
+        return text;
+    }
+
+    WallLayout layout_;
+    OutputFormat format_;
+    std::shared_ptr<MemoryPool> pool_;
+    std::map<int, Image> shown_; // of this rank's displays; made with the wall, changed in finish()
+
+    std::mutex mutex_;
+    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels
+    std::int64_t last_ = 0;                   // finished; under mutex_
+    std::string error_;                       // under mutex_
+
+    std::unique_ptr<detail::Messaging<Transport>> messaging_; // last: its tasks use the others
+};
+
+static_assert(is_pixel_op_v<ToWall<InprocTransport>>);
+
+} // namespace dfb

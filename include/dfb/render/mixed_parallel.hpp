@@ -1,0 +1,300 @@
+// The mixed-parallel rendering loop (Listing 5 of the paper): bricks that several ranks hold are rendered into each
+// tile by one of them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on all
+// ranks image-parallel rendering. And the same with bricks in a known order, without sorting.
+//
+// A tile-brick owner is any type with
+//   int operator()(const SharedBrick& brick, int tile, int pass);      the rank, one of brick.ranks
+// and, if it decides from what it knows of all,
+//   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
+//                                  called before: all pairs of the frame, and of each how many passes it has. The
+//                                  frame's report then has the cost of each pair, for the next plan.
+// It must decide alike on all ranks.
+#pragma once
+
+#include <dfb/frame.hpp>
+#include <dfb/render/shared_world.hpp>
+#include <dfb/render/tile_loop.hpp>
+
+#include <algorithm>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <tuple>
+#include <type_traits>
+#include <unordered_map>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// Deals the tiles of a brick to the ranks that hold it (section 4.3 of the paper); with `sharePasses` each pass of each
+// tile.
+struct RoundRobinBricks {
+    bool sharePasses = false;
+
+    int operator()(const SharedBrick& brick, int tile, int pass) const
+    {
+        const std::size_t turn = brick.brick.id + static_cast<std::size_t>(tile)
+                                 + static_cast<std::size_t>(sharePasses ? pass : 0);
+        return brick.ranks[turn % brick.ranks.size()];
+    }
+};
+
+// Deals them so that all ranks have equally much to do, going by what the same brick and tile have cost in the last
+// frame; where that is not known, by the mean of the brick, then of all. Call update() after each frame. Passes are dealt
+// one by one. The cost is what `renderBrick` returns, or else the time it took, summed over the ranks by the verdict.
+class MeasuredCostBricks {
+public:
+    void update(const FrameReport& report)
+    {
+        costs_.clear();
+        for (const Figure& figure : report.figures)
+            costs_[figure.key] = figure.value;
+    }
+
+    // What FrameReport::figures has the cost of a brick in a tile under.
+    static std::uint64_t keyOf(std::uint32_t brickId, int tile) noexcept
+    {
+        return std::uint64_t{brickId} << 32 | static_cast<std::uint32_t>(tile);
+    }
+
+    void plan(const SharedWorld& world, const std::vector<BrickInTile>& pairs, const std::vector<int>& passes)
+    {
+        struct Job {
+            double cost;
+            std::size_t pair;
+            int pass, rank;
+        };
+        const std::vector<double> pairCosts = estimate(world, pairs);
+        std::vector<Job> jobs;
+        int rankCount = 1;
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            rankCount = std::max(rankCount, ranksOf(world, pairs[p]).back() + 1);
+            for (int pass = 0; pass < passes[p]; ++pass)
+                jobs.push_back({pairCosts[p] / passes[p], p, pass, 0});
+        }
+        // The costliest first, each to whoever has least (Graham 1969).
+        std::sort(jobs.begin(), jobs.end(), [](const Job& a, const Job& b) {
+            return a.cost != b.cost ? a.cost > b.cost : std::tie(a.pair, a.pass) < std::tie(b.pair, b.pass);
+        });
+        std::vector<double> load(static_cast<std::size_t>(rankCount), 0.0);
+        const auto loadOf = [&](int rank) -> double& { return load[static_cast<std::size_t>(rank)]; };
+        const auto least = [&](const Job& job) {
+            const std::vector<int>& ranks = ranksOf(world, pairs[job.pair]);
+            return *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return loadOf(a) < loadOf(b); });
+        };
+        for (Job& job : jobs) {
+            job.rank = least(job);
+            loadOf(job.rank) += job.cost;
+        }
+        // Not every rank can have every job: what has become too much in one place moves on, from rank to rank.
+        for (int sweep = 0, moved = 1; sweep < 32 && moved > 0; ++sweep) {
+            moved = 0;
+            for (Job& job : jobs) {
+                const int other = least(job);
+                if (other == job.rank || !(loadOf(other) + job.cost < loadOf(job.rank)))
+                    continue;
+                loadOf(job.rank) -= job.cost;
+                loadOf(other) += job.cost;
+                job.rank = other;
+                ++moved;
+            }
+        }
+        table_.clear();
+        for (std::size_t p = 0; p < pairs.size(); ++p)
+            table_[keyOf(idOf(world, pairs[p]), pairs[p].tile)].resize(static_cast<std::size_t>(passes[p]));
+        for (const Job& job : jobs)
+            table_[keyOf(idOf(world, pairs[job.pair]), pairs[job.pair].tile)][static_cast<std::size_t>(job.pass)] =
+                job.rank;
+    }
+
+    int operator()(const SharedBrick& brick, int tile, int pass) const
+    {
+        return table_.at(keyOf(brick.brick.id, tile))[static_cast<std::size_t>(pass)];
+    }
+
+private:
+    static const std::vector<int>& ranksOf(const SharedWorld& world, const BrickInTile& pair)
+    {
+        return world.bricks()[static_cast<std::size_t>(pair.brick)].ranks;
+    }
+    static std::uint32_t idOf(const SharedWorld& world, const BrickInTile& pair)
+    {
+        return world.bricks()[static_cast<std::size_t>(pair.brick)].brick.id;
+    }
+
+    std::vector<double> estimate(const SharedWorld& world, const std::vector<BrickInTile>& pairs) const
+    {
+        struct Mean {
+            double sum = 0;
+            std::int64_t count = 0;
+        };
+        std::vector<Mean> ofBrick(world.bricks().size());
+        Mean ofAll;
+        for (const BrickInTile& pair : pairs)
+            if (const auto known = costs_.find(keyOf(idOf(world, pair), pair.tile)); known != costs_.end())
+                for (Mean* mean : {&ofBrick[static_cast<std::size_t>(pair.brick)], &ofAll}) {
+                    mean->sum += known->second;
+                    ++mean->count;
+                }
+        std::vector<double> costs;
+        for (const BrickInTile& pair : pairs) {
+            const auto known = costs_.find(keyOf(idOf(world, pair), pair.tile));
+            const Mean& brick = ofBrick[static_cast<std::size_t>(pair.brick)];
+            costs.push_back(known != costs_.end() ? known->second
+                            : brick.count > 0     ? brick.sum / static_cast<double>(brick.count)
+                            : ofAll.count > 0     ? ofAll.sum / static_cast<double>(ofAll.count)
+                                                  : 1.0);
+        }
+        return costs;
+    }
+
+    std::unordered_map<std::uint64_t, double> costs_;           // of the last frame
+    std::unordered_map<std::uint64_t, std::vector<int>> table_; // of this one: a rank per pass
+};
+
+namespace detail {
+
+template <class Owner, class = void>
+struct HasPlan : std::false_type {
+};
+template <class Owner>
+struct HasPlan<Owner, std::void_t<decltype(std::declval<Owner&>().plan(std::declval<const SharedWorld&>(),
+                                                                       std::declval<const std::vector<BrickInTile>&>(),
+                                                                       std::declval<const std::vector<int>&>()))>>
+    : std::true_type {
+};
+
+// What this rank has to do of a mixed-parallel frame.
+struct MixedJob {
+    std::size_t pair = 0;
+    int pass = 0;
+};
+
+template <class Frame, class Owner>
+std::vector<MixedJob> mixedJobs(const Frame& frame, const SharedWorld& world, const std::vector<BrickInTile>& pairs,
+                                Owner& owner)
+{
+    std::vector<int> passes;
+    for (const BrickInTile& pair : pairs)
+        passes.push_back(frame.samples(pair.tile).count);
+    if constexpr (HasPlan<Owner>::value)
+        owner.plan(world, pairs, passes);
+    std::vector<MixedJob> jobs;
+    for (std::size_t p = 0; p < pairs.size(); ++p)
+        for (int pass = 0; pass < passes[p]; ++pass)
+            if (owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], pairs[p].tile, pass) == world.rank())
+                jobs.push_back({p, pass});
+    return jobs;
+}
+
+// Calls renderBrick, and takes note of the cost for an owner that plans.
+template <class Owner, class Frame, class RenderBrick, class Tile>
+void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& renderBrick, Tile& tile)
+{
+    if constexpr (!HasPlan<Owner>::value) {
+        renderBrick(brick, tile);
+        return;
+    }
+    const std::uint64_t key = MeasuredCostBricks::keyOf(brick.id, tile.tile);
+    if constexpr (std::is_arithmetic_v<decltype(renderBrick(brick, tile))>) {
+        frame.addFigure(key, static_cast<double>(renderBrick(brick, tile)));
+    } else {
+        const auto start = std::chrono::steady_clock::now();
+        renderBrick(brick, tile);
+        frame.addFigure(key, std::chrono::duration<double, std::nano>(std::chrono::steady_clock::now() - start).count());
+    }
+}
+
+} // namespace detail
+
+// Collective. As renderDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says which
+// of them renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is that of
+// renderDataParallel() bit for bit, whoever renders what.
+template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
+FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const Camera& camera, TileBrickOwner& owner,
+                                const RenderBrick& renderBrick, FrameParams params = {},
+                                const typename FrameBuffer::TileFrameData& tileData = {},
+                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    params.declared = true;
+    auto frame = fb.begin(params, tileData, pixelData);
+    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    loop.guard([&] {
+        const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+        const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
+        if (frame.wantsDeclaration()) {
+            // The tile, whoever renders it, is declared by the first of those that hold the brick.
+            std::vector<TileInput> inputs;
+            for (const BrickInTile& pair : pairs)
+                if (const SharedBrick& b = world.bricks()[static_cast<std::size_t>(pair.brick)];
+                    b.ranks.front() == fb.rank())
+                    inputs.push_back({pair.tile, b.brick.id, 0});
+            frame.declare(inputs);
+        }
+        loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
+            const BrickInTile& pair = pairs[jobs[i].pair];
+            const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+            frame.start(tile, pair.tile, jobs[i].pass);
+            tile.generation = 1;
+            tile.source = brick.id;
+            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+            frame.setTile(tile);
+        });
+    });
+    return frame.end();
+}
+
+// Collective. The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
+// visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no manifest.
+// Only where one order is right for all rays of a frame: not with an extended lens or several eyes.
+template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
+FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+                          const std::vector<int>& order, TileBrickOwner& owner, const RenderBrick& renderBrick,
+                          FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                          const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    params.declared = false;
+    params.declarationKey = 0;
+    auto frame = fb.begin(params, tileData, pixelData);
+    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    loop.guard([&] {
+        std::vector<int> place(world.bricks().size(), -1);
+        for (std::size_t i = 0; i < order.size(); ++i)
+            place.at(static_cast<std::size_t>(order[i])) = static_cast<int>(i);
+        if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
+            throw InvalidArgument("the order does not have each brick once");
+        std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+        std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
+            return a.tile != b.tile ? a.tile < b.tile
+                                    : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
+        });
+        const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
+        std::vector<int> firstPair(static_cast<std::size_t>(fb.layout().tileCount()), -1);
+        for (std::size_t p = pairs.size(); p-- > 0;)
+            firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
+        std::vector<int> empty; // tiles of this rank
+        for (const int tile : fb.ownedTiles())
+            if (firstPair[static_cast<std::size_t>(tile)] < 0)
+                empty.push_back(tile);
+        loop.run(empty.size(), [&](std::size_t i, auto& tile) {
+            for (int pass = 0; pass < frame.samples(empty[i]).count; ++pass) {
+                frame.start(tile, empty[i], pass);
+                frame.setTile(tile);
+            }
+        });
+        loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
+            const BrickInTile& pair = pairs[jobs[i].pair];
+            const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+            frame.start(tile, pair.tile, jobs[i].pass);
+            tile.generation = static_cast<int>(jobs[i].pair) - firstPair[static_cast<std::size_t>(pair.tile)];
+            tile.children = jobs[i].pair + 1 < pairs.size() && pairs[jobs[i].pair + 1].tile == pair.tile;
+            tile.source = brick.id;
+            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+            frame.setTile(tile);
+        });
+    });
+    return frame.end();
+}
+
+} // namespace dfb

@@ -1,0 +1,141 @@
+// SharedWorld: the bricks of all ranks, and who holds which: what is needed where several ranks hold the same brick,
+// or where one must know what is in front of what.
+#pragma once
+
+#include <dfb/render/visibility.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// A brick of any rank, and the ranks that hold it, ascending.
+struct SharedBrick {
+    Brick brick;
+    std::vector<int> ranks;
+};
+
+// The same on all ranks. Memory and time to make it: proportional to the bricks of all ranks.
+class SharedWorld {
+public:
+    // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks if
+    // their bounds differ.
+    template <class FrameBuffer>
+    SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
+    {
+        std::vector<std::byte> mine(world.bricks().size() * sizeof(Record));
+        for (std::size_t i = 0; i < world.bricks().size(); ++i) {
+            const Record record{world.bricks()[i].id, world.bricks()[i].bounds};
+            std::memcpy(mine.data() + i * sizeof record, &record, sizeof record);
+        }
+        const std::vector<std::vector<std::byte>> all = fb.allGather(mine);
+        std::vector<std::pair<Record, int>> held;
+        for (std::size_t rank = 0; rank < all.size(); ++rank)
+            for (std::size_t at = 0; at + sizeof(Record) <= all[rank].size(); at += sizeof(Record)) {
+                Record record;
+                std::memcpy(&record, all[rank].data() + at, sizeof record);
+                held.emplace_back(record, static_cast<int>(rank));
+            }
+        std::sort(held.begin(), held.end(), [](const auto& a, const auto& b) {
+            return a.first.id != b.first.id ? a.first.id < b.first.id : a.second < b.second;
+        });
+        for (const auto& [record, rank] : held) {
+            if (bricks_.empty() || bricks_.back().brick.id != record.id) {
+                SharedBrick shared;
+                shared.brick.id = record.id;
+                shared.brick.bounds = record.bounds;
+                bricks_.push_back(std::move(shared));
+            }
+            if (std::memcmp(&bricks_.back().brick.bounds, &record.bounds, sizeof record.bounds) != 0)
+                throw InvalidArgument("brick " + std::to_string(record.id) + " has other bounds on rank "
+                                      + std::to_string(rank) + " than on rank "
+                                      + std::to_string(bricks_.back().ranks.front()));
+            bricks_.back().ranks.push_back(rank);
+        }
+    }
+
+    // By ascending id.
+    const std::vector<SharedBrick>& bricks() const noexcept { return bricks_; }
+
+    // This rank.
+    int rank() const noexcept { return rank_; }
+
+private:
+    struct Record {
+        std::uint32_t id = 0;
+        Box3 bounds;
+    };
+
+    int rank_;
+    std::vector<SharedBrick> bricks_;
+};
+
+// All pairs of a brick, by its place in SharedWorld::bricks(), and a tile that it may project to; tile by tile.
+template <class Camera>
+std::vector<BrickInTile> visibleTiles(const SharedWorld& world, const Camera& camera, const TileLayout& layout)
+{
+    std::vector<Brick> bricks;
+    for (const SharedBrick& shared : world.bricks())
+        bricks.push_back(shared.brick);
+    return visibleTiles(World(bricks), camera, layout);
+}
+
+// The bricks, by their place in SharedWorld::bricks(), such that no ray from `eye` meets one before another that stands
+// earlier in the list. Takes time with the square of their number. Throws InvalidArgument if two overlap, or if
+// there is no such order: three boxes can each be in front of the next.
+inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
+{
+    const auto& bricks = world.bricks();
+    const std::size_t n = bricks.size();
+    // A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
+    enum class Before { Either, First, Second };
+    const auto compare = [&](const Box3& a, const Box3& b) {
+        bool apart = false, first = false, second = false;
+        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
+            if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
+                apart = true;
+                first = first || e <= bLower;
+                second = second || e >= aUpper;
+            } else if (bUpper <= aLower) {
+                apart = true;
+                first = first || e >= bUpper;
+                second = second || e <= aLower;
+            }
+        };
+        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
+        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
+        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
+        if (!apart)
+            throw InvalidArgument("two bricks overlap: there is no order in which they could be blended");
+        return first == second ? Before::Either : first ? Before::First : Before::Second;
+    };
+    std::vector<std::vector<int>> behind(n);
+    std::vector<int> inFront(n, 0);
+    for (std::size_t a = 0; a < n; ++a)
+        for (std::size_t b = a + 1; b < n; ++b) {
+            const Before before = compare(bricks[a].brick.bounds, bricks[b].brick.bounds);
+            if (before == Before::Either)
+                continue;
+            const std::size_t front = before == Before::First ? a : b, back = before == Before::First ? b : a;
+            behind[front].push_back(static_cast<int>(back));
+            ++inFront[back];
+        }
+    std::vector<int> order;
+    for (std::size_t i = 0; i < n; ++i)
+        if (inFront[i] == 0)
+            order.push_back(static_cast<int>(i));
+    for (std::size_t i = 0; i < order.size(); ++i)
+        for (const int next : behind[static_cast<std::size_t>(order[i])])
+            if (--inFront[static_cast<std::size_t>(next)] == 0)
+                order.push_back(next);
+    if (order.size() != n)
+        throw InvalidArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
+    return order;
+}
+
+} // namespace dfb

@@ -1,0 +1,42 @@
+// The cases of tests/algorithms/wall.hpp; and what travels to whom.
+#include "board.hpp"
+#include "everywhere.hpp"
+
+#include "../algorithms/wall.hpp"
+
+#include <map>
+
+TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
+{
+    const auto watched = std::make_shared<board::Board>();
+    std::mutex mutex;
+    std::map<int, std::size_t> pixelBytes; // by receiver
+    watched->inspect = [&](int, int to, const board::MessageHeader& header, dfb::Buffer& message) {
+        if (header.kind == dfb::detail::MessageKind::FinishedTiles || header.kind == dfb::detail::MessageKind::Fragment) {
+            const std::lock_guard<std::mutex> lock(mutex);
+            pixelBytes[to] += message.size();
+        }
+        return board::Board::What::Pass;
+    };
+    const dfb::WallLayout layout{2, 2, 64, 64, 0, 0, {0, 1, 2, 3}};
+    board::runOn(watched, 4, [&](const board::BoardTransport::Communicator& communicator) {
+        auto messenger = std::make_shared<dfb::Messenger<board::BoardTransport>>(communicator);
+        auto executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::DisplayWall<board::BoardTransport> wall(messenger, layout, dfb::OutputFormat::RGBA8, executor);
+        auto config = wall.frameBufferConfig();
+        config.executor = executor;
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall<board::BoardTransport>, board::BoardTransport>
+            fb(messenger, config, {&wall});
+        const auto report = dfb::renderImageParallel(fb, [](auto& tile) {
+            const float rgba[4] = {0.5f, 0, 0, 1};
+            tile.fill(rgba);
+        });
+        wall.finish(report.frame);
+    });
+    // Each rank owns 4 of 16 tiles of 4 KiB, and gets of the 4 on its display those that others own; no more.
+    REQUIRE(pixelBytes.size() == 4);
+    for (const auto& [rank, bytes] : pixelBytes) {
+        INFO("rank " << rank);
+        CHECK(bytes <= 4 * (4096 + 64));
+    }
+}

@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/wall.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/wall.hpp"
