@@ -10,6 +10,7 @@
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/data_parallel.hpp>
+#include <dfb/render/deep_parallel.hpp>
 #include <dfb/render/image_parallel.hpp>
 #include <dfb/render/mixed_parallel.hpp>
 #include <dfb/render/sampling.hpp>

@@ -59,9 +59,9 @@ public:
         // In a frame that has failed: does nothing.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
 
-        // Only with FrameParams::declared: each rank says once which inputs it will send, in each pass, all of
-        // generation 1 without children; it may say so after it sent some. A rank without any calls it with none.
-        // An input that turns out empty must be sent all the same; it costs a header. Waits for nothing. Throws
+        // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
+        // children that these announce need no declaration; it may say so after it sent some. A rank without any calls
+        // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing. Throws
         // InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
         bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
@@ -79,8 +79,9 @@ public:
         // must know alike, such as the cost of a brick: it travels with the verdict. From any thread.
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
-        // Makes FrameReport::mergeErrorBound at least this. From any thread.
-        void noteMergeError(double bound) const { engine_->noteMergeError(bound); }
+        // An input of that tile was simplified, which may have changed a pixel of one pass by `bound`; for
+        // FrameReport::mergeErrorBound. From any thread.
+        void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
         // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
         bool failed() const noexcept { return engine_->failed(); }

@@ -93,7 +93,7 @@ struct FrameReport {
     std::int64_t tilesTouched = 0;     // all: tiles that had an input
     std::int64_t nonFinitePixels = 0;  // all: input pixels with an infinity or NaN (see detail/wire.hpp)
     std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
-    double mergeErrorBound = 0;        // all: the largest that Frame::noteMergeError() was given
+    double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key
     std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict

@@ -132,7 +132,7 @@ public:
         messagesBefore_ = messaging_->messagesSent();
         renderNs_ = 0;
         figures_.clear();
-        mergeErrorBound_ = 0;
+        mergeErrors_.clear();
         tilesLeft_ = countUnknown;
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
         for (const int tile : ownedTiles()) {
@@ -203,10 +203,10 @@ public:
         return range.value_or(JobRange{});
     }
 
-    void noteMergeError(double bound)
+    void noteMergeError(int tile, double bound)
     {
         const std::lock_guard<std::mutex> lock(figuresMutex_);
-        mergeErrorBound_ = std::max(mergeErrorBound_, bound);
+        mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound / samples(tile).count});
     }
 
     void waitForRoom()
@@ -650,10 +650,12 @@ private:
                            {
                                const std::lock_guard<std::mutex> lock(figuresMutex_);
                                v.figures = figures_;
-                               v.mergeErrorBound = mergeErrorBound_;
+                               v.mergeErrors = mergeErrors_;
                            }
-                           sortByKey(v.figures);
-                           v.figures = Verdict::summed(std::move(v.figures));
+                           for (auto* list : {&v.figures, &v.mergeErrors}) {
+                               sortByKey(*list);
+                               *list = Verdict::summed(std::move(*list));
+                           }
                            repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
@@ -750,8 +752,7 @@ private:
     std::uint64_t lastAccumulationId_ = 0;
     bool frameOpen_ = false, lastFailed_ = false;
     std::mutex figuresMutex_;
-    std::vector<Figure> figures_; // under figuresMutex_
-    double mergeErrorBound_ = 0;  // under figuresMutex_
+    std::vector<Figure> figures_, mergeErrors_; // by key, by tile; under figuresMutex_
     std::mutex strayMutex_;
     std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};

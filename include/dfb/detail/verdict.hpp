@@ -82,9 +82,9 @@ struct Verdict {
     // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order.
     std::array<std::int64_t, 7> sums{};
     std::array<std::int64_t, 3> maxima{}; // peak memory in bytes, rendering in ns, peak of the inbox in bytes
-    double mergeErrorBound = 0;           // the largest
     std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
     std::vector<Figure> figures;          // by key; sums
+    std::vector<Figure> mergeErrors;      // by tile; sums
 
     std::vector<std::byte> bytes() const
     {
@@ -95,8 +95,7 @@ struct Verdict {
         out.put(paramsHash);
         out.put(sums);
         out.put(maxima);
-        out.put(mergeErrorBound);
-        for (const auto* list : {&tileErrors, &figures}) {
+        for (const auto* list : {&tileErrors, &figures, &mergeErrors}) {
             out.put(static_cast<std::uint32_t>(list->size()));
             for (const Figure& figure : *list)
                 out.put(figure);
@@ -113,8 +112,7 @@ struct Verdict {
         v.paramsHash = in.get<std::uint64_t>();
         v.sums = in.get<decltype(v.sums)>();
         v.maxima = in.get<decltype(v.maxima)>();
-        v.mergeErrorBound = in.get<double>();
-        for (auto* list : {&v.tileErrors, &v.figures})
+        for (auto* list : {&v.tileErrors, &v.figures, &v.mergeErrors})
             for (auto left = in.get<std::uint32_t>(); left > 0; --left)
                 list->push_back(in.get<Figure>());
         return v;
@@ -133,7 +131,9 @@ struct Verdict {
         report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
         report.peakInboxBytes = maxima[2];
         report.orderUndefinedPixels = sums[6];
-        report.mergeErrorBound = mergeErrorBound;
+        report.mergeErrorBound = 0;
+        for (const Figure& f : mergeErrors)
+            report.mergeErrorBound = std::max(report.mergeErrorBound, f.value);
         report.tileErrors.clear();
         for (const Figure& f : tileErrors)
             report.tileErrors.push_back({static_cast<int>(f.key), f.value});
@@ -205,9 +205,9 @@ struct Verdict {
             a.sums[i] += b.sums[i];
         for (std::size_t i = 0; i < a.maxima.size(); ++i)
             a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
-        a.mergeErrorBound = std::max(a.mergeErrorBound, b.mergeErrorBound);
         a.tileErrors = merged(a.tileErrors, b.tileErrors);
         a.figures = merged(a.figures, b.figures);
+        a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
         return a.bytes();
     }
 };

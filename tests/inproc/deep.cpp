@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/deep.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/deep.hpp"
