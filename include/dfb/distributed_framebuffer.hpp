@@ -9,6 +9,7 @@
 #include <dfb/ops/pixel_ops.hpp>
 
 #include <algorithm>
+#include <cstddef>
 #include <cstdint>
 #include <exception>
 #include <memory>
@@ -37,7 +38,7 @@ public:
     // A frame that has begun. Leaving its scope without end() cancels it on all ranks.
     class Frame {
     public:
-        Frame(Frame&& other) noexcept : engine_(std::exchange(other.engine_, nullptr)) {}
+        Frame(Frame&& other) noexcept : fb_(other.fb_), engine_(std::exchange(other.engine_, nullptr)) {}
         Frame& operator=(Frame&&) = delete;
         ~Frame()
         {
@@ -93,11 +94,18 @@ public:
         // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
         // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
         // begin the next.
-        FrameReport end() { return std::exchange(engine_, nullptr)->end(); }
+        FrameReport end()
+        {
+            Engine* engine = std::exchange(engine_, nullptr);
+            const FrameReport report = engine->end();
+            fb_->lastEnded_ = engine;
+            return report;
+        }
 
     private:
         friend class DistributedFrameBuffer;
-        explicit Frame(Engine* engine) : engine_(engine) {}
+        Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine) {}
+        DistributedFrameBuffer* fb_;
         Engine* engine_;
     };
 
@@ -112,8 +120,19 @@ public:
 
     // The same over a messenger that several framebuffers share; they are made in the same order on all ranks.
     DistributedFrameBuffer(std::shared_ptr<Messenger<Transport>> messenger, Config config, PixelOp pixelOp = {})
-        : engine_(std::move(messenger), std::move(config), std::move(pixelOp))
     {
+        if (!config.executor)
+            config.executor = std::make_shared<ThreadExecutor>();
+        try {
+            for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
+                engines_.push_back(std::make_unique<Engine>(messenger, config, pixelOp, slot));
+        } catch (const InvalidArgument&) {
+            // All ranks throw it: the messenger's end is in order, so it must not come while an exception passes.
+            engines_.clear();
+            messenger.reset();
+            throw;
+        }
+        lastEnded_ = engines_.front().get();
     }
 
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
@@ -122,30 +141,34 @@ public:
     // Collective. No frame may be open.
     ~DistributedFrameBuffer() = default;
 
-    int rank() const noexcept { return engine_.rank(); }
-    int size() const noexcept { return engine_.size(); }
+    int rank() const noexcept { return engine().rank(); }
+    int size() const noexcept { return engine().size(); }
     bool isDisplayRank() const noexcept { return rank() == config().displayRank; }
-    const Config& config() const noexcept { return engine_.config(); }
-    const TileLayout& layout() const noexcept { return engine_.layout(); }
-    int tileOwner(int tile) const noexcept { return engine_.tileOwner(tile); }
-    const std::vector<int>& ownedTiles() const noexcept { return engine_.ownedTiles(); }
+    const Config& config() const noexcept { return engine().config(); }
+    const TileLayout& layout() const noexcept { return engine().layout(); }
+    int tileOwner(int tile) const noexcept { return engine().tileOwner(tile); }
+    const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well; valid until the next begin(). Empty elsewhere.
-    const Image& image() const noexcept { return engine_.image(); }
+    // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be frames
+    // in flight. Empty elsewhere.
+    const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
     // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI.
     // Waits for nothing.
-    bool poll() { return engine_.poll(); }
+    bool poll() { return engine().poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
-    // InvalidArgument, with nothing sent, if a frame is open or `params` can not be.
+    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` can not be. Frames begin and
+    // end in the same order on all ranks; the oldest must end before one too many begins.
     Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
-        engine_.begin(params, tileData, pixelData);
-        return Frame(&engine_);
+        Engine& engine = *engines_[next_];
+        engine.begin(params, tileData, pixelData);
+        next_ = (next_ + 1) % engines_.size();
+        return Frame(this, &engine);
     }
 
     enum class Reduce : std::uint8_t { Sum, Min, Max };
@@ -155,7 +178,7 @@ public:
     // InvalidArgument on every rank if their numbers of values differ.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
-        return engine_.allReduce(values, [how](std::int64_t x, std::int64_t y) {
+        return engine().allReduce(values, [how](std::int64_t x, std::int64_t y) {
             return how == Reduce::Sum ? x + y : how == Reduce::Min ? std::min(x, y) : std::max(x, y);
         });
     }
@@ -163,11 +186,16 @@ public:
     // Collective, outside frames: the bytes of each rank, by rank, on all ranks.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
     {
-        return engine_.allGather(bytes);
+        return engine().allGather(bytes);
     }
 
 private:
-    Engine engine_;
+    Engine& engine() noexcept { return *engines_.front(); }
+    const Engine& engine() const noexcept { return *engines_.front(); }
+
+    std::vector<std::unique_ptr<Engine>> engines_; // each has one frame at a time; they take turns
+    std::size_t next_ = 0;
+    Engine* lastEnded_ = nullptr;
 };
 
 } // namespace dfb

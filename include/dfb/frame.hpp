@@ -29,6 +29,7 @@ struct FrameBufferConfig {
     bool depth = false;                        // the image has depth as well
     ChannelMask aux = 0;                       // and these of imageAuxChannels, which the tile operation must have
     int displayRank = 0;
+    int framesInFlight = 1; // the most that may be open at once; memory grows with it
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
     GatherMode gather = GatherMode::Batches;

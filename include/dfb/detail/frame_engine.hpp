@@ -36,11 +36,10 @@ public:
     using PixelFrameData = typename FrameDataOf<PixelOp>::type;
     using Bytes = ReductionTable::Bytes;
 
-    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp)
-        : pool_(messenger->pool()), config_(std::move(config))
+    // `slot`: which of config.framesInFlight engines this is.
+    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp, int slot = 0)
+        : pool_(messenger->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
-        if (!config_.executor)
-            config_.executor = std::make_shared<ThreadExecutor>();
         config_.progress = messenger->options().progress;
         config_.checksums = messenger->options().checksums;
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
@@ -54,6 +53,9 @@ public:
             if (config_.displayRank < 0 || config_.displayRank >= size())
                 throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
                                       + std::to_string(size()));
+            if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && KeepsState<TileOp>::value))
+                throw InvalidArgument("there can not be " + std::to_string(config_.framesInFlight)
+                                      + " frames in flight: 1 or more, and only 1 if the tile operation keeps state");
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
@@ -114,7 +116,7 @@ public:
 
         TileInfo info;
         info.rank = rank();
-        info.frame = gate_.frame() + 1;
+        info.frame = gate_.next();
         info.passes = params.passes;
         info.accumulationId = params.accumulationId;
         info.wanted = Pipeline::imageChannels(config_);

@@ -22,8 +22,12 @@ public:
         Buffer bytes;
     };
 
-    // The last frame that was opened; 0 before the first.
+    // Frames are numbered from `first`, every `step`.
+    explicit FrameGate(std::int64_t first = 1, std::int64_t step = 1) : frame_(first - step), step_(step) {}
+
+    // The last frame that was opened; not positive before the first. And the one that comes next.
     std::int64_t frame() const noexcept { return frame_; }
+    std::int64_t next() const noexcept { return frame_ + step_; }
     void countLate() noexcept { ++late_; }
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
@@ -31,7 +35,7 @@ public:
     std::vector<Message> open()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        ++frame_;
+        frame_ += step_;
         open_ = true;
         return std::move(early_);
     }
@@ -94,7 +98,8 @@ public:
 private:
     std::mutex mutex_;
     std::condition_variable empty_;
-    std::atomic<std::int64_t> frame_{0}, late_{0};
+    std::atomic<std::int64_t> frame_, late_{0};
+    std::int64_t step_;
     bool open_ = false;
     int inside_ = 0;
     std::vector<Message> early_;

@@ -1,0 +1,116 @@
+// Several images in flight: they do not disturb each other.
+#pragma once
+
+#include "everywhere.hpp"
+
+#include <memory>
+#include <utility>
+
+namespace algorithms {
+
+// Sends what this rank has of a scene into an open frame, as in Listing 3 of the paper.
+template <class FrameBuffer, class Frame>
+void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
+{
+    const auto mine = bricksOf(s, fb.rank(), fb.size());
+    const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+    const auto meets = [&](const dfb::Brick& b, int index) {
+        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
+    };
+    for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // one half, then the other
+        if (fb.tileOwner(index) == fb.rank()) {
+            frame.start(*tile, index);
+            for (const dfb::Brick& b : s.bricks)
+                tile->children += meets(b, index);
+            frame.setTile(*tile);
+        }
+        for (const dfb::Brick& b : mine)
+            if (meets(b, index)) {
+                frame.start(*tile, index);
+                tile->generation = 1;
+                tile->source = b.id;
+                renderBrick(s, b, *tile);
+                frame.setTile(*tile);
+            }
+    }
+}
+
+struct TwoFrames {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        auto config = configOf(scene::makeScene(1), 2);
+        config.framesInFlight = 2;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+        const auto check = [&](const dfb::FrameReport& report, const scene::Scene& s, const std::string& which) {
+            if (!fb.isDisplayRank())
+                return;
+            const scene::Picture picture(fb.image(), report);
+            const std::size_t wrong = wrongValues(picture, referenceOf(s));
+            result.expect(wrong == 0, which + ": " + std::to_string(wrong) + " values");
+            result.hash = result.hash * 31 + picture.hash();
+        };
+        for (std::uint64_t round = 0; round < 4; ++round) {
+            const scene::Scene a = scene::makeScene(5, 2 * round + 1), b = scene::makeScene(7, 2 * round + 2);
+            auto first = fb.begin(paramsOf(a));
+            sendAll(fb, first, a, false);
+            auto second = fb.begin(paramsOf(b));
+            result.expect(second.number() == first.number() + 1, "numbers");
+            sendAll(fb, second, b, false);
+            sendAll(fb, first, a, true);
+            const std::string third = scene::outcomeOf([&] { fb.begin(paramsOf(a)); });
+            result.expect(scene::has(third, "end() it first"), "a third frame: " + third);
+            sendAll(fb, second, b, true);
+            if (round == 2) { // one fails, the other does not
+                if (fb.rank() == fb.size() - 1)
+                    first.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
+                const std::string outcome = scene::outcomeOf([&] { first.end(); });
+                result.expect(scene::has(outcome, "on purpose"), outcome);
+            } else {
+                check(first.end(), a, "first");
+            }
+            check(second.end(), b, "second");
+        }
+        return result;
+    }
+};
+
+// Two framebuffers of other sizes and operations, over one messenger.
+struct TwoFrameBuffers {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const scene::Scene a = scene::makeScene(5, 3), b = scene::makeScene(1, 4, 128, 33);
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> blend(messenger, configOf(a, 1));
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(messenger, configOf(b, 1));
+        for (int round = 0; round < 3; ++round) {
+            auto frame = blend.begin(paramsOf(a));
+            sendAll(blend, frame, a, false);
+            const auto other = dfb::renderImageParallel(
+                single, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(b, b.bricks[0], tile); }, paramsOf(b));
+            sendAll(blend, frame, a, true);
+            const auto report = frame.end();
+            if (!blend.isDisplayRank())
+                continue;
+            const scene::Picture pictureA(blend.image(), report), pictureB(single.image(), other);
+            result.expect(wrongValues(pictureA, referenceOf(a)) == 0 && wrongValues(pictureB, referenceOf(b)) == 0, "values");
+            result.hash = pictureA.hash() ^ 3 * pictureB.hash();
+        }
+        return result;
+    }
+};
+
+} // namespace algorithms
+
+TEST_CASE("Two frames of one framebuffer at once do not disturb each other", "[in_flight]")
+{
+    everywhere<algorithms::TwoFrames>();
+}
+
+TEST_CASE("Two framebuffers with open frames do not disturb each other", "[in_flight]")
+{
+    everywhere<algorithms::TwoFrameBuffers>();
+}
