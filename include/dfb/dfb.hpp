@@ -9,6 +9,7 @@
 #include <dfb/ops/pixel_ops.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
+#include <dfb/render/cameras.hpp>
 #include <dfb/render/data_parallel.hpp>
 #include <dfb/render/deep_parallel.hpp>
 #include <dfb/render/image_parallel.hpp>

@@ -64,7 +64,7 @@ TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[vis
         const dfb::Vec3 a = center + extent * point(random, 1), b = center + extent * point(random, 1);
         const dfb::Box3 box{{std::min(a.x, b.x), std::min(a.y, b.y), std::min(a.z, b.z)},
                             {std::max(a.x, b.x), std::max(a.y, b.y), std::max(a.z, b.z)}};
-        const dfb::Region region = camera.project(box, width, height);
+        const dfb::Region region = camera.project(box, width, height).region();
         CHECK(dfb::intersection(region, {0, 0, width, height}) == region);
         behind += region.empty();
         around += meets(eye, {1, 0, 0}, box) && meets(eye, {-1, 0, 0}, box);
@@ -102,7 +102,7 @@ TEST_CASE("The projection covers the points of boxes in large images, and not mu
         const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -4, 0)));
         const dfb::Vec3 half{extent, 0.3f * extent, 0.7f * extent};
         const dfb::Box3 box{center - half, center + half};
-        const dfb::Region region = camera.project(box, width, height);
+        const dfb::Region region = camera.project(box, width, height).region();
         const double pixelsPerUnit = 0.5 * height / std::tan(20 * 3.14159265358979 / 180);
         double x0 = 1e9, x1 = -1e9, y0 = 1e9, y1 = -1e9;
         for (int k = 0; k < 9 * 9 * 9; ++k) {
@@ -125,25 +125,83 @@ TEST_CASE("The projection covers the points of boxes in large images, and not mu
     }
     CHECK(missed == 0);
     CHECK(inside > 100000);
-    // One pixel on each side, and the pixels that the ends lie in: the corners of a box are its extremes.
-    CHECK(largest <= 4.001);
+    // The margin on each side, and the pixels that the ends lie in: the corners of a box are its extremes.
+    CHECK(largest <= 2.3);
 }
 
 TEST_CASE("Boxes behind, around and beside the camera", "[visibility]")
 {
     const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 60);
-    CHECK(camera.project({{-1, -1, 6}, {1, 1, 8}}, 100, 80).empty());
-    CHECK(camera.project({{-1, -1, 4}, {1, 1, 8}}, 100, 80) == dfb::Region{0, 0, 100, 80});
-    CHECK(camera.project({{50, -1, -1}, {52, 1, 1}}, 100, 80).empty());
+    CHECK(camera.project({{-1, -1, 6}, {1, 1, 8}}, 100, 80).region().empty());
+    CHECK(camera.project({{-1, -1, 4}, {1, 1, 8}}, 100, 80).region() == dfb::Region{0, 0, 100, 80});
+    CHECK(camera.project({{50, -1, -1}, {52, 1, 1}}, 100, 80).region().empty());
     // So wide that its corners are at a right angle to the view: it still fills the image.
     for (const float wide : {1e4f, 1e8f, 1e30f}) {
         INFO("half width " << wide);
-        CHECK(camera.project({{-wide, -wide, -1}, {wide, wide, 1}}, 100, 80) == dfb::Region{0, 0, 100, 80});
+        CHECK(camera.project({{-wide, -wide, -1}, {wide, wide, 1}}, 100, 80).region() == dfb::Region{0, 0, 100, 80});
     }
-    const dfb::Region speck = camera.project({{0, 0, 0}, {0, 0, 0}}, 100, 80);
+    const dfb::Region speck = camera.project({{0, 0, 0}, {0, 0, 0}}, 100, 80).region();
     CHECK(speck.contains(50, 40));
-    CHECK(speck.width() <= 4);
-    CHECK(speck.height() <= 4);
+    CHECK(speck.width() <= 2);
+    CHECK(speck.height() <= 2);
+}
+
+TEST_CASE("A footprint meets the tiles that the box projects to, and no others", "[visibility]")
+{
+    Random random(8);
+    const int width = 1500, height = 1100;
+    const dfb::TileLayout layout(width, height, 64);
+    const double scale = 0.5 * height / std::tan(20 * 3.14159265358979 / 180);
+    std::size_t missed = 0, superfluous = 0, saved = 0, pairs = 0;
+    for (int i = 0; i < 60; ++i) {
+        const dfb::PerspectiveCamera camera({0, 0, 10}, {0, 0, 0}, {0, 1, 0}, 40);
+        const dfb::Vec3 center = point(random, 3);
+        const auto extent = static_cast<float>(std::pow(10.0, uniform(random, -4, 0.3)));
+        const dfb::Vec3 half{extent, 0.2f * extent, 2 * extent};
+        const dfb::Box3 box{center - half, center + half};
+        if (box.upper.z > 9)
+            continue;
+        // Points of its faces, densely.
+        std::vector<std::pair<double, double>> points;
+        const int n = 40;
+        for (int face = 0; face < 6; ++face)
+            for (int a = 0; a <= n; ++a)
+                for (int b = 0; b <= n; ++b) {
+                    double f[3];
+                    f[face % 3] = face / 3;
+                    f[(face + 1) % 3] = static_cast<double>(a) / n;
+                    f[(face + 2) % 3] = static_cast<double>(b) / n;
+                    const double px = box.lower.x + f[0] * (static_cast<double>(box.upper.x) - box.lower.x);
+                    const double py = box.lower.y + f[1] * (static_cast<double>(box.upper.y) - box.lower.y);
+                    const double pz = box.lower.z + f[2] * (static_cast<double>(box.upper.z) - box.lower.z);
+                    points.emplace_back(0.5 * width + scale * px / (10 - pz), 0.5 * height - scale * py / (10 - pz));
+                }
+        double x0 = 1e9, x1 = -1e9, y0 = 1e9, y1 = -1e9;
+        for (const auto& [x, y] : points) {
+            x0 = std::min(x0, x), x1 = std::max(x1, x);
+            y0 = std::min(y0, y), y1 = std::max(y1, y);
+        }
+        const double between = 3 * std::max(x1 - x0, y1 - y0) / n; // more than from one point to the next
+        std::set<int> found;
+        for (const auto& pair : dfb::visibleTiles(dfb::World({{1, box}}), camera, layout))
+            found.insert(pair.tile);
+        pairs += found.size();
+        for (int tile = 0; tile < layout.tileCount(); ++tile) {
+            const dfb::Region r = layout.region(tile);
+            double nearest = 1e9;
+            for (const auto& [x, y] : points) {
+                const double dx = std::max({0.0, r.x0 - x, x - r.x1}), dy = std::max({0.0, r.y0 - y, y - r.y1});
+                nearest = std::min(nearest, std::hypot(dx, dy));
+            }
+            missed += nearest == 0 && found.count(tile) == 0;
+            superfluous += nearest > between + 0.2 && found.count(tile) != 0;
+            saved += found.count(tile) == 0 && x0 < r.x1 && x1 > r.x0 && y0 < r.y1 && y1 > r.y0;
+        }
+    }
+    CHECK(missed == 0);
+    CHECK(superfluous == 0);
+    CHECK(pairs > 300);
+    CHECK(saved > 10); // within the rectangle around the projection
 }
 
 TEST_CASE("Degenerate cameras and bricks that are none are refused", "[visibility]")
@@ -163,6 +221,26 @@ TEST_CASE("Degenerate cameras and bricks that are none are refused", "[visibilit
     CHECK_THROWS_AS(world.add({8, {{0, 0, 0}, {1, 1, infinity}}}), dfb::InvalidArgument);
     CHECK(world.bricks().size() == 1);
     CHECK_NOTHROW(world.add({8, {{1, 1, 1}, {1, 1, 1}}}));
+    CHECK_THROWS_AS(world.add({9, {{0, 0, 0}, {2, 2, 2}}, dfb::Box3{{0, 0, 0}, {1, 2, 2}}}), dfb::InvalidArgument);
+    CHECK_THROWS_AS(world.addGhost({7, {{2, 0, 0}, {3, 1, 1}}}), dfb::InvalidArgument);
+}
+
+TEST_CASE("Bounds override those of the data, and ghosts project to nothing", "[visibility]")
+{
+    const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 60);
+    const dfb::TileLayout layout(100, 80, 16);
+    const dfb::Box3 left{{-1, -1, -1}, {0, 1, 1}}, all{{-2, -2, -2}, {2, 2, 2}};
+    dfb::World plain({{1, left}}), withGhosts({{1, left, all}});
+    withGhosts.addGhost({2, all});
+    CHECK(dfb::visibleTiles(plain, camera, layout).size() == dfb::visibleTiles(withGhosts, camera, layout).size());
+    REQUIRE(withGhosts.bricks().size() == 1);
+    REQUIRE(withGhosts.ghosts().size() == 1);
+    CHECK(withGhosts.ghosts()[0].id == 2);
+    CHECK(plain.bricks()[0].data().upper.x == 0.0f);
+    CHECK(withGhosts.bricks()[0].data().upper.x == 2.0f);
+    // Equal bounds, two ids: two bricks.
+    const dfb::World twins({{1, left}, {2, left}});
+    CHECK(dfb::visibleTiles(twins, camera, layout).size() == 2 * dfb::visibleTiles(plain, camera, layout).size());
 }
 
 TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meets", "[visibility]")
@@ -178,7 +256,7 @@ TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meet
     std::set<std::pair<int, int>> expected;
     for (int brick = 0; brick < 3; ++brick)
         for (int tile = 0; tile < layout.tileCount(); ++tile)
-            if (!dfb::intersection(camera.project(world.bricks()[static_cast<std::size_t>(brick)].bounds, 100, 80), layout.region(tile)).empty())
+            if (camera.project(world.bricks()[static_cast<std::size_t>(brick)].bounds, 100, 80).meets(layout.region(tile)))
                 expected.emplace(tile, brick);
     CHECK(found == expected);
     CHECK(std::is_sorted(pairs.begin(), pairs.end(), [](const auto& a, const auto& b) { return a.tile < b.tile; }));

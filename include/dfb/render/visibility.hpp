@@ -3,10 +3,12 @@
 // A camera, for the loops in render/, is any type with
 //   Region project(const Box3& bounds, int width, int height) const;
 // the pixels of a width x height image that the box may cover for any sample position within a pixel: never too few;
-// too many cost a header each.
+// too many cost a header each. Instead of a Region it may return a Footprint, which leaves out the tiles in the corners,
+// or a std::vector of those (a stereo camera has two).
 #pragma once
 
 #include <dfb/detail/manifest.hpp>
+#include <dfb/render/footprint.hpp>
 #include <dfb/render/world.hpp>
 #include <dfb/tile_layout.hpp>
 
@@ -15,6 +17,84 @@
 #include <vector>
 
 namespace dfb {
+
+namespace detail {
+
+struct Point3 {
+    double x = 0, y = 0, z = 0;
+};
+inline Point3 operator+(const Point3& a, const Point3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Point3 operator-(const Point3& a, const Point3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Point3 operator*(double s, const Point3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
+inline double dot(const Point3& a, const Point3& b) noexcept { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Point3 cross(const Point3& a, const Point3& b) noexcept
+{
+    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+}
+inline double length(const Point3& a) noexcept { return std::sqrt(dot(a, a)); }
+
+inline Point3 cornerOf(const Box3& b, int corner) noexcept
+{
+    const auto pick = [corner](int bit, float lower, float upper) {
+        return static_cast<double>(corner & bit ? upper : lower);
+    };
+    return {pick(1, b.lower.x, b.upper.x), pick(2, b.lower.y, b.upper.y), pick(4, b.lower.z, b.upper.z)};
+}
+
+// Where the eye is and how it looks; the axes are orthonormal.
+struct Pose {
+    Point3 eye, forward, right, up;
+};
+
+// The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, and that has `pixelsPerUnit` at
+// distance 1. Of a box that reaches behind the eye: the whole image. `blur(depth)`: by how many pixels a point at that
+// distance along the view may be off to any side; it must be largest at one of the ends of the box's interval.
+//
+// The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the rounding
+// of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels is less than
+// 1/100) and for points some units of the last place of the coordinates.
+template <class Blur>
+Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit, int width, int height, double shiftX,
+                     const Blur& blur)
+{
+    std::vector<PixelPoint> points;
+    points.reserve(32);
+    int behind = 0;
+    bool near = false;
+    double margin = 0;
+    for (int corner = 0; corner < 8; ++corner) {
+        const Point3 p = cornerOf(bounds, corner), d = p - pose.eye;
+        // The axes are rounded to float: a depth below that rounding may have either sign.
+        const double depth = dot(d, pose.forward);
+        const double rounding = 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z));
+        behind += depth < -rounding;
+        near = near || depth <= rounding;
+        if (near)
+            continue;
+        const double x = 0.5 * width + shiftX + pixelsPerUnit * dot(d, pose.right) / depth;
+        const double y = 0.5 * height - pixelsPerUnit * dot(d, pose.up) / depth;
+        const double b = blur(depth);
+        if (b > 0)
+            for (int side = 0; side < 4; ++side)
+                points.push_back({x + (side & 1 ? b : -b), y + (side & 2 ? b : -b)});
+        else
+            points.push_back({x, y});
+        const double largest = length(p) + length(pose.eye);
+        margin = std::max(margin, 0.125 + 5e-7 * largest / depth * pixelsPerUnit);
+    }
+    if (behind == 8)
+        return {};
+    if (near)
+        return Footprint::whole(width, height);
+    return Footprint(std::move(points), margin, width, height);
+}
+
+inline Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit, int width, int height)
+{
+    return projectBox(bounds, pose, pixelsPerUnit, width, height, 0, [](double) { return 0.0; });
+}
+
+} // namespace detail
 
 // A pinhole at `eye`. Pixels are square; pixel coordinates grow to the right and down.
 class PerspectiveCamera {
@@ -44,41 +124,11 @@ public:
     }
 
     // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
-    Region project(const Box3& bounds, int width, int height) const
+    Footprint project(const Box3& bounds, int width, int height) const
     {
-        const Region all{0, 0, width, height};
-        const double pixelsPerUnit = 0.5 * height / static_cast<double>(tanHalfFov_);
-        const auto along = [](const double(&d)[3], const Vec3& axis) {
-            return d[0] * static_cast<double>(axis.x) + d[1] * static_cast<double>(axis.y)
-                   + d[2] * static_cast<double>(axis.z);
-        };
-        double x0 = 1e300, y0 = 1e300, x1 = -1e300, y1 = -1e300;
-        int behind = 0;
-        bool near = false;
-        for (int corner = 0; corner < 8; ++corner) {
-            const Vec3 p{corner & 1 ? bounds.upper.x : bounds.lower.x, corner & 2 ? bounds.upper.y : bounds.lower.y,
-                         corner & 4 ? bounds.upper.z : bounds.lower.z};
-            const double d[3] = {static_cast<double>(p.x) - static_cast<double>(eye_.x),
-                                 static_cast<double>(p.y) - static_cast<double>(eye_.y),
-                                 static_cast<double>(p.z) - static_cast<double>(eye_.z)};
-            // The axes are rounded to float: a depth below that rounding may have either sign.
-            const double depth = along(d, forward_);
-            const double rounding = 1e-6 * (std::fabs(d[0]) + std::fabs(d[1]) + std::fabs(d[2]));
-            behind += depth < -rounding;
-            near = near || depth <= rounding;
-            const double x = 0.5 * width + pixelsPerUnit * along(d, right_) / depth;
-            const double y = 0.5 * height - pixelsPerUnit * along(d, up_) / depth;
-            x0 = std::min(x0, x), x1 = std::max(x1, x);
-            y0 = std::min(y0, y), y1 = std::max(y1, y);
-        }
-        if (behind == 8)
-            return {};
-        if (near)
-            return all;
-        // One pixel more on each side covers the rounding of all this and of the renderer's rays.
-        const auto pixel = [](double v) { return static_cast<int>(std::floor(std::clamp(v, -1e6, 1e6))); };
-        const Region region = intersection(all, {pixel(x0) - 1, pixel(y0) - 1, pixel(x1) + 2, pixel(y1) + 2});
-        return region.empty() ? Region{} : region;
+        const auto of = [](const Vec3& v) { return detail::Point3{v.x, v.y, v.z}; };
+        return detail::projectBox(bounds, {of(eye_), of(forward_), of(right_), of(up_)},
+                                  0.5 * height / static_cast<double>(tanHalfFov_), width, height);
     }
 
 private:
@@ -108,20 +158,46 @@ struct BrickInTile {
     int tile = 0;
 };
 
+namespace detail {
+
+// Calls found(tile) for each tile that the projection may cover; a tile may come up twice.
+template <class Found>
+void forEachTile(const Region& projection, const TileLayout& layout, const Found& found)
+{
+    const Region tiles = layout.tilesIn(projection);
+    for (int row = tiles.y0; row < tiles.y1; ++row)
+        for (int column = tiles.x0; column < tiles.x1; ++column)
+            found(layout.tileAt(column, row));
+}
+template <class Found>
+void forEachTile(const Footprint& projection, const TileLayout& layout, const Found& found)
+{
+    forEachTile(projection.region(), layout, [&](int tile) {
+        if (projection.meets(layout.region(tile)))
+            found(tile);
+    });
+}
+template <class Projection, class Found>
+void forEachTile(const std::vector<Projection>& projections, const TileLayout& layout, const Found& found)
+{
+    for (const Projection& projection : projections)
+        forEachTile(projection, layout, found);
+}
+
+} // namespace detail
+
 // All pairs, tile by tile, so that the inputs of a tile are rendered one after the other.
 template <class Camera>
 std::vector<BrickInTile> visibleTiles(const World& world, const Camera& camera, const TileLayout& layout)
 {
     std::vector<BrickInTile> result;
-    for (std::size_t b = 0; b < world.bricks().size(); ++b) {
-        const Region tiles = layout.tilesIn(camera.project(world.bricks()[b].bounds, layout.width(), layout.height()));
-        for (int row = tiles.y0; row < tiles.y1; ++row)
-            for (int column = tiles.x0; column < tiles.x1; ++column)
-                result.push_back({static_cast<int>(b), layout.tileAt(column, row)});
-    }
-    std::sort(result.begin(), result.end(), [](const BrickInTile& a, const BrickInTile& b) {
-        return a.tile != b.tile ? a.tile < b.tile : a.brick < b.brick;
-    });
+    for (std::size_t b = 0; b < world.bricks().size(); ++b)
+        detail::forEachTile(camera.project(world.bricks()[b].bounds, layout.width(), layout.height()), layout,
+                            [&](int tile) { result.push_back({static_cast<int>(b), tile}); });
+    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
+    std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
+    result.erase(std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
+                 result.end());
     return result;
 }
 

@@ -6,6 +6,7 @@
 
 #include <cmath>
 #include <cstdint>
+#include <optional>
 #include <string>
 #include <unordered_set>
 #include <vector>
@@ -32,13 +33,19 @@ struct Box3 {
     Vec3 lower, upper;
 };
 
-// A convex region of space that overlaps no other brick.
+// A convex region of space that overlaps no other brick, with what it holds. Camera rays see it within `bounds` only:
+// renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion, which
+// secondary rays see beyond the bounds as well.
 struct Brick {
-    std::uint32_t id = 0; // the same number means the same data, on any rank
+    std::uint32_t id = 0; // the same number means the same data, on any rank; bounds do not matter for that
     Box3 bounds;
+    std::optional<Box3> dataBounds{}; // if they are more than `bounds`
+
+    const Box3& data() const noexcept { return dataBounds ? *dataBounds : bounds; }
 };
 
-// What this rank holds; ranks may hold none. Not for use by several threads while bricks are added.
+// What this rank holds; ranks may hold none. Ghost bricks are copies of what others hold, seen by secondary rays alone:
+// they are neither projected nor declared nor rendered. Not for use by several threads while bricks are added.
 class World {
 public:
     World() = default;
@@ -49,8 +56,26 @@ public:
             add(brick);
     }
 
-    // Throws InvalidArgument for bounds that are not finite or have lower > upper, and for an id this rank has already.
+    // Throws InvalidArgument for bounds that are not finite or have lower > upper, data bounds that do not hold the bounds,
+    // and an id that this rank has already.
     void add(const Brick& brick)
+    {
+        check(brick);
+        bricks_.push_back(brick);
+    }
+
+    // Throws as add() does.
+    void addGhost(const Brick& brick)
+    {
+        check(brick);
+        ghosts_.push_back(brick);
+    }
+
+    const std::vector<Brick>& bricks() const noexcept { return bricks_; }
+    const std::vector<Brick>& ghosts() const noexcept { return ghosts_; }
+
+private:
+    void check(const Brick& brick)
     {
         const auto ordered = [](float lower, float upper) {
             return std::isfinite(lower) && std::isfinite(upper) && lower <= upper;
@@ -58,15 +83,15 @@ public:
         const Box3& b = brick.bounds;
         if (!ordered(b.lower.x, b.upper.x) || !ordered(b.lower.y, b.upper.y) || !ordered(b.lower.z, b.upper.z))
             throw InvalidArgument("the bounds of brick " + std::to_string(brick.id) + " are not a box");
+        const Box3& d = brick.data();
+        if (!(d.lower.x <= b.lower.x && d.lower.y <= b.lower.y && d.lower.z <= b.lower.z && d.upper.x >= b.upper.x
+              && d.upper.y >= b.upper.y && d.upper.z >= b.upper.z))
+            throw InvalidArgument("the data of brick " + std::to_string(brick.id) + " do not fill its bounds");
         if (!ids_.insert(brick.id).second)
             throw InvalidArgument("brick " + std::to_string(brick.id) + " was added twice");
-        bricks_.push_back(brick);
     }
 
-    const std::vector<Brick>& bricks() const noexcept { return bricks_; }
-
-private:
-    std::vector<Brick> bricks_;
+    std::vector<Brick> bricks_, ghosts_;
     std::unordered_set<std::uint32_t> ids_;
 };
 

@@ -1,0 +1,260 @@
+// Cameras beyond the pinhole: what per-pixel sorting allows (section 4.2 of the paper). Each gives a ray for a point of
+// the image and sample numbers for lens and time, and can tell which tiles a box may project to. A ray's sample numbers
+// must be a function of pixel, sample and seed alone, so that all bricks are seen along the same ray; each sample is a pass.
+//
+// Points of the image are in pixels, pixel centres at .5; sample numbers are in [0, 1); angles in degrees.
+#pragma once
+
+#include <dfb/render/visibility.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <vector>
+
+namespace dfb {
+
+// `direction` has length 1, or is 0 where the camera sees nothing.
+struct Ray {
+    Vec3 origin, direction;
+};
+
+// What lens and shutter need besides a point of the image.
+struct LensSample {
+    double lensU = 0, lensV = 0, time = 0;
+};
+
+namespace detail {
+
+inline constexpr double pi = 3.14159265358979323846;
+
+inline Point3 pointOf(const Vec3& v) { return {v.x, v.y, v.z}; }
+inline Vec3 vecOf(const Point3& p)
+{
+    return {static_cast<float>(p.x), static_cast<float>(p.y), static_cast<float>(p.z)};
+}
+inline Point3 normalized(const Point3& p) { return (1 / length(p)) * p; }
+
+// Throws InvalidArgument if the view or `up` are none.
+inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
+{
+    const Point3 v = pointOf(view), side = cross(v, pointOf(up));
+    if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
+        throw InvalidArgument("the camera's view or up vector is degenerate");
+    Pose pose;
+    pose.eye = pointOf(eye);
+    pose.forward = normalized(v);
+    pose.right = normalized(side);
+    pose.up = cross(pose.right, pose.forward);
+    return pose;
+}
+
+inline double tanHalf(float fovY)
+{
+    if (!(fovY > 0 && fovY < 180))
+        throw InvalidArgument("the camera's angle of view must be in (0, 180) degrees");
+    return std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
+}
+
+} // namespace detail
+
+// Depth of field: points at `focusDistance` along the view are sharp; `apertureRadius` is that of the lens, in units of
+// the world.
+class ThinLensCamera {
+public:
+    // Looks along `view`, of any length. Throws InvalidArgument for what is no camera.
+    ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
+                   float focusDistance)
+        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), radius_(static_cast<double>(apertureRadius)),
+          focus_(static_cast<double>(focusDistance))
+    {
+        if (!(radius_ >= 0) || !(focus_ > 0))
+            throw InvalidArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
+    }
+
+    Ray ray(double x, double y, int width, int height, const LensSample& sample) const
+    {
+        const double scale = 2 * tan_ / height;
+        const detail::Point3 sharp =
+            focus_
+            * (pose_.forward + (x - 0.5 * width) * scale * pose_.right + (0.5 * height - y) * scale * pose_.up);
+        const double r = radius_ * std::sqrt(sample.lensU), angle = 2 * detail::pi * sample.lensV;
+        const detail::Point3 onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
+        return {detail::vecOf(pose_.eye + onLens), detail::vecOf(detail::normalized(sharp - onLens))};
+    }
+
+    // Seen from a point of the lens at most `radius` off its middle, a point at depth z is off by at most
+    // radius |1/z - 1/focus| in the plane at distance 1, so each corner's image lies in a square around that from the
+    // middle. The hull of all these squares holds the image of the box from every point of the lens.
+    Footprint project(const Box3& bounds, int width, int height) const
+    {
+        const double scale = 0.5 * height / tan_;
+        return detail::projectBox(bounds, pose_, scale, width, height, 0, [&](double depth) {
+            return scale * radius_ * std::fabs(1 / depth - 1 / focus_);
+        });
+    }
+
+private:
+    detail::Pose pose_;
+    double tan_, radius_, focus_;
+};
+
+// Two eyes side by side: the left half of the image is the left one's, the right half the right one's. They are
+// `separation` apart, and what is at `convergence` along the view is at the same place in both halves.
+class StereoCamera {
+public:
+    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument for what is no camera.
+    StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
+        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), separation_(static_cast<double>(separation)),
+          convergence_(static_cast<double>(convergence))
+    {
+        if (!(separation_ >= 0) || !(convergence_ > 0))
+            throw InvalidArgument("eyes are 0 or more apart and converge at a distance above 0");
+    }
+
+    Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
+    {
+        const bool right = x >= 0.5 * width;
+        const double scale = 2 * tan_ / height, offset = right ? 0.5 * separation_ : -0.5 * separation_;
+        const double u = (x - (right ? 0.75 : 0.25) * width) * scale, v = (0.5 * height - y) * scale;
+        const detail::Point3 aside = offset * pose_.right;
+        const detail::Point3 to = convergence_ * (pose_.forward + u * pose_.right + v * pose_.up);
+        return {detail::vecOf(pose_.eye + aside), detail::vecOf(detail::normalized(to - aside))};
+    }
+
+    // One per eye, each in its half.
+    std::vector<Footprint> project(const Box3& bounds, int width, int height) const
+    {
+        const double scale = 0.5 * height / tan_;
+        std::vector<Footprint> both;
+        for (const double side : {-1.0, 1.0}) {
+            detail::Pose pose = pose_;
+            const double offset = 0.5 * side * separation_;
+            pose.eye = pose_.eye + offset * pose_.right;
+            both.push_back(detail::projectBox(bounds, pose, scale, width, height,
+                                              side * 0.25 * width + scale * offset / convergence_,
+                                              [](double) { return 0.0; }));
+        }
+        return both;
+    }
+
+private:
+    detail::Pose pose_;
+    double tan_, separation_, convergence_;
+};
+
+// An equidistant fisheye for domes: a circle as large as fits into the image, its middle along the view, its border
+// `angle` / 2 off it; nothing is seen outside.
+class DomeCamera {
+public:
+    // Throws InvalidArgument for an angle that is not in (0, 360] degrees.
+    DomeCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float angle = 180)
+        : pose_(detail::poseOf(eye, view, up)), border_(0.5 * static_cast<double>(angle) * detail::pi / 180)
+    {
+        if (!(angle > 0 && angle <= 360))
+            throw InvalidArgument("a dome covers an angle in (0, 360] degrees");
+    }
+
+    Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
+    {
+        const double radius = 0.5 * std::min(width, height), px = (x - 0.5 * width) / radius,
+                     py = (0.5 * height - y) / radius, r = std::hypot(px, py);
+        if (r > 1)
+            return {detail::vecOf(pose_.eye), {0, 0, 0}};
+        const double angle = r * border_, aside = r > 0 ? std::sin(angle) / r : 0;
+        const detail::Point3 d =
+            std::cos(angle) * pose_.forward + px * aside * pose_.right + py * aside * pose_.up;
+        return {detail::vecOf(pose_.eye), detail::vecOf(detail::normalized(d))};
+    }
+
+    // Around the sphere that holds the box. Angles along a radius come out to scale; across, angles at theta off the view
+    // are stretched by theta / sin(theta).
+    Footprint project(const Box3& bounds, int width, int height) const
+    {
+        const detail::Point3 lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
+        const detail::Point3 to = 0.5 * (lower + upper) - pose_.eye;
+        const double sphere = 0.5 * detail::length(upper - lower) + 1e-6 * (detail::length(upper) + detail::length(pose_.eye)),
+                     distance = detail::length(to);
+        if (distance <= sphere)
+            return Footprint::whole(width, height);
+        const double half = std::asin(sphere / distance), x = detail::dot(to, pose_.right), y = detail::dot(to, pose_.up),
+                     theta = std::atan2(std::hypot(x, y), detail::dot(to, pose_.forward)), farthest = theta + half;
+        if (theta - half > border_)
+            return {};
+        if (farthest > 2.6) // near the point behind, which is stretched to a circle
+            return Footprint::whole(width, height);
+        const double scale = 0.5 * std::min(width, height) / border_, aside = std::hypot(x, y);
+        const double cx = 0.5 * width + (aside > 0 ? scale * theta * x / aside : 0),
+                     cy = 0.5 * height - (aside > 0 ? scale * theta * y / aside : 0);
+        const double r = scale * half * std::max(1.0, farthest / std::sin(farthest));
+        std::vector<PixelPoint> octagon;
+        for (int i = 0; i < 8; ++i)
+            octagon.push_back({cx + r / std::cos(detail::pi / 8) * std::cos((i + 0.5) * detail::pi / 4),
+                               cy + r / std::cos(detail::pi / 8) * std::sin((i + 0.5) * detail::pi / 4)});
+        return Footprint(std::move(octagon), 0.125, width, height);
+    }
+
+private:
+    detail::Pose pose_;
+    double border_;
+};
+
+// Motion blur of a camera that turns around an axis while the shutter is open: by `degrees` from sample time 0 to 1.
+class OrbitBlurCamera {
+public:
+    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument for what is no
+    // camera, an axis of length 0, or more than a full turn.
+    OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
+                    float degrees)
+        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), center_(detail::pointOf(center)),
+          axis_(detail::pointOf(axis)), angle_(static_cast<double>(degrees) * detail::pi / 180)
+    {
+        if (!(detail::length(axis_) > 0) || !(std::fabs(angle_) <= 2 * detail::pi))
+            throw InvalidArgument("the camera turns around an axis, by a full turn at most");
+        axis_ = detail::normalized(axis_);
+    }
+
+    Ray ray(double x, double y, int width, int height, const LensSample& sample) const
+    {
+        const detail::Pose pose = at(sample.time);
+        const double scale = 2 * tan_ / height;
+        const detail::Point3 d =
+            pose.forward + (x - 0.5 * width) * scale * pose.right + (0.5 * height - y) * scale * pose.up;
+        return {detail::vecOf(pose.eye), detail::vecOf(detail::normalized(d))};
+    }
+
+    // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho of
+    // the axis is never farther than rho times half the part's angle from where it is in the middle of the part.
+    std::vector<Footprint> project(const Box3& bounds, int width, int height) const
+    {
+        double rho = 0;
+        for (int corner = 0; corner < 8; ++corner)
+            rho = std::max(rho, detail::length(detail::cross(detail::cornerOf(bounds, corner) - center_, axis_)));
+        const int parts = 1 + static_cast<int>(std::fabs(angle_) * 32);
+        const auto pad = static_cast<float>(rho * 0.5 * std::fabs(angle_) / parts * 1.000001);
+        const Box3 padded{bounds.lower - Vec3{pad, pad, pad}, bounds.upper + Vec3{pad, pad, pad}};
+        std::vector<Footprint> all;
+        for (int i = 0; i < parts; ++i)
+            all.push_back(detail::projectBox(padded, at((i + 0.5) / parts), 0.5 * height / tan_, width, height));
+        return all;
+    }
+
+private:
+    detail::Point3 turned(const detail::Point3& v, double angle) const // Rodrigues
+    {
+        return std::cos(angle) * v + std::sin(angle) * detail::cross(axis_, v)
+               + (1 - std::cos(angle)) * detail::dot(axis_, v) * axis_;
+    }
+    detail::Pose at(double time) const
+    {
+        const double angle = angle_ * time;
+        return {center_ + turned(pose_.eye - center_, angle), turned(pose_.forward, angle), turned(pose_.right, angle),
+                turned(pose_.up, angle)};
+    }
+
+    detail::Pose pose_;
+    double tan_;
+    detail::Point3 center_, axis_;
+    double angle_;
+};
+
+} // namespace dfb
