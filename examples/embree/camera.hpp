@@ -1,16 +1,29 @@
-// Camera: a perspective view that orbits around the scene, one position per frame.
+// Camera: a view that orbits around the scene, one position per frame, with or without a lens, motion, two eyes, a dome.
 #pragma once
 
 #include "vec.hpp"
 
+#include <dfb/render/cameras.hpp>
+
+#include <variant>
+#include <vector>
+
 namespace example {
 
-// What the user chooses about the view; angles in degrees.
+enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
+
+// What the user chooses about the view; angles in degrees, lengths in units of the largest extent of what there is to see.
 struct View {
     float azimuth = 30;     // around the y axis, from +z towards +x
     float elevation = 20;   // above the xz plane
     float fieldOfView = 35; // full vertical angle
-    float distance = 2.3f;  // from the centre of what there is to see, in units of its largest extent
+    float distance = 2.3f;  // from the centre of what there is to see
+    CameraKind kind = CameraKind::Perspective;
+    float aperture = 0.05f;  // radius of the lens
+    float focus = 0;         // distance of what is sharp; 0: the centre
+    float shutter = 8;       // degrees that the camera goes on along its orbit while the shutter is open
+    float separation = 0.1f; // of the eyes
+    float domeAngle = 180;
 };
 
 struct Camera {
@@ -48,5 +61,75 @@ inline Camera orbitCamera(const Box& focus, const View& view, int frame, int fra
     camera.aspect = static_cast<float>(width) / static_cast<float>(height);
     return camera;
 }
+
+// A camera of any kind at one frame: its rays, and for the library, where boxes project to.
+class FrameCamera {
+public:
+    FrameCamera(const Box& focus, const View& view, int frame, int frameCount, int width, int height)
+        : pose_(orbitCamera(focus, view, frame, frameCount, width, height)), width_(width), height_(height),
+          pinhole_(dfb::PerspectiveCamera::along(of(pose_.origin), of(pose_.forward), of(pose_.up), view.fieldOfView))
+    {
+        const float unit = focus.largestExtent();
+        const auto orOne = [](float v) { return v > 0 ? v : 1.0f; }; // of a scene without extent
+        const float sharp = orOne(view.focus > 0 ? view.focus * unit : view.distance * unit);
+        const dfb::Vec3 eye = of(pose_.origin), forward = of(pose_.forward), up = of(pose_.up);
+        switch (view.kind) {
+        case CameraKind::Perspective: break;
+        case CameraKind::DepthOfField:
+            lens_ = dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
+            break;
+        case CameraKind::MotionBlur:
+            lens_ = dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.center()), {0, 1, 0}, view.shutter);
+            break;
+        case CameraKind::Stereo:
+            lens_ = dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);
+            break;
+        case CameraKind::Dome: lens_ = dfb::DomeCamera(eye, forward, up, view.domeAngle); break;
+        }
+    }
+
+    const Camera& pose() const { return pose_; }
+
+    // The ray through a point of the image, in pixels; false where the camera sees nothing.
+    bool ray(double x, double y, const dfb::LensSample& sample, Vec3& origin, Vec3& direction) const
+    {
+        return std::visit(
+            [&](const auto& lens) {
+                if constexpr (std::is_same_v<std::decay_t<decltype(lens)>, std::monostate>) {
+                    origin = pose_.origin;
+                    direction = pose_.direction(x, y, width_, height_);
+                    return true;
+                } else {
+                    const dfb::Ray ray = lens.ray(x, y, width_, height_, sample);
+                    origin = {ray.origin.x, ray.origin.y, ray.origin.z};
+                    direction = {ray.direction.x, ray.direction.y, ray.direction.z};
+                    return dot(direction, direction) > 0;
+                }
+            },
+            lens_);
+    }
+
+    std::vector<dfb::Footprint> project(const dfb::Box3& bounds, int width, int height) const
+    {
+        return std::visit(
+            [&](const auto& lens) {
+                if constexpr (std::is_same_v<std::decay_t<decltype(lens)>, std::monostate>)
+                    return std::vector<dfb::Footprint>{pinhole_.project(bounds, width, height)};
+                else
+                    return listOf(lens.project(bounds, width, height));
+            },
+            lens_);
+    }
+
+private:
+    static dfb::Vec3 of(const Vec3& v) { return {v.x, v.y, v.z}; }
+    static std::vector<dfb::Footprint> listOf(std::vector<dfb::Footprint> all) { return all; }
+    static std::vector<dfb::Footprint> listOf(dfb::Footprint one) { return {std::move(one)}; }
+
+    Camera pose_;
+    int width_, height_;
+    dfb::PerspectiveCamera pinhole_;
+    std::variant<std::monostate, dfb::ThinLensCamera, dfb::OrbitBlurCamera, dfb::StereoCamera, dfb::DomeCamera> lens_;
+};
 
 } // namespace example

@@ -15,7 +15,9 @@
 
 namespace example {
 
-enum class Mode { Data, Image };
+enum class Mode { Data, Image, Mixed };
+enum class Balance { Cost, RoundRobin };
+enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
 enum class Compression { None, Snappy };
 enum class OwnerMap { Lattice, Linear, Hash };
 
@@ -25,6 +27,11 @@ struct Options {
     Mode mode = Mode::Data;
     int ranks = 0;   // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;  // 0: one per rank
+    int replicate = 2; // ranks that hold each brick, in mixed mode
+    Balance balance = Balance::Cost;
+    Distribution distribution = Distribution::Owned; // in image mode
+    int interleave = 1;                              // cells of a brick
+    int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
     int threads = 0; // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
     OwnerMap ownerMap = OwnerMap::Lattice;
@@ -32,7 +39,10 @@ struct Options {
     int width = 1024, height = 1024;
     int frames = 1;
     int spp = 1;
+    float adaptive = 0; // 0: off
     std::uint64_t seed = 1;
+    int ao = 0, path = 0; // 0: off
+    float aoDistance = 0.1f;
     View view;
 
     float opacity = 0.6f;
@@ -40,7 +50,10 @@ struct Options {
     float exposure = 0;                             // 0: off
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
 
-    std::string output, alpha, depth, stats; // empty: not written
+    int wallColumns = 0, wallRows = 0; // 0: no wall
+    int bezel = 0;
+
+    std::string output, alpha, depth, aux, stats; // empty: not written
 };
 
 // Either options to run with, or a message to print (on one rank) and a code to exit with: the help and 0, or one
@@ -121,22 +134,23 @@ inline std::string wrapped(std::string text)
     return text;
 }
 
-inline void parseSize(const std::string& text, Options& options)
+inline void parseSize(const std::string& name, const std::string& text, int most, int& width, int& height)
 {
     const std::size_t x = text.find('x');
-    const auto side = [&text](std::size_t from, std::size_t to) {
+    const auto side = [&](std::size_t from, std::size_t to) {
         int value = 0;
         bool ok = from < to;
         for (; from < to && ok; ++from) {
-            ok = text[from] >= '0' && text[from] <= '9' && value <= 65536;
+            ok = text[from] >= '0' && text[from] <= '9' && value <= most;
             value = ok ? 10 * value + (text[from] - '0') : 0;
         }
-        return ok && value >= 1 && value <= 65536 ? value : 0;
+        return ok && value >= 1 && value <= most ? value : 0;
     };
-    options.width = x == std::string::npos ? 0 : side(0, x);
-    options.height = x == std::string::npos ? 0 : side(x + 1, text.size());
-    if (options.width == 0 || options.height == 0)
-        throw CLI::ValidationError("--size", "'" + text + "' is no WIDTHxHEIGHT with sides from 1 to 65536");
+    width = x == std::string::npos ? 0 : side(0, x);
+    height = x == std::string::npos ? 0 : side(x + 1, text.size());
+    if (width == 0 || height == 0)
+        throw CLI::ValidationError(name, "'" + text + "' is no pair of numbers such as 4x3, each from 1 to "
+                                             + std::to_string(most));
 }
 
 } // namespace detail
@@ -144,7 +158,7 @@ inline void parseSize(const std::string& text, Options& options)
 inline ParsedOptions parseOptions(int argc, const char* const* argv)
 {
     Options options;
-    std::string size;
+    std::string size, wall;
     std::vector<float> background;
     CLI::App app("Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render");
     app.set_help_flag("-h,--help", "Print this and exit");
@@ -163,9 +177,36 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     const char* how = "Distribution";
     app.add_option("--mode", options.mode,
                    "data: each rank holds some bricks of the scene; image: each rank holds all and renders some "
-                   "tiles; default data")
-        ->transform(detail::choice({"data", "image"}))
-        ->option_text("data|image")
+                   "tiles; mixed: several ranks hold each brick and share its tiles; default data")
+        ->transform(detail::choice({"data", "image", "mixed"}))
+        ->option_text("data|image|mixed")
+        ->group(how);
+    app.add_option("--replicate", options.replicate, "Ranks that hold each brick, with --mode mixed; default 2")
+        ->check(detail::number(1, most))
+        ->option_text("K")
+        ->group(how);
+    app.add_option("--balance", options.balance,
+                   "How the ranks that hold a brick share its tiles: by what they cost in the last frame, or in turn; "
+                   "default cost")
+        ->transform(detail::choice({"cost", "round-robin"}))
+        ->option_text("cost|round-robin")
+        ->group(how);
+    app.add_option("--distribution", options.distribution,
+                   "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on "
+                   "demand; default owned")
+        ->transform(detail::choice({"owned", "linear", "round-robin", "dynamic"}))
+        ->option_text("owned|linear|round-robin|dynamic")
+        ->group(how);
+    app.add_option("--interleave", options.interleave,
+                   "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1. Pixels whose "
+                   "order is undefined are counted, unless --deep has segments enough")
+        ->check(detail::number(1, 4096))
+        ->option_text("C")
+        ->group(how);
+    app.add_option("--deep", options.deep,
+                   "Deep fragments: the most segments per pixel and brick; default 0: a single fragment")
+        ->check(detail::number(0, 65535))
+        ->option_text("K")
         ->group(how);
     app.add_option("--ranks", options.ranks, "Run N ranks as threads of one process; default: the ranks of MPI")
         ->check(detail::number(1, 4096))
@@ -199,6 +240,68 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
     app.add_option("--spp", options.spp, "Samples per pixel, one pass each; default 1, in the pixel's centre")
         ->check(detail::number(1, 65536))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--adaptive", options.adaptive,
+                   "Render a tile until the standard error of its pixels is at most this, from 8 to --spp samples; "
+                   "default 0: all have --spp")
+        ->check(detail::number(0, 1))
+        ->option_text("ERR")
+        ->group(picture);
+    app.add_option("--ao", options.ao,
+                   "Ambient occlusion of surfaces and spheres, with N rays per hit; default 0: none. Bricks then hold what "
+                   "is within --ao-distance of them as ghosts")
+        ->check(detail::number(0, 4096))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--ao-distance", options.aoDistance,
+                   "How far these rays look, in units of the scene's largest extent; default 0.1")
+        ->check(detail::number(1e-6, 10))
+        ->option_text("D")
+        ->group(picture);
+    app.add_option("--path", options.path,
+                   "Path-trace opaque surfaces and spheres under a bright sky, N bounces at most; volumes are left out; "
+                   "needs --mode image; default 0: off")
+        ->check(detail::number(0, 1000))
+        ->option_text("N")
+        ->group(picture);
+    app.add_option("--camera", options.view.kind,
+                   "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
+                   "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
+                   "dof and motion want --spp 16 or more")
+        ->transform(detail::choice({"perspective", "dof", "motion", "stereo", "dome"}))
+        ->option_text("perspective|dof|motion|stereo|dome")
+        ->group(picture);
+    app.add_option("--aperture", options.view.aperture,
+                   "Radius of the lens of dof, in units of the largest extent of what there is to see; default 0.05")
+        ->check(detail::number(0, 10))
+        ->option_text("R")
+        ->group(picture);
+    app.add_option("--focus", options.view.focus,
+                   "Distance of what is sharp with dof and at the screen with stereo, in the same units; default: the "
+                   "centre's")
+        ->check(detail::number(1e-6, 1e6))
+        ->option_text("D")
+        ->group(picture);
+    app.add_option("--shutter", options.view.shutter, "Degrees of the orbit that motion blurs, up to 360; default 8")
+        ->check(detail::number(-360, 360))
+        ->option_text("DEG")
+        ->group(picture);
+    app.add_option("--eyes", options.view.separation, "Distance of the eyes of stereo, in the same units; default 0.1")
+        ->check(detail::number(0, 10))
+        ->option_text("D")
+        ->group(picture);
+    app.add_option("--dome-angle", options.view.domeAngle, "Degrees that dome covers, up to 360; default 180")
+        ->check(detail::number(1, 360))
+        ->option_text("DEG")
+        ->group(picture);
+    app.add_option("--wall", wall,
+                   "Display wall of COLUMNSxROWS displays, which ranks drive in turn; the image size is that of all, and "
+                   "each display's picture is written to the output file with its number before the ending")
+        ->option_text("CxR")
+        ->group(picture);
+    app.add_option("--bezel", options.bezel, "Pixels that are hidden between two displays of a wall; default 0")
+        ->check(detail::number(0, 10000))
         ->option_text("N")
         ->group(picture);
     app.add_option("--seed", options.seed, "Of generated scenes and sample positions; default 1")
@@ -260,7 +363,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::ending({".pfm"}))
         ->option_text("FILE")
         ->group(files);
-    app.add_option("--stats", options.stats, "Times in ms, bytes, messages and a hash of the image; default none")
+    app.add_option("--aux", options.aux,
+                   "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
+                   ".instance.png with a colour for each id; default none")
+        ->option_text("PREFIX")
+        ->group(files);
+    app.add_option("--stats", options.stats,
+                   "Times in ms, bytes, messages, tiles and samples of each rank, samples saved, and a hash of the image; "
+                   "default none")
         ->check(detail::ending({".json"}))
         ->option_text("FILE")
         ->group(files);
@@ -275,7 +385,29 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         app.parse(argc, argv);
         options.fit = !noFit;
         if (app.count("--size") > 0)
-            detail::parseSize(size, options);
+            detail::parseSize("--size", size, 65536, options.width, options.height);
+        if (app.count("--wall") > 0)
+            detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
+        const auto refuse = [&app](bool wrong, const char* option, const char* why) {
+            if (wrong && app.count(option) > 0)
+                throw CLI::ValidationError(option, why);
+        };
+        const bool isData = options.mode == Mode::Data;
+        refuse(options.mode != Mode::Mixed, "--replicate", "needs --mode mixed");
+        refuse(options.mode != Mode::Mixed, "--balance", "needs --mode mixed");
+        refuse(options.mode != Mode::Image, "--distribution", "needs --mode image");
+        refuse(options.mode != Mode::Image, "--path", "needs --mode image: paths go through the whole scene");
+        refuse(!isData, "--interleave", "needs --mode data");
+        refuse(!isData, "--deep", "needs --mode data");
+        refuse(options.interleave > 1 || options.deep > 0, "--adaptive", "does not go with --interleave or --deep");
+        refuse(options.interleave > 1 || options.deep > 0, "--aux", "does not go with --interleave or --deep");
+        refuse(options.interleave > 1 || options.deep > 0, "--wall", "does not go with --interleave or --deep");
+        refuse(options.interleave > 1 || options.deep > 0, "--exposure", "does not go with --interleave or --deep");
+        refuse(options.adaptive > 0, "--wall", "does not go with --adaptive");
+        refuse(options.adaptive > 0, "--exposure", "does not go with --adaptive");
+        refuse(options.adaptive > 0 && options.spp < 8, "--adaptive", "needs --spp 8 or more: the most samples per pixel");
+        for (const char* file : {"--alpha", "--depth", "--aux"})
+            refuse(options.wallColumns > 0, file, "is not written for a wall");
         if (background.size() == 3)
             options.background = {{background[0], background[1], background[2]}};
         for (const std::string& word : options.scene) {

@@ -100,6 +100,25 @@ inline void writeGreyPfm(const std::string& path, int width, int height, const f
     detail::writeFloats(path, width, height, values, stride, 1);
 }
 
+// Three floats per pixel as a colour PFM.
+inline void writeVectorPfm(const std::string& path, int width, int height, const float* values)
+{
+    detail::writeFloats(path, width, height, values, 3, 3);
+}
+
+// A colour for each id, black where there is none (all bits set).
+inline void writeIdPng(const std::string& path, int width, int height, const std::uint32_t* ids)
+{
+    const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
+    std::vector<std::uint8_t> rgba(4 * pixels, 0);
+    for (std::size_t i = 0; i < pixels; ++i) {
+        const std::uint64_t hash = XXH3_64bits(ids + i, sizeof *ids);
+        for (std::size_t c = 0; c < 3 && ids[i] != 0xffffffffu; ++c)
+            rgba[4 * i + c] = static_cast<std::uint8_t>(64 + (hash >> (8 * c)) % 192);
+    }
+    writePng(path, width, height, rgba.data());
+}
+
 // XXH3 of the pixels as they are in memory, 16 hexadecimal digits.
 inline std::string hashPixels(const float* rgba, std::size_t pixelCount)
 {
@@ -126,6 +145,10 @@ struct FrameStats {
     std::uint64_t tilesTotal = 0;
     std::uint64_t tilesTouched = 0;
     std::uint64_t peakMemoryBytes = 0; // of the rank with the most
+    // Of each rank: tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
+    std::vector<std::uint64_t> tilesRendered, workOfRanks;
+    std::uint64_t orderUndefinedPixels = 0;
+    double mergeErrorBound = 0;
 };
 
 struct RunStats {
@@ -134,6 +157,7 @@ struct RunStats {
     int width = 0, height = 0;
     std::string imageHash; // of the last frame
     double meanAlpha = 0;
+    std::uint64_t samplesTaken = 0, samplesSaved = 0; // of pixels, in the last frame
     std::vector<FrameStats> frames;
 };
 
@@ -147,6 +171,8 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
     json["height"] = run.height;
     json["image_hash"] = run.imageHash;
     json["mean_alpha"] = run.meanAlpha;
+    json["samples_taken"] = run.samplesTaken;
+    json["samples_saved"] = run.samplesSaved;
     json["frames"] = nlohmann::ordered_json::array();
     for (const FrameStats& frame : run.frames) {
         nlohmann::ordered_json entry;
@@ -158,6 +184,10 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["tiles_total"] = frame.tilesTotal;
         entry["tiles_touched"] = frame.tilesTouched;
         entry["peak_memory_bytes"] = frame.peakMemoryBytes;
+        entry["order_undefined_pixels"] = frame.orderUndefinedPixels;
+        entry["merge_error_bound"] = frame.mergeErrorBound;
+        entry["tiles_rendered"] = frame.tilesRendered;
+        entry["work_of_ranks"] = frame.workOfRanks;
         json["frames"].push_back(entry);
     }
     return json;

@@ -14,6 +14,9 @@ inline RenderSettings renderSettings(const Options& options)
     settings.height = options.height;
     settings.frames = options.frames;
     settings.passes = options.spp;
+    settings.aoRays = options.ao;
+    settings.aoDistance = options.aoDistance;
+    settings.pathBounces = options.path;
     settings.seed = options.seed;
     settings.opacity = options.opacity;
     settings.earlyTermination = options.earlyTermination;
@@ -36,28 +39,51 @@ inline Scene makeScene(const Options& options, int brickCount)
 
 struct RankScene {
     SceneInfo info;
-    std::vector<Box> cells;              // of all bricks, by brick id; in image mode one, the whole scene
     std::vector<std::uint32_t> brickIds; // of the bricks that this rank holds, ascending
-    std::vector<Renderer> renderers;     // one for each of brickIds
+    std::vector<Box> bounds;             // of all bricks, by brick id; in image mode one, the whole scene
+    // For each of brickIds one per cell: a brick has one, or with --interleave several that are apart.
+    std::vector<std::vector<Renderer>> renderers;
+
+    const std::vector<Renderer>& of(std::uint32_t brickId) const
+    {
+        const auto found = std::lower_bound(brickIds.begin(), brickIds.end(), brickId);
+        return renderers[static_cast<std::size_t>(found - brickIds.begin())];
+    }
 };
+
+// Whether a rank holds a brick: `copies` ranks in a row do.
+inline bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int copies)
+{
+    const int first = rankOfBrick(brick, brickCount, rankCount);
+    return (rank - first + rankCount) % rankCount < copies;
+}
 
 // Not collective: each rank reads what it needs, and all come to the same cells. Throws std::runtime_error.
 inline RankScene loadRankScene(const Options& options, int rank, int rankCount)
 {
-    const int brickCount = options.bricks > 0 ? options.bricks : rankCount;
-    const Scene scene = makeScene(options, brickCount);
+    const bool isImage = options.mode == Mode::Image;
+    const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
+    const Scene scene = makeScene(options, sceneBricks);
+    const RenderSettings settings = renderSettings(options);
     RankScene result{SceneInfo(scene), {}, {}, {}};
-    if (options.mode == Mode::Image)
-        result.cells = {scene.bounds};
-    else
-        result.cells = cutScene(scene, brickCount);
-    const int count = static_cast<int>(result.cells.size());
-    for (int brick = 0; brick < count; ++brick)
-        if (options.mode == Mode::Image || rankOfBrick(brick, count, rankCount) == rank) {
-            const std::uint32_t id = static_cast<std::uint32_t>(brick);
-            result.brickIds.push_back(id);
-            result.renderers.emplace_back(loadBrick(scene, id, result.cells[id]), result.info, renderSettings(options));
-        }
+    const float ghosts = ghostReach(result.info, settings);
+    std::vector<Box> cells{scene.bounds};
+    if (!isImage)
+        cells = cutScene(scene, brickCount * options.interleave);
+    const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
+    for (int brick = 0; brick < brickCount; ++brick) {
+        Box bounds;
+        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size(); c += static_cast<std::size_t>(brickCount))
+            bounds.grow(cells[c]);
+        result.bounds.push_back(bounds);
+        if (!isImage && !holdsBrick(rank, brick, brickCount, rankCount, copies))
+            continue;
+        const auto id = static_cast<std::uint32_t>(brick);
+        result.brickIds.push_back(id);
+        result.renderers.emplace_back();
+        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size(); c += static_cast<std::size_t>(brickCount))
+            result.renderers.back().emplace_back(loadBrick(scene, id, cells[c], ghosts), result.info, settings);
+    }
     return result;
 }
 

@@ -9,6 +9,11 @@
 #include "surfaces.hpp"
 #include "volume_sampler.hpp"
 
+#include <dfb/deep_tile.hpp>
+
+#include <array>
+#include <cstdint>
+
 #if defined(__SSE2__) || defined(_M_X64)
 #include <xmmintrin.h>
 #endif
@@ -20,6 +25,9 @@ struct RenderSettings {
     int frames = 1;            // of one turn of the camera
     int passes = 1;            // samples per pixel
     std::uint64_t seed = 0;
+    int aoRays = 0;           // of ambient occlusion, per hit of a surface or sphere; 0: none
+    float aoDistance = 0.1f;  // how far they look, in units of the scene's largest extent
+    int pathBounces = 0;      // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
     float opacity = 0.6f;       // of a surface or sphere
     float earlyTermination = 0; // a ray ends when less than this passes through it; 0: never
     View view;
@@ -41,9 +49,15 @@ struct SceneInfo {
 };
 
 // The same on all ranks, with or without a brick.
-inline Camera frameCamera(const SceneInfo& scene, const RenderSettings& settings, int frameIndex)
+inline FrameCamera frameCamera(const SceneInfo& scene, const RenderSettings& settings, int frameIndex)
 {
-    return orbitCamera(scene.focus, settings.view, frameIndex, settings.frames, settings.width, settings.height);
+    return FrameCamera(scene.focus, settings.view, frameIndex, settings.frames, settings.width, settings.height);
+}
+
+// How far secondary rays reach beyond a brick's cell, in world space: so far it needs ghosts.
+inline float ghostReach(const SceneInfo& scene, const RenderSettings& settings)
+{
+    return settings.aoRays > 0 ? settings.aoDistance * scene.bounds.largestExtent() : 0;
 }
 
 class Renderer {
@@ -58,18 +72,46 @@ public:
             volumes_.emplace_back(std::move(volume), scene.step);
     }
 
-    // Renders the brick into tile.color and tile.depth (tile.region, tile.pass); the tile comes cleared, and pixels
-    // where the brick has nothing stay so. From any number of threads.
+    // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and pixels
+    // where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and one for each
+    // camera ray that comes near. From any number of threads.
     template <class Tile>
-    void renderTile(Tile& tile, int frameIndex) const
+    std::int64_t renderTile(Tile& tile, int frameIndex) const
     {
-        render({tile.region.x0, tile.region.y0, tile.region.x1, tile.region.y1}, tile.pass, frameIndex, Tile::size,
-               tile.color, tile.depth);
+        Target to;
+        to.region = tile.region;
+        to.sample = tile.sample;
+        to.stride = Tile::size;
+        to.color = tile.color;
+        to.depth = tile.depth;
+        if constexpr ((Tile::channels & dfb::normalChannel) != 0) {
+            to.normal = tile.normal;
+            to.albedo = tile.albedo;
+            to.position = tile.position;
+            to.primitiveId = tile.primitiveId;
+            to.instanceId = tile.instanceId;
+        }
+        return render(to, frameIndex);
+    }
+
+    // The same into a tile with several segments per pixel: adds one to each where the brick has something.
+    std::int64_t renderDeep(dfb::DeepTile& deep, int frameIndex) const
+    {
+        Target to;
+        to.region = deep.header().region;
+        to.sample = deep.header().sample;
+        to.deep = &deep;
+        return render(to, frameIndex);
     }
 
 private:
-    struct Pixels {
-        int x0, y0, x1, y1;
+    // Where pixels go: to a tile's channels, of which some may be null, or to segments.
+    struct Target {
+        dfb::Region region;
+        int sample = 0, stride = 0;
+        float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
+        std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
+        dfb::DeepTile* deep = nullptr;
     };
 
     // Denormals flushed to zero, as Embree wants it, for as long as this lives.
@@ -93,7 +135,10 @@ private:
     // What has been gathered along a ray so far.
     struct Accumulator {
         double r = 0, g = 0, b = 0, alpha = 0, through = 1;
-        float depth = std::numeric_limits<float>::infinity();
+        float depth = std::numeric_limits<float>::infinity(), farDepth = -std::numeric_limits<float>::infinity();
+        Vec3 normal, albedo; // premultiplied
+        std::uint32_t primitive = dfb::noId, instance = dfb::noId;
+        std::int64_t cost = 0;
 
         void add(float t, float red, float green, float blue, float opacity)
         {
@@ -101,12 +146,33 @@ private:
                 return;
             if (alpha == 0)
                 depth = t;
+            farDepth = t;
             r += through * static_cast<double>(red);
             g += through * static_cast<double>(green);
             b += through * static_cast<double>(blue);
             alpha += through * static_cast<double>(opacity);
             through *= 1 - static_cast<double>(opacity);
         }
+        // To be called before add().
+        void addSurface(const Hit& hit, float opacity)
+        {
+            if (!(opacity > 0))
+                return;
+            const float weight = static_cast<float>(through) * opacity;
+            normal = normal + hit.normal * weight;
+            albedo = albedo + hit.color * weight;
+            if (primitive == dfb::noId) {
+                primitive = hit.primitive;
+                instance = hit.geometry;
+            }
+        }
+    };
+
+    // What a ray is traced with: numbers that are a function of pixel, sample, frame and seed alone.
+    struct RaySample {
+        std::uint64_t key = 0;
+        dfb::LensSample lens;
+        double x = 0, y = 0; // in the image
     };
 
     // Where a ray is in one volume: the next sample it has to look at, and the one behind the last.
@@ -116,42 +182,121 @@ private:
     };
 
     // One function for all tile types and so one machine code for all bricks.
-    void render(const Pixels& region, int pass, int frameIndex, int stride, float* color, float* depth) const
+    std::int64_t render(const Target& to, int frameIndex) const
     {
         if (volumes_.empty() && surfaces_.empty())
-            return;
+            return 0;
         const FlushDenormals flush;
-        const Camera view = frameCamera(scene_, settings_, frameIndex);
+        const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
+        const Camera& view = camera.pose();
         const Light light{normalize(view.forward * -0.75f + view.up * 0.55f + view.right * -0.40f)};
         std::vector<Hit> hits;
         std::vector<VolumeRay> rays(volumes_.size());
-        for (int y = region.y0; y < region.y1; ++y)
-            for (int x = region.x0; x < region.x1; ++x) {
-                double sx = x + 0.5, sy = y + 0.5;
-                if (settings_.passes > 1)
-                    jitter(x, y, pass, frameIndex, sx, sy);
-                const Vec3 direction = view.direction(sx, sy, settings_.width, settings_.height);
-                const Accumulator sum = trace(view.origin, direction, light, hits, rays);
+        std::int64_t cost = 0;
+        for (int y = to.region.y0; y < to.region.y1; ++y)
+            for (int x = to.region.x0; x < to.region.x1; ++x) {
+                const RaySample sample = sampleAt(x, y, to.sample, frameIndex);
+                Vec3 origin, direction;
+                if (!camera.ray(sample.x, sample.y, sample.lens, origin, direction))
+                    continue;
+                const Accumulator sum = trace(origin, direction, light, sample.key, hits, rays);
+                cost += sum.cost;
                 if (sum.alpha == 0)
                     continue;
-                const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(y - region.y0) * stride + (x - region.x0);
-                color[4 * at] = static_cast<float>(sum.r);
-                color[4 * at + 1] = static_cast<float>(sum.g);
-                color[4 * at + 2] = static_cast<float>(sum.b);
-                color[4 * at + 3] = static_cast<float>(sum.alpha);
-                depth[at] = sum.depth;
+                const std::array<float, 4> rgba{static_cast<float>(sum.r), static_cast<float>(sum.g),
+                                                static_cast<float>(sum.b), static_cast<float>(sum.alpha)};
+                if (to.deep) {
+                    to.deep->add(x, y, {rgba, sum.depth, sum.farDepth});
+                    continue;
+                }
+                const std::ptrdiff_t at =
+                    static_cast<std::ptrdiff_t>(y - to.region.y0) * to.stride + (x - to.region.x0);
+                std::copy(rgba.begin(), rgba.end(), to.color + 4 * at);
+                to.depth[at] = sum.depth;
+                if (to.normal == nullptr)
+                    continue;
+                const Vec3 position = pointAt(origin, direction, sum.depth);
+                for (int i = 0; i < 3; ++i) {
+                    to.normal[3 * at + i] = sum.normal[i];
+                    to.albedo[3 * at + i] = sum.albedo[i];
+                    to.position[3 * at + i] = position[i];
+                }
+                to.primitiveId[at] = sum.primitive;
+                to.instanceId[at] = sum.instance;
             }
+        return cost;
     }
 
-    // A low-discrepancy sequence over the passes (the R2 sequence of Roberts), shifted by a hash of the pixel.
-    void jitter(int x, int y, int pass, int frameIndex, double& sx, double& sy) const
+    // Low-discrepancy sequences over the samples (the R2 sequence of Roberts for the image, the R3 one for lens and time),
+    // shifted by a hash of the pixel. A single sample is in the pixel's centre, the lens's middle, the shutter's beginning.
+    RaySample sampleAt(int x, int y, int index, int frameIndex) const
     {
         const std::uint64_t pixel = (static_cast<std::uint64_t>(y) << 32) | static_cast<std::uint32_t>(x);
         const std::uint64_t key = hash64(hash64(settings_.seed, static_cast<std::uint64_t>(frameIndex)), pixel);
-        const double u = unitReal(key) + 0.7548776662466927 * pass;
-        const double v = unitReal(hash64(key)) + 0.5698402909980532 * pass;
-        sx = x + (u - std::floor(u));
-        sy = y + (v - std::floor(v));
+        RaySample sample;
+        sample.key = hash64(key, static_cast<std::uint64_t>(index) + 1);
+        sample.x = x + 0.5;
+        sample.y = y + 0.5;
+        if (settings_.passes <= 1)
+            return sample;
+        const auto at = [index](double shift, double step) {
+            const double v = shift + step * index;
+            return v - std::floor(v);
+        };
+        const std::uint64_t second = hash64(key), third = hash64(second), fourth = hash64(third);
+        sample.x = x + at(unitReal(key), 0.7548776662466927);
+        sample.y = y + at(unitReal(second), 0.5698402909980532);
+        sample.lens = {at(unitReal(third), 0.8191725133961644), at(unitReal(fourth), 0.6710436067037893),
+                       at(unitReal(hash64(fourth)), 0.5497004779019703)};
+        return sample;
+    }
+
+    // The direction number `index` of a set that is distributed by the cosine around a normal.
+    static Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
+    {
+        const std::uint64_t h = hash64(key, static_cast<std::uint64_t>(index));
+        const double u = unitReal(h), angle = 2 * 3.14159265358979323846 * unitReal(hash64(h)), r = std::sqrt(u);
+        const Vec3d n(normal);
+        const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d(0, 1, 0) : Vec3d(1, 0, 0);
+        const Vec3d a = normalize(cross(n, other)), b = cross(n, a);
+        return Vec3(normalize(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
+    }
+
+    // The part of the sky that a hit sees, as far as the rays look. Of everything that the brick has, in its cell or not.
+    float openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const
+    {
+        const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
+        const float reach = ghostReach(scene_, settings_), least = 1e-3f * reach;
+        const std::uint64_t own =
+            hash64(key, (static_cast<std::uint64_t>(hit.geometry) << 32) | hit.primitive);
+        int open = 0;
+        for (int i = 0; i < settings_.aoRays; ++i)
+            open += !surfaces_.occluded(point, cosineDirection(normal, own, i), least, reach);
+        return static_cast<float>(open) / static_cast<float>(settings_.aoRays);
+    }
+
+    static Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+
+    // Diffuse light from a bright sky, over the bounces of one path that begins at a hit. Volumes are left out.
+    Vec3 pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits, std::int64_t& cost) const
+    {
+        Vec3 through = hit.color;
+        const float least = 1e-4f * scene_.bounds.largestExtent();
+        for (int bounce = 0; bounce < settings_.pathBounces; ++bounce) {
+            const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
+            direction = cosineDirection(normal, key, bounce);
+            const Vec3 origin = point + normal * least;
+            surfaces_.intersect(origin, direction, hits);
+            ++cost;
+            if (hits.empty()) {
+                const float sky = 0.9f + 0.5f * direction.y; // brighter above
+                return product(through, Vec3(sky, sky, 1.05f * sky));
+            }
+            hit = hits.front();
+            point = pointAt(origin, direction, hit.t);
+            through = product(through, hit.color);
+        }
+        return Vec3(0, 0, 0);
     }
 
     // The distances at which a ray enters and leaves a box; false if it misses.
@@ -169,8 +314,8 @@ private:
         return enter <= leave;
     }
 
-    Accumulator trace(const Vec3& origin, const Vec3& direction, const Light& light, std::vector<Hit>& hits,
-                      std::vector<VolumeRay>& rays) const
+    Accumulator trace(const Vec3& origin, const Vec3& direction, const Light& light, std::uint64_t key,
+                      std::vector<Hit>& hits, std::vector<VolumeRay>& rays) const
     {
         Accumulator sum;
         const Vec3 inverse(1 / direction.x, 1 / direction.y, 1 / direction.z);
@@ -179,7 +324,18 @@ private:
         const Box reach = cell_.padded(1e-5f * (scene_.bounds.largestExtent() + length(origin)));
         if (!clip(reach, origin, inverse, enter, leave))
             return sum;
+        sum.cost = 1;
         surfaces_.intersect(origin, direction, hits);
+        if (settings_.pathBounces > 0) {
+            if (hits.empty())
+                return sum;
+            const Hit first = hits.front();
+            const Vec3 c =
+                pathLight(first, pointAt(origin, direction, first.t), direction, key, hits, sum.cost);
+            sum.addSurface(first, 1);
+            sum.add(first.t, c.x, c.y, c.z, 1);
+            return sum;
+        }
         const int none = std::numeric_limits<int>::max();
         for (std::size_t i = 0; i < volumes_.size(); ++i) {
             float first = 0, last = 0;
@@ -199,7 +355,12 @@ private:
         auto hit = hits.begin();
         const auto addHits = [&](float before) {
             for (; hit != hits.end() && hit->t <= before; ++hit) {
-                const Vec3 c = light.shade(hit->color, hit->normal, direction) * settings_.opacity;
+                Vec3 c = light.shade(hit->color, hit->normal, direction) * settings_.opacity;
+                if (settings_.aoRays > 0 && settings_.opacity > 0) {
+                    c = c * openness(*hit, pointAt(origin, direction, hit->t), direction, key);
+                    sum.cost += settings_.aoRays;
+                }
+                sum.addSurface(*hit, settings_.opacity);
                 sum.add(hit->t, c.x, c.y, c.z, settings_.opacity);
             }
         };
@@ -227,9 +388,11 @@ private:
                     rays[i].next = k + skip;
                     continue;
                 }
+                ++sum.cost;
                 const TransferFunction::Entry entry = volume.shade(voxel, direction, light);
                 if (entry.alpha > 0) {
                     addHits(t);
+                    sum.albedo = sum.albedo + Vec3(entry.r, entry.g, entry.b) * static_cast<float>(sum.through);
                     sum.add(t, entry.r, entry.g, entry.b, entry.alpha);
                 }
             }

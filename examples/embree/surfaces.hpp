@@ -110,6 +110,38 @@ public:
                    hits.end());
     }
 
+    // Whether anything is on the ray between two distances, in the cell or not. From any thread.
+    bool occluded(const Vec3& origin, const Vec3& direction, float from, float to) const
+    {
+        if (empty())
+            return false;
+        Query query;
+        query.origin = origin;
+        query.direction = direction;
+        query.from = static_cast<double>(from);
+        query.to = static_cast<double>(to);
+        RTCRay ray{};
+        ray.org_x = origin.x;
+        ray.org_y = origin.y;
+        ray.org_z = origin.z;
+        ray.dir_x = direction.x;
+        ray.dir_y = direction.y;
+        ray.dir_z = direction.z;
+        ray.tfar = 1.001f * to; // it is our own distance that decides
+        ray.mask = ~0u;
+#if RTC_VERSION_MAJOR >= 4
+        rtcInitRayQueryContext(&query.context);
+        RTCOccludedArguments arguments;
+        rtcInitOccludedArguments(&arguments);
+        arguments.context = &query.context;
+        rtcOccluded1(scene_.get(), &ray, &arguments);
+#else
+        rtcInitIntersectContext(&query.context);
+        rtcOccluded1(scene_.get(), &query.context, &ray);
+#endif
+        return ray.tfar < 0;
+    }
+
 private:
 #if RTC_VERSION_MAJOR >= 4
     using Context = RTCRayQueryContext;
@@ -122,6 +154,7 @@ private:
         Vec3 origin, direction;
         const Box* cell = nullptr;
         std::vector<Hit>* hits = nullptr;
+        double from = 0, to = 0; // of occluded()
 
         void keep(double distance, const Hit& hit) const
         {
@@ -148,6 +181,7 @@ private:
         rtcSetSharedGeometryBuffer(geometry, RTC_BUFFER_TYPE_INDEX, 0, RTC_FORMAT_UINT3, part.mesh.triangles.data(), 0,
                                    sizeof(Triangle), part.mesh.triangles.size());
         rtcSetGeometryIntersectFilterFunction(geometry, onTriangle);
+        rtcSetGeometryOccludedFilterFunction(geometry, onOccludingTriangle);
         finish(geometry, &part);
     }
 
@@ -157,6 +191,7 @@ private:
         rtcSetGeometryUserPrimitiveCount(geometry, static_cast<unsigned>(part.spheres.size()));
         rtcSetGeometryBoundsFunction(geometry, sphereBounds, nullptr);
         rtcSetGeometryIntersectFunction(geometry, onSphere);
+        rtcSetGeometryOccludedFunction(geometry, onOccludingSphere);
         finish(geometry, &part);
     }
 
@@ -166,6 +201,22 @@ private:
         rtcCommitGeometry(geometry);
         rtcAttachGeometry(scene_.get(), geometry);
         rtcReleaseGeometry(geometry);
+    }
+
+    // Where the ray meets the triangle's plane, as a distance and as weights of the second and third vertex.
+    static double distanceTo(const Query& query, const Mesh& mesh, const Triangle& triangle, double& u, double& v)
+    {
+        const Vec3d a(mesh.positions[triangle[0]]);
+        const Vec3d ab = Vec3d(mesh.positions[triangle[1]]) - a, ac = Vec3d(mesh.positions[triangle[2]]) - a;
+        const Vec3d o(query.origin), d(query.direction);
+        const Vec3d p = cross(d, ac), q = cross(o - a, ab);
+        const double determinant = dot(ab, p);
+        u = determinant != 0 ? dot(o - a, p) / determinant : 0;
+        v = determinant != 0 ? dot(d, q) / determinant : 0;
+        // Seen edge-on the plane says little about where: the point stays in the triangle and so in its box.
+        u = std::clamp(u, 0.0, 1.0);
+        v = std::clamp(v, 0.0, 1.0 - u);
+        return dot(a + ab * u + ac * v - o, d) / dot(d, d);
     }
 
     // Notes the hit and rejects it, so that Embree goes on to the next one.
@@ -179,16 +230,8 @@ private:
         const std::uint32_t index = RTCHitN_primID(arguments->hit, arguments->N, 0);
         const Triangle& triangle = part.mesh.triangles[index];
 
-        const Vec3d a(part.mesh.positions[triangle[0]]);
-        const Vec3d ab = Vec3d(part.mesh.positions[triangle[1]]) - a, ac = Vec3d(part.mesh.positions[triangle[2]]) - a;
-        const Vec3d o(query.origin), d(query.direction);
-        const Vec3d p = cross(d, ac), q = cross(o - a, ab);
-        const double determinant = dot(ab, p);
-        double u = determinant != 0 ? dot(o - a, p) / determinant : 0;
-        double v = determinant != 0 ? dot(d, q) / determinant : 0;
-        // Seen edge-on the plane says little about where: the point stays in the triangle and so in its box.
-        u = std::clamp(u, 0.0, 1.0);
-        v = std::clamp(v, 0.0, 1.0 - u);
+        double u = 0, v = 0;
+        const double distance = distanceTo(query, part.mesh, triangle, u, v);
         const Vec3d normal = Vec3d(part.normals[triangle[0]]) * (1 - u - v) + Vec3d(part.normals[triangle[1]]) * u
                              + Vec3d(part.normals[triangle[2]]) * v;
         Hit hit;
@@ -196,7 +239,39 @@ private:
         hit.primitive = part.primitives[index];
         hit.normal = Vec3(normalize(normal));
         hit.color = part.color;
-        query.keep(dot(a + ab * u + ac * v - o, d) / dot(d, d), hit);
+        query.keep(distance, hit);
+    }
+
+    static void onOccludingTriangle(const RTCFilterFunctionNArguments* arguments)
+    {
+        if (arguments->valid[0] == 0)
+            return;
+        const Query& query = *reinterpret_cast<const Query*>(arguments->context);
+        const BrickMesh& part = *static_cast<const BrickMesh*>(arguments->geometryUserPtr);
+        double u = 0, v = 0;
+        const double distance =
+            distanceTo(query, part.mesh, part.mesh.triangles[RTCHitN_primID(arguments->hit, arguments->N, 0)], u, v);
+        if (!(distance > query.from && distance < query.to))
+            arguments->valid[0] = 0;
+    }
+
+    static void onOccludingSphere(const RTCOccludedFunctionNArguments* arguments)
+    {
+        if (arguments->valid[0] == 0)
+            return;
+        const Query& query = *reinterpret_cast<const Query*>(arguments->context);
+        const auto& part = *static_cast<const BrickSpheres*>(arguments->geometryUserPtr);
+        const Sphere& sphere = part.spheres[arguments->primID];
+        const Vec3d toCenter = Vec3d(sphere.center) - Vec3d(query.origin), d(query.direction);
+        const double radius = static_cast<double>(sphere.radius), dd = dot(d, d), along = dot(toCenter, d) / dd;
+        const Vec3d off = toCenter - d * along;
+        const double rest = radius * radius - dot(off, off);
+        if (!(rest > 0))
+            return;
+        const double half = std::sqrt(rest / dd);
+        for (const double t : {along - half, along + half})
+            if (t > query.from && t < query.to)
+                RTCRayN_tfar(arguments->ray, arguments->N, 0) = -std::numeric_limits<float>::infinity();
     }
 
     static void sphereBounds(const RTCBoundsFunctionArguments* arguments)

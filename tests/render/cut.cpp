@@ -88,6 +88,7 @@ struct Run {
     int threads = 1;
     dfb::OwnerMap ownerMap = dfb::latticeOwner;
     std::function<int(int brick, int bricks, int ranks)> rankOf = example::rankOfBrick;
+    bool ghosts = true;
 };
 
 dfb::FrameBufferConfig configOf(const example::RenderSettings& settings, const Run& run)
@@ -136,12 +137,10 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
                 continue;
             const Box& c = cells[id];
             world.add({id, {{c.lo.x, c.lo.y, c.lo.z}, {c.hi.x, c.hi.y, c.hi.z}}});
-            renderers[id] = std::make_unique<example::Renderer>(loadBrick(scene, id, c), info, settings);
+            const float ghosts = run.ghosts ? ghostReach(info, settings) : 0;
+            renderers[id] = std::make_unique<example::Renderer>(loadBrick(scene, id, c, ghosts), info, settings);
         }
-        const example::Camera view = frameCamera(info, settings, 0);
-        const auto vec = [](const Vec3& v) { return dfb::Vec3{v.x, v.y, v.z}; };
-        const dfb::PerspectiveCamera camera(vec(view.origin), vec(view.origin) + vec(view.forward), vec(view.up),
-                                            settings.view.fieldOfView);
+        const example::FrameCamera camera = frameCamera(info, settings, 0);
         keep(fb, dfb::renderDataParallel(
                      fb, world, camera,
                      [&](const dfb::Brick& brick, auto& tile) { renderers[brick.id]->renderTile(tile, 0); }, params));
@@ -226,6 +225,78 @@ Scene wallScene()
 }
 
 } // namespace
+
+TEST_CASE("Every camera sees the same scene, cut or whole", "[cut]")
+{
+    const Scene scene = example::demoScene(3);
+    for (const auto kind : {example::CameraKind::DepthOfField, example::CameraKind::MotionBlur,
+                            example::CameraKind::Stereo, example::CameraKind::Dome}) {
+        INFO("camera " << static_cast<int>(kind));
+        example::RenderSettings settings = settingsOf(96, 64);
+        settings.passes = 3;
+        settings.view.kind = kind;
+        const Picture whole = render(scene, settings, {1, 0});
+        CHECK(whole.meanAlpha() > 0.003); // the dome sees it from afar
+        settings.view.kind = example::CameraKind::Perspective;
+        CHECK(largestDifference(render(scene, settings, {1, 0}).rgba, whole.rgba) > 0.1f);
+        settings.view.kind = kind;
+        for (const int bricks : {1, 2, 3, 5}) {
+            INFO(bricks << " bricks");
+            const Picture one = render(scene, settings, {1, bricks});
+            checkNoSeams(one, whole);
+            if (bricks != 5)
+                continue;
+            for (const int ranks : {2, 3, 4, 7})
+                checkSame(render(scene, settings, {ranks, bricks}), one);
+        }
+    }
+}
+
+TEST_CASE("Ambient occlusion is the same, cut or whole, and needs its ghosts", "[cut]")
+{
+    const Scene scene = example::demoScene(3);
+    example::RenderSettings settings = settingsOf(96, 64);
+    const Picture plain = render(scene, settings, {1, 0});
+    settings.aoRays = 6;
+    settings.aoDistance = 0.15f;
+    const Picture whole = render(scene, settings, {1, 0});
+    CHECK(largestDifference(plain.rgba, whole.rgba) > 0.1f);
+    for (const int bricks : {1, 2, 5, 8}) {
+        INFO(bricks << " bricks");
+        const Picture one = render(scene, settings, {1, bricks});
+        checkNoSeams(one, whole);
+        for (const int ranks : {2, 3, 4, 7})
+            checkSame(render(scene, settings, {ranks, bricks}), one);
+    }
+    Run without{1, 8};
+    without.ghosts = false;
+    CHECK(largestDifference(render(scene, settings, without).rgba, whole.rgba) > 0.01f);
+}
+
+TEST_CASE("Path tracing converges, and depends on its seed", "[cut]")
+{
+    const Scene scene = wallScene();
+    example::RenderSettings settings = settingsOf(48, 32);
+    settings.pathBounces = 3;
+    settings.passes = 4;
+    const Picture a = render(scene, settings, {1, 0});
+    checkSame(render(scene, settings, {3, 0}), a);
+    settings.seed = 2;
+    const Picture b = render(scene, settings, {1, 0});
+    settings.passes = 256;
+    const Picture converged = render(scene, settings, {1, 0});
+    const auto error = [&](const Picture& p) {
+        double sum = 0;
+        for (std::size_t i = 0; i < p.rgba.size(); ++i)
+            sum += std::pow(static_cast<double>(p.rgba[i]) - static_cast<double>(converged.rgba[i]), 2);
+        return std::sqrt(sum / static_cast<double>(p.rgba.size()));
+    };
+    settings.passes = 64;
+    const Picture better = render(scene, settings, {1, 0});
+    CHECK(a.hash() != b.hash());
+    CHECK(error(b) > 0.01);
+    CHECK(error(better) < 0.5 * error(b)); // a quarter, were the two independent of the converged one
+}
 
 TEST_CASE("Cells tile the bounds and are disjoint", "[cut]")
 {

@@ -1,6 +1,7 @@
 // The data-parallel rendering loop (Listing 3 of the paper): each rank renders its bricks wherever they project.
 #pragma once
 
+#include <dfb/frame.hpp>
 #include <dfb/render/tile_loop.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/render/world.hpp>

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/deep_tile.hpp>
+#include <dfb/frame.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/tile_loop.hpp>
 #include <dfb/render/visibility.hpp>

@@ -76,9 +76,9 @@ FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, 
         break;
     case WorkDistribution::Dynamic:
         loop.guard([&] {
-            for (JobRange jobsHere = frame.nextJobs(count); jobsHere.begin < jobsHere.end && !frame.failed();
-                 jobsHere = frame.nextJobs(count))
-                renderRange(jobsHere.begin, jobsHere.end);
+            for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
+                 range = frame.nextJobs(count))
+                renderRange(range.begin, range.end);
         });
         break;
     case WorkDistribution::Owned: break;

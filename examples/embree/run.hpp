@@ -1,0 +1,16 @@
+// Run: one rank's whole run of dfb_render. There is a source file per transport, as each takes long to compile.
+#pragma once
+
+#include "options.hpp"
+
+#include <dfb/dfb.hpp>
+
+namespace example {
+
+// The exit code, the same on all ranks; what is thrown is not caught.
+int runInproc(const dfb::InprocCommunicator& communicator, const Options& options, int threads);
+#if defined(DFB_HAS_MPI)
+int runMpi(MPI_Comm communicator, const Options& options, int threads);
+#endif
+
+} // namespace example
