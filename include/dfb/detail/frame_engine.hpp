@@ -198,7 +198,15 @@ public:
         std::optional<JobRange> range = jobs_.take(count, rank(), size());
         askForJobs(count); // for the next time, while this one is worked on
         if (!range) {
-            messaging_->wait([this] { return jobs_.ready() || outcome_->failed(); });
+            std::optional<Clock::time_point> deadline;
+            if (params_.timeoutMs > 0)
+                deadline = Clock::now() + std::chrono::milliseconds(params_.timeoutMs);
+            if (!messaging_->wait([this] { return jobs_.ready() || outcome_->failed(); }, deadline)) {
+                ErrorInfo info;
+                info.kind = ErrorKind::TimedOut;
+                info.message = "no word of rank " + std::to_string(jobServer()) + " on what there is to render";
+                failWith(std::make_exception_ptr(Error(std::move(info))));
+            }
             range = jobs_.take(count, rank(), size());
             askForJobs(count);
         }

@@ -14,7 +14,7 @@
 
 namespace dfb {
 
-// A brick of any rank, and the ranks that hold it, ascending.
+// The id and bounds of a brick of any rank, and the ranks that hold it, ascending.
 struct SharedBrick {
     Brick brick;
     std::vector<int> ranks;
