@@ -28,11 +28,14 @@ namespace example {
 inline constexpr dfb::ChannelMask tileChannels = dfb::allChannels & ~dfb::farChannel;
 using Blend = dfb::BasicAlphaBlend<64, tileChannels>;
 using Single = dfb::BasicImageParallel<64, tileChannels>;
+// Samples are saved tile by tile: smaller tiles save more.
+using AdaptiveBlend = dfb::Progressive<dfb::BasicAlphaBlend<16, tileChannels>>;
+using AdaptiveSingle = dfb::Progressive<dfb::BasicImageParallel<16, tileChannels>>;
 
 template <class TileOp>
-inline constexpr bool is_single_v = std::is_same_v<TileOp, Single> || std::is_same_v<TileOp, dfb::Progressive<Single>>;
+inline constexpr bool is_single_v = std::is_same_v<TileOp, Single> || std::is_same_v<TileOp, AdaptiveSingle>;
 template <class TileOp>
-inline constexpr bool is_progressive_v = TileOp::channels == tileChannels && dfb::detail::KeepsState<TileOp>::value;
+inline constexpr bool is_adaptive_v = std::is_same_v<TileOp, AdaptiveBlend> || std::is_same_v<TileOp, AdaptiveSingle>;
 template <class TileOp>
 inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 
@@ -191,7 +194,7 @@ public:
         for (int frame = 0; frame < o_.frames; ++frame) {
             progress.beginFrame(frame);
             tiles_ = samples_ = 0;
-            if constexpr (is_progressive_v<TileOp>)
+            if constexpr (is_adaptive_v<TileOp>)
                 renderAdaptively(frame, world, progress);
             else
                 addReport(renderFrame(frame, world, params_, progress));
@@ -447,8 +450,7 @@ int runWith(const typename Transport::Communicator& communicator, const Options&
         return run(dfb::DeepBlend(), dfb::NoPixelOp());
     const bool isImage = o.mode == Mode::Image;
     if (o.adaptive > 0)
-        return isImage ? run(dfb::Progressive<Single>(), dfb::NoPixelOp())
-                       : run(dfb::Progressive<Blend>(), dfb::NoPixelOp());
+        return isImage ? run(AdaptiveSingle(), dfb::NoPixelOp()) : run(AdaptiveBlend(), dfb::NoPixelOp());
     if (o.wallColumns > 0 && o.exposure > 0)
         return isImage ? run(Single(), ToneMapToWall()) : run(Blend(), ToneMapToWall());
     if (o.wallColumns > 0)
