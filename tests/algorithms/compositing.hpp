@@ -254,8 +254,14 @@ struct Nearest {
     }
 };
 
+// In compositing.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<AuxChannels>(int);
+extern template Result inProcess<AuxImageParallel>(int);
+extern template Result inProcess<Nearest>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("Auxiliary channels come out by their rules, composited", "[compositing]")
 {
     everywhere<algorithms::AuxChannels>();
@@ -270,3 +276,4 @@ TEST_CASE("DepthComposite keeps the nearest input of each pixel", "[compositing]
 {
     everywhere<algorithms::Nearest>();
 }
+#endif

@@ -164,9 +164,14 @@ struct Deep {
     }
 };
 
+// In deep.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<Deep>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("Interleaved bricks are exact with deep fragments, and reported without", "[deep]")
 {
     everywhere<algorithms::Deep>();
 }
+#endif

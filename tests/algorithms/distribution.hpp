@@ -258,8 +258,15 @@ struct Ordered {
     }
 };
 
+// In distribution.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<Mixed>(int);
+extern template Result inProcess<OtherBounds>(int);
+extern template Result inProcess<Unbalanced>(int);
+extern template Result inProcess<Ordered>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("Mixed-parallel rendering gives the data-parallel image, whoever renders what", "[distribution]")
 {
     everywhere<algorithms::Mixed>();
@@ -279,3 +286,4 @@ TEST_CASE("Bricks in a known order blend to the image of sorted ones, without de
 {
     everywhere<algorithms::Ordered>();
 }
+#endif

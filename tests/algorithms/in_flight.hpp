@@ -103,8 +103,13 @@ struct TwoFrameBuffers {
     }
 };
 
+// In in_flight.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<TwoFrames>(int);
+extern template Result inProcess<TwoFrameBuffers>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("Two frames of one framebuffer at once do not disturb each other", "[in_flight]")
 {
     everywhere<algorithms::TwoFrames>();
@@ -114,3 +119,4 @@ TEST_CASE("Two framebuffers with open frames do not disturb each other", "[in_fl
 {
     everywhere<algorithms::TwoFrameBuffers>();
 }
+#endif

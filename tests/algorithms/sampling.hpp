@@ -335,8 +335,17 @@ struct DarkCorners {
     }
 };
 
+// In sampling.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<Distributions>(int);
+extern template Result inProcess<Dynamic>(int);
+extern template Result inProcess<Accumulation>(int);
+extern template Result inProcess<Reset>(int);
+extern template Result inProcess<Adaptive>(int);
+extern template Result inProcess<DarkCorners>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("However the work is distributed, the image is the same and nothing is rendered twice", "[sampling]")
 {
     everywhere<algorithms::Distributions>();
@@ -366,3 +375,4 @@ TEST_CASE("Adaptive sampling does not lose bright corners of dark tiles", "[samp
 {
     everywhere<algorithms::DarkCorners>();
 }
+#endif

@@ -153,8 +153,13 @@ struct WallProgressive {
     }
 };
 
+// In wall.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<Wall>(int);
+extern template Result inProcess<WallProgressive>(int);
+
 } // namespace algorithms
 
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("Each display of a wall shows what the single image has there", "[wall]")
 {
     everywhere<algorithms::Wall>();
@@ -164,3 +169,4 @@ TEST_CASE("A wall shows converged tiles and survives a frame that fails", "[wall
 {
     everywhere<algorithms::WallProgressive>();
 }
+#endif
