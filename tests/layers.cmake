@@ -18,7 +18,7 @@ set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/wire.hpp render/visibil
 set(level_8 pixel_op.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
             detail/final_gather.hpp detail/tile_table.hpp detail/verdict.hpp)
 set(level_9 ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
-            detail/outcome.hpp)
+            detail/frame_figures.hpp detail/outcome.hpp)
 set(level_10 detail/tile_pipeline.hpp)
 set(level_11 detail/frame_engine.hpp)
 set(level_12 display_wall.hpp distributed_framebuffer.hpp)

@@ -1,4 +1,5 @@
-// Camera: a view that orbits around the scene, one position per frame, with or without a lens, motion, two eyes, a dome.
+// Camera: a view that orbits around the scene, one position per frame, with or without a lens, motion, two eyes, a
+// dome.
 #pragma once
 
 #include "vec.hpp"
@@ -12,7 +13,8 @@ namespace example {
 
 enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
 
-// What the user chooses about the view; angles in degrees, lengths in units of the largest extent of what there is to see.
+// What the user chooses about the view; angles in degrees, lengths in units of the largest extent of what there is to
+// see.
 struct View {
     float azimuth = 30;     // around the y axis, from +z towards +x
     float elevation = 20;   // above the xz plane
@@ -79,7 +81,8 @@ public:
             lens_ = dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
             break;
         case CameraKind::MotionBlur:
-            lens_ = dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.center()), {0, 1, 0}, view.shutter);
+            lens_ =
+                dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.center()), {0, 1, 0}, view.shutter);
             break;
         case CameraKind::Stereo:
             lens_ = dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);

@@ -25,14 +25,14 @@ struct Options {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files
     bool fit = true;
     Mode mode = Mode::Data;
-    int ranks = 0;   // threads as ranks, without MPI; 0: MPI's ranks
-    int bricks = 0;  // 0: one per rank
+    int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
+    int bricks = 0;    // 0: one per rank
     int replicate = 2; // ranks that hold each brick, in mixed mode
     Balance balance = Balance::Cost;
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
     int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
-    int threads = 0; // per rank; 0: as many as the machine has
+    int threads = 0;                                 // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
     OwnerMap ownerMap = OwnerMap::Lattice;
 
@@ -197,9 +197,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->transform(detail::choice({"owned", "linear", "round-robin", "dynamic"}))
         ->option_text("owned|linear|round-robin|dynamic")
         ->group(how);
-    app.add_option("--interleave", options.interleave,
-                   "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1. Pixels whose "
-                   "order is undefined are counted, unless --deep has segments enough")
+    app.add_option(
+           "--interleave", options.interleave,
+           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1. Pixels whose "
+           "order is undefined are counted, unless --deep has segments enough")
         ->check(detail::number(1, 4096))
         ->option_text("C")
         ->group(how);
@@ -248,9 +249,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1))
         ->option_text("ERR")
         ->group(picture);
-    app.add_option("--ao", options.ao,
-                   "Ambient occlusion of surfaces and spheres, with N rays per hit; default 0: none. Bricks then hold what "
-                   "is within --ao-distance of them as ghosts")
+    app.add_option(
+           "--ao", options.ao,
+           "Ambient occlusion of surfaces and spheres, with N rays per hit; default 0: none. Bricks then hold what "
+           "is within --ao-distance of them as ghosts")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(picture);
@@ -259,16 +261,18 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(1e-6, 10))
         ->option_text("D")
         ->group(picture);
-    app.add_option("--path", options.path,
-                   "Path-trace opaque surfaces and spheres under a bright sky, N bounces at most; volumes are left out; "
-                   "needs --mode image; default 0: off")
+    app.add_option(
+           "--path", options.path,
+           "Path-trace opaque surfaces and spheres under a bright sky, N bounces at most; volumes are left out; "
+           "needs --mode image; default 0: off")
         ->check(detail::number(0, 1000))
         ->option_text("N")
         ->group(picture);
-    app.add_option("--camera", options.view.kind,
-                   "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
-                   "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
-                   "dof and motion want --spp 16 or more")
+    app.add_option(
+           "--camera", options.view.kind,
+           "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
+           "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
+           "dof and motion want --spp 16 or more")
         ->transform(detail::choice({"perspective", "dof", "motion", "stereo", "dome"}))
         ->option_text("perspective|dof|motion|stereo|dome")
         ->group(picture);
@@ -295,9 +299,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(1, 360))
         ->option_text("DEG")
         ->group(picture);
-    app.add_option("--wall", wall,
-                   "Display wall of COLUMNSxROWS displays, which ranks drive in turn; the image size is that of all, and "
-                   "each display's picture is written to the output file with its number before the ending")
+    app.add_option(
+           "--wall", wall,
+           "Display wall of COLUMNSxROWS displays, which ranks drive in turn; the image size is that of all, and "
+           "each display's picture is written to the output file with its number before the ending")
         ->option_text("CxR")
         ->group(picture);
     app.add_option("--bezel", options.bezel, "Pixels that are hidden between two displays of a wall; default 0")
@@ -368,9 +373,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                    ".instance.png with a colour for each id; default none")
         ->option_text("PREFIX")
         ->group(files);
-    app.add_option("--stats", options.stats,
-                   "Times in ms, bytes, messages, tiles and samples of each rank, samples saved, and a hash of the image; "
-                   "default none")
+    app.add_option(
+           "--stats", options.stats,
+           "Times in ms, bytes, messages, tiles and samples of each rank, samples saved, and a hash of the image; "
+           "default none")
         ->check(detail::ending({".json"}))
         ->option_text("FILE")
         ->group(files);
@@ -405,7 +411,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.interleave > 1 || options.deep > 0, "--exposure", "does not go with --interleave or --deep");
         refuse(options.adaptive > 0, "--wall", "does not go with --adaptive");
         refuse(options.adaptive > 0, "--exposure", "does not go with --adaptive");
-        refuse(options.adaptive > 0 && options.spp < 8, "--adaptive", "needs --spp 8 or more: the most samples per pixel");
+        refuse(options.adaptive > 0 && options.spp < 8, "--adaptive",
+               "needs --spp 8 or more: the most samples per pixel");
         for (const char* file : {"--alpha", "--depth", "--aux"})
             refuse(options.wallColumns > 0, file, "is not written for a wall");
         if (background.size() == 3)

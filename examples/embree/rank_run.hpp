@@ -50,9 +50,9 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     dfb::FrameBufferConfig config;
     config.width = o.width;
     config.height = o.height;
-    config.format = wantsFloat(o)                                              ? dfb::OutputFormat::RGBA32F
+    config.format = wantsFloat(o)                                             ? dfb::OutputFormat::RGBA32F
                     : !o.output.empty() || !o.depth.empty() || !o.aux.empty() ? dfb::OutputFormat::SRGBA8
-                                                                               : dfb::OutputFormat::None;
+                                                                              : dfb::OutputFormat::None;
     config.depth = !o.depth.empty();
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
@@ -234,7 +234,8 @@ private:
             if (!path->empty())
                 all.push_back(*path);
         if (!o_.aux.empty())
-            for (const char* ending : {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
+            for (const char* ending :
+                 {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
                 all.push_back(o_.aux + ending);
         return all;
     }
@@ -279,8 +280,9 @@ private:
                                       : o_.distribution == Distribution::Dynamic    ? dfb::WorkDistribution::Dynamic
                                                                                     : dfb::WorkDistribution::Owned;
             report = dfb::renderImageParallel(
-                *fb_, distribution, [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); },
-                params, {}, pixelData);
+                *fb_, distribution,
+                [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, {},
+                pixelData);
         } else if (!shared_) {
             report = dfb::renderDataParallel(*fb_, world, camera, renderBrick, params, {}, pixelData);
         } else if (o_.balance == Balance::Cost) {

@@ -73,7 +73,8 @@ inline RankScene loadRankScene(const Options& options, int rank, int rankCount)
     const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
     for (int brick = 0; brick < brickCount; ++brick) {
         Box bounds;
-        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size(); c += static_cast<std::size_t>(brickCount))
+        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
+             c += static_cast<std::size_t>(brickCount))
             bounds.grow(cells[c]);
         result.bounds.push_back(bounds);
         if (!isImage && !holdsBrick(rank, brick, brickCount, rankCount, copies))
@@ -81,7 +82,8 @@ inline RankScene loadRankScene(const Options& options, int rank, int rankCount)
         const auto id = static_cast<std::uint32_t>(brick);
         result.brickIds.push_back(id);
         result.renderers.emplace_back();
-        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size(); c += static_cast<std::size_t>(brickCount))
+        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
+             c += static_cast<std::size_t>(brickCount))
             result.renderers.back().emplace_back(loadBrick(scene, id, cells[c], ghosts), result.info, settings);
     }
     return result;

@@ -25,9 +25,9 @@ struct RenderSettings {
     int frames = 1;            // of one turn of the camera
     int passes = 1;            // samples per pixel
     std::uint64_t seed = 0;
-    int aoRays = 0;           // of ambient occlusion, per hit of a surface or sphere; 0: none
-    float aoDistance = 0.1f;  // how far they look, in units of the scene's largest extent
-    int pathBounces = 0;      // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
+    int aoRays = 0;             // of ambient occlusion, per hit of a surface or sphere; 0: none
+    float aoDistance = 0.1f;    // how far they look, in units of the scene's largest extent
+    int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
     float opacity = 0.6f;       // of a surface or sphere
     float earlyTermination = 0; // a ray ends when less than this passes through it; 0: never
     View view;
@@ -72,9 +72,9 @@ public:
             volumes_.emplace_back(std::move(volume), scene.step);
     }
 
-    // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and pixels
-    // where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and one for each
-    // camera ray that comes near. From any number of threads.
+    // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and
+    // pixels where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and
+    // one for each camera ray that comes near. From any number of threads.
     template <class Tile>
     std::int64_t renderTile(Tile& tile, int frameIndex) const
     {
@@ -227,8 +227,9 @@ private:
         return cost;
     }
 
-    // Low-discrepancy sequences over the samples (the R2 sequence of Roberts for the image, the R3 one for lens and time),
-    // shifted by a hash of the pixel. A single sample is in the pixel's centre, the lens's middle, the shutter's beginning.
+    // Low-discrepancy sequences over the samples (the R2 sequence of Roberts for the image, the R3 one for lens and
+    // time), shifted by a hash of the pixel. A single sample is in the pixel's centre, the lens's middle, the shutter's
+    // beginning.
     RaySample sampleAt(int x, int y, int index, int frameIndex) const
     {
         const std::uint64_t pixel = (static_cast<std::uint64_t>(y) << 32) | static_cast<std::uint32_t>(x);
@@ -262,13 +263,13 @@ private:
         return Vec3(normalize(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
     }
 
-    // The part of the sky that a hit sees, as far as the rays look. Of everything that the brick has, in its cell or not.
+    // The part of the sky that a hit sees, as far as the rays look. Of everything that the brick has, in its cell or
+    // not.
     float openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const
     {
         const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
         const float reach = ghostReach(scene_, settings_), least = 1e-3f * reach;
-        const std::uint64_t own =
-            hash64(key, (static_cast<std::uint64_t>(hit.geometry) << 32) | hit.primitive);
+        const std::uint64_t own = hash64(key, (static_cast<std::uint64_t>(hit.geometry) << 32) | hit.primitive);
         int open = 0;
         for (int i = 0; i < settings_.aoRays; ++i)
             open += !surfaces_.occluded(point, cosineDirection(normal, own, i), least, reach);
@@ -278,7 +279,8 @@ private:
     static Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
     // Diffuse light from a bright sky, over the bounces of one path that begins at a hit. Volumes are left out.
-    Vec3 pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits, std::int64_t& cost) const
+    Vec3 pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits,
+                   std::int64_t& cost) const
     {
         Vec3 through = hit.color;
         const float least = 1e-4f * scene_.bounds.largestExtent();
@@ -330,8 +332,7 @@ private:
             if (hits.empty())
                 return sum;
             const Hit first = hits.front();
-            const Vec3 c =
-                pathLight(first, pointAt(origin, direction, first.t), direction, key, hits, sum.cost);
+            const Vec3 c = pathLight(first, pointAt(origin, direction, first.t), direction, key, hits, sum.cost);
             sum.addSurface(first, 1);
             sum.add(first.t, c.x, c.y, c.z, 1);
             return sum;

@@ -341,8 +341,8 @@ inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reac
 } // namespace detail
 
 // What a rank keeps of the scene for one cell. Volumes are read from their source here, and only as far as needed;
-// the scene itself can go when all bricks are loaded. `ghosts`: meshes and spheres are kept as far as that beyond the cell,
-// for secondary rays.
+// the scene itself can go when all bricks are loaded. `ghosts`: meshes and spheres are kept as far as that beyond the
+// cell, for secondary rays.
 inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
 {
     Brick brick;
@@ -350,7 +350,8 @@ inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, fl
     brick.cell = cell;
     // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
     const Box reach = cell.padded(
-        ghosts + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
+        ghosts
+        + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
     for (const VolumeObject& object : scene.volumes)
         detail::addVolume(brick, object);
     for (const MeshObject& object : scene.meshes)

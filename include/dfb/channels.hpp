@@ -13,9 +13,10 @@ using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
 // Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
 inline constexpr ChannelMask depthChannel = 2;
-// Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they come
-// out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
-inline constexpr ChannelMask normalChannel = 4;       // 3 floats times alpha: over; comes out shorter than 1 where normals differ
+// Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they
+// come out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
+inline constexpr ChannelMask normalChannel =
+    4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
 inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the input that gives the depth
 inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the nearest input with alpha > 0 that has one

@@ -50,7 +50,7 @@ struct CompositeRow {
     std::vector<float> depth;          // width: of the nearest layer with alpha > 0, else +infinity
     AuxPixels aux;
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
-    std::vector<float> reach;             // width, or empty
+    std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
 
     // `wanted`: of the auxiliary channels.
@@ -116,7 +116,8 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     blend(row.aux.normal, aux.at[detail::Normal]);
     blend(row.aux.albedo, aux.at[detail::Albedo]);
     const auto isNearest = [&](int i) { // of those whose alpha counts
-        return layer.color[4 * i + 3] > 0.0f && layer.depth && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
+        return layer.color[4 * i + 3] > 0.0f && layer.depth
+               && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
     };
     if (!row.aux.position.empty() && aux.at[detail::Position]) {
         const float* from = detail::floatsOf(aux.at[detail::Position]);
@@ -246,7 +247,8 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
 }
 
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there. Nothing may be in the row yet.
+// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there. Nothing may be in the row
+// yet.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     for (int i = 0; i < count; ++i) {

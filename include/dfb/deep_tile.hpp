@@ -19,12 +19,12 @@ struct Segment {
     float depth = 0, farDepth = 0;
 };
 
-// At most `maxSegments` are kept per pixel, so memory and messages are bounded: of one more, the two neighbours are merged
-// that change the pixel least. To merge two is exact unless another brick has something between them; then what lies
-// between, (c', a'), is blended behind both, and the pixel is off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of
-// the two and T gets through all that the brick has before it. That is at most T max(a2, |c2|) for colours with
-// c' <= a' <= 1, and the sum of it over all merges bounds the error of a pixel: errorBound(). Where c' is more than a',
-// multiply by the largest c' / a'.
+// At most `maxSegments` are kept per pixel, so memory and messages are bounded: of one more, the two neighbours are
+// merged that change the pixel least. To merge two is exact unless another brick has something between them; then what
+// lies between, (c', a'), is blended behind both, and the pixel is off by T |c' a2 - c2 a'|, where (c2, a2) is the
+// farther of the two and T gets through all that the brick has before it. That is at most T max(a2, |c2|) for colours
+// with c' <= a' <= 1, and the sum of it over all merges bounds the error of a pixel: errorBound(). Where c' is more
+// than a', multiply by the largest c' / a'.
 class DeepTile {
 public:
     explicit DeepTile(int maxSegments) : maxSegments_(std::max(1, maxSegments)) {}
@@ -46,8 +46,8 @@ public:
 
     const TileHeader& header() const noexcept { return header_; }
 
-    // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any order
-    // and should not overlap. One that has no colour and no alpha is left out.
+    // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any
+    // order and should not overlap. One that has no colour and no alpha is left out.
     void add(int x, int y, const Segment& segment)
     {
         if (segment.rgba == std::array<float, 4>{})
@@ -88,7 +88,8 @@ public:
                                           + static_cast<std::size_t>(x);
                 if (layer >= counts_[pixel])
                     continue;
-                const Segment& s = segments_[pixel * static_cast<std::size_t>(maxSegments_) + static_cast<std::size_t>(layer)];
+                const Segment& s =
+                    segments_[pixel * static_cast<std::size_t>(maxSegments_) + static_cast<std::size_t>(layer)];
                 std::copy(s.rgba.begin(), s.rgba.end(), tile.pixel(x, y));
                 tile.depth[y * TileType::size + x] = s.depth;
                 tile.farDepth[y * TileType::size + x] = s.farDepth;

@@ -66,8 +66,8 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them at
-// most `poolBytes` each.
+// Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them
+// at most `poolBytes` each.
 template <class Transport = MpiTransport>
 class DisplayWall final : private detail::MessageHandler {
 public:
@@ -87,8 +87,7 @@ public:
         detail::Agreement mine{true, describe()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
             mine = {false, wrong};
-        const auto all =
-            detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
+        const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         if (!all.fine) {
             messaging_.reset();
             throw InvalidArgument(all.text);
@@ -115,9 +114,9 @@ public:
         return config;
     }
 
-    // Collective, after the frame of that number has ended well on all ranks: returns when all displays have it, which is
-    // the moment to show it on all of them. If some display has not got all of it within `timeoutMs` (0: no limit), throws
-    // Error (TimedOut), the same on all ranks. Throws TransportError.
+    // Collective, after the frame of that number has ended well on all ranks: returns when all displays have it, which
+    // is the moment to show it on all of them. If some display has not got all of it within `timeoutMs` (0: no limit),
+    // throws Error (TimedOut), the same on all ranks. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
         messaging_->messenger().expectMessages(true);
@@ -134,8 +133,7 @@ public:
             throw;
         }
         detail::Agreement mine{complete, complete ? "" : missing};
-        const auto all =
-            detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
+        const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         messaging_->messenger().expectMessages(false);
         const std::lock_guard<std::mutex> lock(mutex_);
         if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
@@ -175,12 +173,10 @@ public:
             header.kind = detail::MessageKind::FinishedTiles;
             header.receiver = messaging_->address();
             header.number = tile.frame;
-            const PartHeader where{d,
-                                   {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0,
-                                    part.y1 - display.y0}};
+            const PartHeader where{
+                d, {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0, part.y1 - display.y0}};
             const auto width = static_cast<std::size_t>(part.width());
-            Buffer message =
-                pool_->acquire(prefix + width * static_cast<std::size_t>(part.height()) * pixelBytes);
+            Buffer message = pool_->acquire(prefix + width * static_cast<std::size_t>(part.height()) * pixelBytes);
             std::memcpy(message.data(), &header, sizeof header);
             std::memcpy(message.data() + sizeof header, &where, sizeof where);
             std::byte* out = message.data() + prefix;
@@ -280,7 +276,8 @@ private:
         const Region whole{0, 0, layout_.displayWidth, layout_.displayHeight}, part = where.region;
         if (shown_.count(where.display) == 0 || part.empty() || intersection(whole, part) != part)
             detail::failMalformed("a part of a display that this rank does not drive, or outside of it");
-        const std::size_t pixelBytes = bytesPerPixel(format_), rowBytes = static_cast<std::size_t>(part.width()) * pixelBytes;
+        const std::size_t pixelBytes = bytesPerPixel(format_),
+                          rowBytes = static_cast<std::size_t>(part.width()) * pixelBytes;
         if (message.size() != prefix + rowBytes * static_cast<std::size_t>(part.height()))
             detail::failMalformed("a part of a display has the wrong size");
         std::shared_ptr<Pictures> pictures; // finish() may drop those of a frame that failed
@@ -294,8 +291,10 @@ private:
         std::byte* pixels = picture.image.bytes();
         const std::byte* in = message.data() + prefix;
         for (int y = part.y0; y < part.y1; ++y, in += rowBytes)
-            std::memcpy(pixels + (static_cast<std::size_t>(y) * static_cast<std::size_t>(layout_.displayWidth)
-                                  + static_cast<std::size_t>(part.x0)) * pixelBytes,
+            std::memcpy(pixels
+                            + (static_cast<std::size_t>(y) * static_cast<std::size_t>(layout_.displayWidth)
+                               + static_cast<std::size_t>(part.x0))
+                                  * pixelBytes,
                         in, rowBytes);
         bool complete = false;
         {
@@ -326,9 +325,9 @@ private:
         if (shown_.empty())
             return true;
         const auto found = coming_.find(frame);
-        return found != coming_.end()
-               && std::all_of(found->second->begin(), found->second->end(),
-                              [](const auto& p) { return p.second.pixelsLeft == 0; });
+        return found != coming_.end() && std::all_of(found->second->begin(), found->second->end(), [](const auto& p) {
+                   return p.second.pixelsLeft == 0;
+               });
     }
     bool hasError()
     {
@@ -358,8 +357,8 @@ private:
 
     std::mutex mutex_;
     std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels
-    std::int64_t last_ = 0;                   // finished; under mutex_
-    std::string error_;                       // under mutex_
+    std::int64_t last_ = 0;                                    // finished; under mutex_
+    std::string error_;                                        // under mutex_
 
     std::unique_ptr<detail::Messaging<Transport>> messaging_; // last: its tasks use the others
 };

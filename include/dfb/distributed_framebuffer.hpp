@@ -62,18 +62,18 @@ public:
 
         // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
         // children that these announce need no declaration; it may say so after it sent some. A rank without any calls
-        // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing. Throws
-        // InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
+        // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing.
+        // Throws InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
         bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
 
         // How many samples a tile gets in this frame, and which.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
-        // A range of jobs for this rank out of [0, count), all of which every rank could do; over all ranks each comes up
-        // once. Empty: there are no more, or the frame has failed. `count` must be the same on all ranks and calls; only by
-        // the thread that began the frame, and not in a task: waits for the answer of another rank, which is asked while
-        // the range before is worked on. Throws TransportError.
+        // A range of jobs for this rank out of [0, count), all of which every rank could do; over all ranks each comes
+        // up once. Empty: there are no more, or the frame has failed. `count` must be the same on all ranks and calls;
+        // only by the thread that began the frame, and not in a task: waits for the answer of another rank, which is
+        // asked while the range before is worked on. Throws TransportError.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds to what FrameReport::figures has for this key, on all ranks. For what a renderer measures and all ranks
@@ -150,8 +150,8 @@ public:
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be frames
-    // in flight. Empty elsewhere.
+    // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be
+    // frames in flight. Empty elsewhere.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
@@ -160,8 +160,8 @@ public:
     bool poll() { return engine().poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
-    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` can not be. Frames begin and
-    // end in the same order on all ranks; the oldest must end before one too many begins.
+    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` can not be. Frames begin
+    // and end in the same order on all ranks; the oldest must end before one too many begins.
     Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {

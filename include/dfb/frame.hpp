@@ -29,7 +29,7 @@ struct FrameBufferConfig {
     bool depth = false;                        // the image has depth as well
     ChannelMask aux = 0;                       // and these of imageAuxChannels, which the tile operation must have
     int displayRank = 0;
-    int framesInFlight = 1; // the most that may be open at once; memory grows with it
+    int framesInFlight = 1;               // the most that may be open at once; memory grows with it
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
     GatherMode gather = GatherMode::Batches;
@@ -52,8 +52,8 @@ using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 struct FrameParams {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
     int passes = 1;                              // samples a pixel, each a pass
-    // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile operation
-    // that keepsState may a tile have none or not begin with sample 0.
+    // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile
+    // operation that keepsState may a tile have none or not begin with sample 0.
     SamplePlan samples;
     std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
@@ -84,17 +84,17 @@ struct Figure {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    double totalMs = 0;                // begin() to the return of end(), this rank
-    double renderMs = 0;               // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0;  // the call of end() to its return, this rank
-    double renderMsMax = 0;            // all: the longest renderMs
-    std::int64_t bytesSent = 0;        // all: message bytes to other ranks, without the transport's own
-    std::int64_t messagesSent = 0;     // all
-    std::int64_t tilesTotal = 0;       // in the image
-    std::int64_t tilesTouched = 0;     // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;  // all: input pixels with an infinity or NaN (see detail/wire.hpp)
+    double totalMs = 0;                    // begin() to the return of end(), this rank
+    double renderMs = 0;                   // begin() to the call of end(), this rank
+    double compositingOverheadMs = 0;      // the call of end() to its return, this rank
+    double renderMsMax = 0;                // all: the longest renderMs
+    std::int64_t bytesSent = 0;            // all: message bytes to other ranks, without the transport's own
+    std::int64_t messagesSent = 0;         // all
+    std::int64_t tilesTotal = 0;           // in the image
+    std::int64_t tilesTouched = 0;         // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (see detail/wire.hpp)
     std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
-    double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
+    double mergeErrorBound = 0;            // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key
     std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict

@@ -167,12 +167,12 @@ public:
         require(format_ == OutputFormat::RGBA32F, "float pixels");
         return reinterpret_cast<const float*>(bytes());
     }
-    // One float a pixel, +infinity where nothing was hit. This and the next throw InvalidArgument if the channel was not
-    // asked for. What they mean where inputs were blended: channels.hpp.
+    // One float a pixel, +infinity where nothing was hit. This and the next throw InvalidArgument if the channel was
+    // not asked for. What they mean where inputs were blended: channels.hpp.
     const float* depth() const { return detail::floatsOf(plane(detail::Depth, "depth")); }
-    const float* normal() const { return detail::floatsOf(plane(detail::Normal, "normals")); }         // 3 a pixel
-    const float* albedo() const { return detail::floatsOf(plane(detail::Albedo, "albedo")); }          // 3 a pixel
-    const float* position() const { return detail::floatsOf(plane(detail::Position, "positions")); }   // 3 a pixel
+    const float* normal() const { return detail::floatsOf(plane(detail::Normal, "normals")); }       // 3 a pixel
+    const float* albedo() const { return detail::floatsOf(plane(detail::Albedo, "albedo")); }        // 3 a pixel
+    const float* position() const { return detail::floatsOf(plane(detail::Position, "positions")); } // 3 a pixel
     // noId where there is none.
     const std::uint32_t* primitiveId() const { return detail::idsOf(plane(detail::PrimitiveId, "primitive ids")); }
     const std::uint32_t* instanceId() const { return detail::idsOf(plane(detail::InstanceId, "instance ids")); }

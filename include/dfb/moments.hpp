@@ -8,9 +8,9 @@
 namespace dfb {
 
 // Of samples of 4 channels: their number, their sum, and the sum over the channels of squared deviations from the mean
-// (M2), merged by the pairwise formula of Chan, Golub and LeVeque (1979). For n samples that are floats the mean is within
-// n * 2^-53 of exact, relative to the mean of |x|: for 10^7 of them far below the last bit of a float. M2 is free of
-// cancellation, however large the mean is beside the spread.
+// (M2), merged by the pairwise formula of Chan, Golub and LeVeque (1979). For n samples that are floats the mean is
+// within n * 2^-53 of exact, relative to the mean of |x|: for 10^7 of them far below the last bit of a float. M2 is
+// free of cancellation, however large the mean is beside the spread.
 struct Moments {
     std::int64_t count = 0;
     std::array<double, 4> sum{};

@@ -92,7 +92,9 @@ struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
     ConstPlanes planes() const noexcept
     {
         ConstPlanes p;
-        const auto set = [&p](Channel channel, const void* data) { p.at[channel] = static_cast<const std::byte*>(data); };
+        const auto set = [&p](Channel channel, const void* data) {
+            p.at[channel] = static_cast<const std::byte*>(data);
+        };
         set(Color, color);
         if constexpr (hasChannel(Channels, Depth))
             set(Depth, this->depth);
@@ -114,8 +116,8 @@ struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
 
 } // namespace detail
 
-// Pixel (x, y) of the tile, counted from region.x0 and region.y0, is pixel i = y * size + x: color[4 * i], and as far as
-// the tile has the channels depth[i], normal[3 * i], albedo[3 * i], position[3 * i], primitiveId[i], instanceId[i],
+// Pixel (x, y) of the tile, counted from region.x0 and region.y0, is pixel i = y * size + x: color[4 * i], and as far
+// as the tile has the channels depth[i], normal[3 * i], albedo[3 * i], position[3 * i], primitiveId[i], instanceId[i],
 // farDepth[i]. Pixels outside the region are never read.
 template <ChannelMask Channels, int Size>
 struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {

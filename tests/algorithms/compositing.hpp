@@ -121,11 +121,14 @@ inline std::size_t wrongAux(const scene::Scene& s, const dfb::Image& image)
     std::size_t wrong = 0;
     for (int y = 0; y < s.height; ++y)
         for (int x = 0; x < s.width; ++x) {
-            const auto i = static_cast<std::size_t>(y) * static_cast<std::size_t>(s.width) + static_cast<std::size_t>(x);
+            const auto i =
+                static_cast<std::size_t>(y) * static_cast<std::size_t>(s.width) + static_cast<std::size_t>(x);
             const AuxPixel p = auxReference(s, x, y);
             for (std::size_t c = 0; c < 3; ++c) {
                 // Normals have either sign: what cancels is off by the rounding of what was summed.
-                const auto expected = [&](Exact sum) { return p.weight > 0 ? static_cast<double>(sum / p.weight) : 0.0; };
+                const auto expected = [&](Exact sum) {
+                    return p.weight > 0 ? static_cast<double>(sum / p.weight) : 0.0;
+                };
                 const auto off = [](float got, double want) {
                     return !(std::fabs(static_cast<double>(got) - want) <= 1e-12 + 0x1p-24 * std::fabs(want));
                 };
@@ -223,7 +226,7 @@ struct Nearest {
         Result result;
         const scene::Scene s = scene::makeScene(8, 9, 97, 61, 2);
         dfb::DistributedFrameBuffer<dfb::BasicDepthComposite<16>, dfb::NoPixelOp, Transport> fb(communicator,
-                                                                                                 configOf(s, 2));
+                                                                                                configOf(s, 2));
         const auto report = dfb::renderDataParallel(
             fb, dfb::World(bricksOf(s, fb.rank(), fb.size(), 3)), scene::FlatCamera(),
             [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOf(s));

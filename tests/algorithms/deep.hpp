@@ -21,7 +21,10 @@ struct Interleaved {
         return scene::mix(scene::mix(static_cast<std::uint64_t>(slot) * 17 + static_cast<std::uint64_t>(pass))
                           + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
     }
-    int brickAt(int x, int y, int slot, int pass) const { return static_cast<int>(hashAt(x, y, slot, pass) % 4); } // 3: nobody
+    int brickAt(int x, int y, int slot, int pass) const
+    {
+        return static_cast<int>(hashAt(x, y, slot, pass) % 4);
+    } // 3: nobody
     dfb::Segment segmentAt(int x, int y, int slot, int pass) const
     {
         const std::uint64_t h = hashAt(x, y, slot, pass);
@@ -37,7 +40,8 @@ struct Interleaved {
         dfb::World mine;
         for (int b = 0; b < bricks; ++b) // their bounds are all the same
             if (b % size == rank)
-                mine.add({static_cast<std::uint32_t>(b + 5), {{0, 0, 0}, {static_cast<float>(width), static_cast<float>(height), 1}}});
+                mine.add({static_cast<std::uint32_t>(b + 5),
+                          {{0, 0, 0}, {static_cast<float>(width), static_cast<float>(height), 1}}});
         return mine;
     }
 

@@ -63,8 +63,8 @@ struct Mixed {
                 return 1.0;
             };
             const auto renderedOnce = [&](const std::string& what) {
-                const std::int64_t pairs = static_cast<std::int64_t>(
-                    visibleTiles(world, scene::FlatCamera(), fb.layout()).size());
+                const std::int64_t pairs =
+                    static_cast<std::int64_t>(visibleTiles(world, scene::FlatCamera(), fb.layout()).size());
                 const std::int64_t all =
                     fb.allReduce({static_cast<std::int64_t>(rendered.size())}, decltype(fb)::Reduce::Sum).front();
                 result.expect(all == 3 * pairs, what + ": " + std::to_string(all) + " tiles of bricks rendered of "
@@ -73,7 +73,8 @@ struct Mixed {
             };
             for (const bool share : {false, true}) {
                 dfb::RoundRobinBricks owner{share};
-                const auto report = dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
+                const auto report =
+                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
                 result.expect(report.figures.empty(), "costs that nobody wants");
                 check(report, name + ", round robin");
                 renderedOnce(name + ", round robin");
@@ -122,7 +123,8 @@ struct Unbalanced {
         scene::Scene s = scene::makeScene(0, 1, 256, 256, 1);
         const int size = std::max(2, communicatorSize<Transport>(communicator));
         for (int i = 0; i < size; ++i) { // beside each other, the first the largest
-            const float x0 = i == 0 ? 0 : 64.0f + 8.0f * static_cast<float>(i - 1), x1 = 64.0f + 8.0f * static_cast<float>(i);
+            const float x0 = i == 0 ? 0 : 64.0f + 8.0f * static_cast<float>(i - 1),
+                        x1 = 64.0f + 8.0f * static_cast<float>(i);
             s.bricks.push_back({static_cast<std::uint32_t>(i), {{x0, 0, 0}, {x1, 96, 1}}});
         }
         BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
@@ -137,7 +139,8 @@ struct Unbalanced {
         const auto slowest = [&] {
             return static_cast<double>(fb.allReduce({samples.exchange(0)}, decltype(fb)::Reduce::Max).front());
         };
-        dfb::renderDataParallel(fb, replicated(s.bricks, fb.rank(), fb.size(), 1), scene::FlatCamera(), render, paramsOf(s));
+        dfb::renderDataParallel(fb, replicated(s.bricks, fb.rank(), fb.size(), 1), scene::FlatCamera(), render,
+                                paramsOf(s));
         const double dataParallel = slowest();
         const dfb::SharedWorld world(fb, replicated(s.bricks, fb.rank(), fb.size(), 2));
         dfb::RoundRobinBricks inTurn;
@@ -150,7 +153,8 @@ struct Unbalanced {
         const double measured = slowest();
         if (fb.size() > 1) {
             const std::string text = std::to_string(dataParallel) + " samples on the slowest rank data-parallel, "
-                                     + std::to_string(roundRobin) + " dealt out, " + std::to_string(measured) + " by cost";
+                                     + std::to_string(roundRobin) + " dealt out, " + std::to_string(measured)
+                                     + " by cost";
             result.expect(measured <= 0.65 * dataParallel, text);
             result.expect(measured < roundRobin, text);
         }
@@ -232,7 +236,8 @@ struct Ordered {
         dfb::RoundRobinBricks owner{copies > 1};
         dfb::FrameReport report;
         if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
-            report = dfb::renderOrdered(fb, world, camera, dfb::visibilityOrder(world, eye), owner, renderBrick, params);
+            report =
+                dfb::renderOrdered(fb, world, camera, dfb::visibilityOrder(world, eye), owner, renderBrick, params);
         else
             report = dfb::renderMixedParallel(fb, world, camera, owner, renderBrick, params);
         bytes = report.bytesSent;

@@ -84,19 +84,23 @@ struct TwoFrameBuffers {
         Result result;
         const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
         const scene::Scene a = scene::makeScene(5, 3), b = scene::makeScene(1, 4, 128, 33);
-        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> blend(messenger, configOf(a, 1));
-        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(messenger, configOf(b, 1));
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> blend(messenger,
+                                                                                               configOf(a, 1));
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(messenger,
+                                                                                                   configOf(b, 1));
         for (int round = 0; round < 3; ++round) {
             auto frame = blend.begin(paramsOf(a));
             sendAll(blend, frame, a, false);
             const auto other = dfb::renderImageParallel(
-                single, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(b, b.bricks[0], tile); }, paramsOf(b));
+                single, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(b, b.bricks[0], tile); },
+                paramsOf(b));
             sendAll(blend, frame, a, true);
             const auto report = frame.end();
             if (!blend.isDisplayRank())
                 continue;
             const scene::Picture pictureA(blend.image(), report), pictureB(single.image(), other);
-            result.expect(wrongValues(pictureA, referenceOf(a)) == 0 && wrongValues(pictureB, referenceOf(b)) == 0, "values");
+            result.expect(wrongValues(pictureA, referenceOf(a)) == 0 && wrongValues(pictureB, referenceOf(b)) == 0,
+                          "values");
             result.hash = pictureA.hash() ^ 3 * pictureB.hash();
         }
         return result;

@@ -42,7 +42,7 @@ struct Distributions {
         Result result;
         const scene::Scene s = wholeScene(97, 61, 3);
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>, dfb::NoPixelOp, Transport> fb(communicator,
-                                                                                                configOf(s, 2));
+                                                                                               configOf(s, 2));
         for (const auto distribution : {WorkDistribution::Owned, WorkDistribution::Linear, WorkDistribution::RoundRobin,
                                         WorkDistribution::Dynamic, WorkDistribution::Dynamic}) {
             const std::string name = "distribution " + std::to_string(static_cast<int>(distribution));
@@ -58,7 +58,8 @@ struct Distributions {
             const std::int64_t most = fb.allReduce({rendered.load()}, decltype(fb)::Reduce::Max).front();
             result.expect(all == 28 * 3, name + ": " + std::to_string(all) + " tiles rendered");
             if (distribution == WorkDistribution::Linear || distribution == WorkDistribution::RoundRobin)
-                result.expect(most == (84 + fb.size() - 1) / fb.size(), name + ": " + std::to_string(most) + " on a rank");
+                result.expect(most == (84 + fb.size() - 1) / fb.size(),
+                              name + ": " + std::to_string(most) + " on a rank");
             if (!fb.isDisplayRank())
                 continue;
             const scene::Picture picture(fb.image(), report);
@@ -70,8 +71,8 @@ struct Distributions {
     }
 };
 
-// Rank 0 is stuck in its first tile until the others have done more than their fair share of all, which they only can if
-// what is handed out on demand goes to them. (Over MPI ranks can not see each other: there nobody is stuck.)
+// Rank 0 is stuck in its first tile until the others have done more than their fair share of all, which they only can
+// if what is handed out on demand goes to them. (Over MPI ranks can not see each other: there nobody is stuck.)
 struct Dynamic {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -80,7 +81,7 @@ struct Dynamic {
         Result result;
         const scene::Scene s = wholeScene(160, 160, 2);
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>, dfb::NoPixelOp, Transport> fb(communicator,
-                                                                                                configOf(s, 1));
+                                                                                               configOf(s, 1));
         const int jobs = fb.layout().tileCount() * s.passes, fairShare = jobs - jobs / fb.size();
         const bool isStuck = fb.rank() == 0 && fb.size() > 1 && std::is_same_v<Transport, dfb::InprocTransport>;
         ofOthers = 0;
@@ -142,8 +143,8 @@ struct Accumulation {
                         [&](const dfb::Brick& b, auto& tile) { renderSample(s, b, tile); }, params);
                 else
                     report = dfb::renderImageParallel(
-                        fb, dfb::WorkDistribution::RoundRobin,
-                        [&](auto& tile) { renderSample(s, s.bricks[0], tile); }, params);
+                        fb, dfb::WorkDistribution::RoundRobin, [&](auto& tile) { renderSample(s, s.bricks[0], tile); },
+                        params);
                 if (wanted == 4)
                     result.expect(report.tilesTouched <= tiles - (tiles + 2) / 3,
                                   std::to_string(report.tilesTouched) + " tiles touched");
@@ -218,9 +219,9 @@ struct NoisyScene {
     void render(Tile& tile) const
     {
         tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
-            const std::uint64_t h = scene::mix(scene::mix(static_cast<std::uint64_t>(y) * 65536
-                                                          + static_cast<std::uint64_t>(x))
-                                               + static_cast<std::uint64_t>(tile.sample));
+            const std::uint64_t h =
+                scene::mix(scene::mix(static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x))
+                           + static_cast<std::uint64_t>(tile.sample));
             const bool lit = static_cast<double>(h >> 11) * 0x1p-53 < probability(x, y);
             rgba[0] = rgba[1] = rgba[2] = lit ? 1.0f : 0.0f;
             rgba[3] = 1;
@@ -235,8 +236,10 @@ struct NoisyScene {
         for (int y = region.y0; y < region.y1; ++y)
             for (int x = region.x0; x < region.x1; ++x)
                 for (int c = 0; c < 3; ++c) {
-                    const std::size_t i = static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x);
-                    const double off = static_cast<double>(image.rgba32f()[4 * i + static_cast<std::size_t>(c)]) - probability(x, y);
+                    const std::size_t i =
+                        static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x);
+                    const double off =
+                        static_cast<double>(image.rgba32f()[4 * i + static_cast<std::size_t>(c)]) - probability(x, y);
                     sum += off * off;
                 }
         return std::sqrt(sum / (4.0 * region.width() * region.height()));
@@ -244,7 +247,8 @@ struct NoisyScene {
 };
 
 template <class Transport>
-using NoisyFrameBuffer = dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicImageParallel<16>>, dfb::NoPixelOp, Transport>;
+using NoisyFrameBuffer =
+    dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicImageParallel<16>>, dfb::NoPixelOp, Transport>;
 
 inline dfb::FrameBufferConfig configOf(const NoisyScene& s)
 {
@@ -328,8 +332,9 @@ struct DarkCorners {
             const dfb::Region r = fb.layout().region(tile);
             // The error that was promised is that of the block of 8x8 pixels that has the corner.
             const double error = s.error(fb.image(), {r.x0 + 8, r.y0 + 8, r.x1, r.y1});
-            result.expect(error <= 1.6 * maxError, "tile " + std::to_string(tile) + " is off by " + std::to_string(error)
-                                                       + " after " + std::to_string(sampler.samplesOf(tile)));
+            result.expect(error <= 1.6 * maxError, "tile " + std::to_string(tile) + " is off by "
+                                                       + std::to_string(error) + " after "
+                                                       + std::to_string(sampler.samplesOf(tile)));
         }
         return result;
     }
@@ -361,10 +366,7 @@ TEST_CASE("Samples of several frames accumulate to the reference image", "[sampl
     everywhere<algorithms::Accumulation>();
 }
 
-TEST_CASE("A reset reaches all ranks or is an error on all", "[sampling]")
-{
-    everywhere<algorithms::Reset>();
-}
+TEST_CASE("A reset reaches all ranks or is an error on all", "[sampling]") { everywhere<algorithms::Reset>(); }
 
 TEST_CASE("Adaptive sampling needs less than half the samples for the same error", "[sampling]")
 {

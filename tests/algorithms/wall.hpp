@@ -43,15 +43,17 @@ struct Wall {
                 int wrongRows = 0;
                 for (int y = 0; y < layout.displayHeight; ++y) {
                     const std::size_t bytes = pixelBytes * static_cast<std::size_t>(layout.displayWidth);
-                    const std::size_t first = pixelBytes
-                                              * (static_cast<std::size_t>(region.y0 + y) * static_cast<std::size_t>(layout.width())
-                                                 + static_cast<std::size_t>(region.x0));
+                    const std::size_t first =
+                        pixelBytes
+                        * (static_cast<std::size_t>(region.y0 + y) * static_cast<std::size_t>(layout.width())
+                           + static_cast<std::size_t>(region.x0));
                     wrongRows += std::memcmp(wall.image(d).bytes() + static_cast<std::size_t>(y) * bytes,
                                              pixels.data() + first, bytes)
                                  != 0;
                 }
-                result.expect(wrongRows == 0, name + ": display " + std::to_string(d) + " has " + std::to_string(wrongRows)
-                                                  + " wrong rows in frame " + std::to_string(frame));
+                result.expect(wrongRows == 0, name + ": display " + std::to_string(d) + " has "
+                                                  + std::to_string(wrongRows) + " wrong rows in frame "
+                                                  + std::to_string(frame));
             }
             if (single.isDisplayRank())
                 result.hash = result.hash * 31 + reference::hashOf(pixels.data(), pixels.size());
@@ -82,7 +84,8 @@ struct Wall {
                 [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOfFrame(frame));
         };
         const auto image = [&](auto& fb, int frame) {
-            const scene::Scene s = scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().width, fb.config().height);
+            const scene::Scene s =
+                scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().width, fb.config().height);
             return dfb::renderImageParallel(
                 fb, dfb::WorkDistribution::RoundRobin, [&](auto& tile) { renderBrick(s, s.bricks[0], tile); },
                 paramsOfFrame(frame));
@@ -95,7 +98,8 @@ struct Wall {
                                                    dfb::OutputFormat::RGBA8, result, "1x5 with wide bezels", data);
         dfb::WallLayout wrong = dealt({2, 2, 8, 8, 0, 0, {}}, 0);
         wrong.ranks[3] = size;
-        const std::string outcome = scene::outcomeOf([&] { dfb::DisplayWall<Transport>(messenger, wrong, dfb::OutputFormat::RGBA8); });
+        const std::string outcome =
+            scene::outcomeOf([&] { dfb::DisplayWall<Transport>(messenger, wrong, dfb::OutputFormat::RGBA8); });
         result.expect(scene::has(outcome, "is driven by rank"), outcome);
         return result;
     }
@@ -123,7 +127,8 @@ struct WallProgressive {
                 fb,
                 [&](auto& tile) {
                     tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                        const bool lit = scene::mix(static_cast<std::uint64_t>(tile.sample * 1000003 + y * 1009 + x)) % 2 != 0;
+                        const bool lit =
+                            scene::mix(static_cast<std::uint64_t>(tile.sample * 1000003 + y * 1009 + x)) % 2 != 0;
                         rgba[1] = x >= 43 ? 0.5f : lit ? 1.0f : 0.0f;
                         rgba[3] = 1;
                     });
@@ -160,10 +165,7 @@ extern template Result inProcess<WallProgressive>(int);
 } // namespace algorithms
 
 #if !defined(ALGORITHMS_WITHOUT_TESTS)
-TEST_CASE("Each display of a wall shows what the single image has there", "[wall]")
-{
-    everywhere<algorithms::Wall>();
-}
+TEST_CASE("Each display of a wall shows what the single image has there", "[wall]") { everywhere<algorithms::Wall>(); }
 
 TEST_CASE("A wall shows converged tiles and survives a frame that fails", "[wall]")
 {

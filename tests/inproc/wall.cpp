@@ -12,7 +12,8 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
     std::mutex mutex;
     std::map<int, std::size_t> pixelBytes; // by receiver
     watched->inspect = [&](int, int to, const board::MessageHeader& header, dfb::Buffer& message) {
-        if (header.kind == dfb::detail::MessageKind::FinishedTiles || header.kind == dfb::detail::MessageKind::Fragment) {
+        if (header.kind == dfb::detail::MessageKind::FinishedTiles
+            || header.kind == dfb::detail::MessageKind::Fragment) {
             const std::lock_guard<std::mutex> lock(mutex);
             pixelBytes[to] += message.size();
         }
@@ -25,7 +26,8 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
         dfb::DisplayWall<board::BoardTransport> wall(messenger, layout, dfb::OutputFormat::RGBA8, executor);
         auto config = wall.frameBufferConfig();
         config.executor = executor;
-        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall<board::BoardTransport>, board::BoardTransport>
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall<board::BoardTransport>,
+                                    board::BoardTransport>
             fb(messenger, config, {&wall});
         const auto report = dfb::renderImageParallel(fb, [](auto& tile) {
             const float rgba[4] = {0.5f, 0, 0, 1};

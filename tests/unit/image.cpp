@@ -63,8 +63,8 @@ TEST_CASE("toUnorm8 is exact rounding of every float, ties to even", "[image]")
 
 TEST_CASE("toUnorm8 is exact rounding of doubles, and the double nearest to a tie counts as the tie", "[image]")
 {
-    // An exact result can be a tie that is not a double, as 1/6 = 42.5 / 255 from 3 passes. It is known to half an ulp, and
-    // must round to even all the same. The next 2 doubles may go with it, or to their own side.
+    // An exact result can be a tie that is not a double, as 1/6 = 42.5 / 255 from 3 passes. It is known to half an ulp,
+    // and must round to even all the same. The next 2 doubles may go with it, or to their own side.
     std::size_t wrong = 0;
     for (int k = 0; k < 255; ++k) {
         const double tie = (k + 0.5) / 255;

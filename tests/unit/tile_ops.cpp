@@ -90,7 +90,8 @@ Output runOp(const Inputs<Op::tileSize>& in, const std::vector<std::size_t>& ord
             const auto wanted = static_cast<dfb::ChannelMask>(dfb::detail::NeededChannelsOf<Op>::value
                                                               | (withDepth ? dfb::depthChannel : 0));
             dfb::Buffer message = dfb::detail::encodeFragment(*pool, *in.tiles[i], wanted, 0, nullptr, out.nonFinite);
-            op.add(dfb::detail::decodeFragment(*pool, std::move(message), in.layout, [&](int) { return in.passes; }, nullptr));
+            op.add(dfb::detail::decodeFragment(
+                *pool, std::move(message), in.layout, [&](int) { return in.passes; }, nullptr));
         }
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
         const std::size_t stride = width * dfb::bytesPerPixel(format);
@@ -219,7 +220,8 @@ void fillAdversarial(TileOf<Size>& tile, Random& random)
     const std::size_t depthKind = below(random, 8);
     const std::size_t density = below(random, 5); // 0: empty; 4: all
     const bool plain = below(random, 3) == 0;     // one colour and depth
-    const float plainAlpha = anyAlpha(random), plainColor = anyColor(random, plainAlpha), plainDepth = anyDepth(random, depthKind);
+    const float plainAlpha = anyAlpha(random), plainColor = anyColor(random, plainAlpha),
+                plainDepth = anyDepth(random, depthKind);
     for (int y = 0; y < tile.region.height(); ++y)
         for (int x = 0; x < tile.region.width();) {
             const bool active = density == 4 || below(random, 4) < density;
@@ -250,7 +252,9 @@ Inputs<Size> adversarial(std::uint64_t seed, int layers, int passes, bool image 
         in.background = {0.25f, 1e-3f, 0.5f, uniform(random)};
     for (int pass = 0; pass < passes; ++pass)
         for (int i = 0; i < (image ? 1 : layers); ++i)
-            fillAdversarial(in.add(pass, static_cast<std::uint32_t>(i / 2), static_cast<std::uint16_t>(i % 2), image ? 0 : 1), random);
+            fillAdversarial(
+                in.add(pass, static_cast<std::uint32_t>(i / 2), static_cast<std::uint16_t>(i % 2), image ? 0 : 1),
+                random);
     return in;
 }
 
@@ -292,7 +296,8 @@ TEST_CASE("ImageParallel is within 1 ulp of exact in float, exact in 8 bits and 
 {
     for (std::uint64_t seed = 1; seed <= 12; ++seed) {
         INFO("seed " << seed);
-        const Comparison c = compare<dfb::BasicImageParallel<16>>(adversarial<16>(seed, 1, 1 + static_cast<int>(seed % 3), true));
+        const Comparison c =
+            compare<dfb::BasicImageParallel<16>>(adversarial<16>(seed, 1, 1 + static_cast<int>(seed % 3), true));
         CHECK(c.worstUlps <= 1);
         CHECK(c.wrongBytes == 0);
         CHECK(c.wrongDepths == 0);
@@ -473,7 +478,8 @@ TEST_CASE("What is not finite spoils its own pixel and is counted", "[ops]")
                     changedElsewhere += reference::ulpsBetween(out.value(4 * i + c), clean.value(4 * i + c)) != 0
                                         || out.depth[i] != clean.depth[i];
         CHECK(changedElsewhere == 0);
-        // At the pixel itself the rule is arithmetic's own; the reference follows it (and treats a NaN depth as farthest).
+        // At the pixel itself the rule is arithmetic's own; the reference follows it (and treats a NaN depth as
+        // farthest).
         const auto expected = referenceOf(in);
         for (std::size_t c = 0; c < 4; ++c)
             CHECK(reference::ulpsBetween(out.value(4 * pixel + c), reference::toFloat(expected[pixel].rgba[c])) <= 1);

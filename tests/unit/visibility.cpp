@@ -57,7 +57,8 @@ TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[vis
     for (int i = 0; i < 600; ++i) {
         const auto [width, height] = sizes[static_cast<std::size_t>(i) % sizes.size()];
         const dfb::Vec3 eye = point(random, 3), target = point(random, 1);
-        const dfb::PerspectiveCamera camera(eye, target, {0.1f, 1.0f, -0.05f}, static_cast<float>(uniform(random, 2, 160)));
+        const dfb::PerspectiveCamera camera(eye, target, {0.1f, 1.0f, -0.05f},
+                                            static_cast<float>(uniform(random, 2, 160)));
         // From a thousandth of a unit to several, some of them around the eye or behind it.
         const float extent = static_cast<float>(std::pow(10.0, uniform(random, -3, 0.7)));
         const dfb::Vec3 center = i % 5 == 0 ? eye : point(random, 3);
@@ -73,12 +74,15 @@ TEST_CASE("The projection of a box covers every pixel whose rays meet it", "[vis
                 for (int s = 0; s < 5; ++s) {
                     // The corners and a random point of the pixel.
                     const double dx = s < 4 ? s % 2 : uniform(random, 0, 1), dy = s < 4 ? s / 2 : uniform(random, 0, 1);
-                    if (!meets(eye, camera.direction(static_cast<float>(x + dx), static_cast<float>(y + dy), width, height), box))
+                    if (!meets(eye,
+                               camera.direction(static_cast<float>(x + dx), static_cast<float>(y + dy), width, height),
+                               box))
                         continue;
                     ++hits;
                     if (!region.contains(x, y)) {
                         ++missed;
-                        example = "scene " + std::to_string(i) + ", pixel " + std::to_string(x) + ' ' + std::to_string(y);
+                        example =
+                            "scene " + std::to_string(i) + ", pixel " + std::to_string(x) + ' ' + std::to_string(y);
                     }
                 }
     }
@@ -111,7 +115,8 @@ TEST_CASE("The projection covers the points of boxes in large images, and not mu
             const double px = box.lower.x + fx * (static_cast<double>(box.upper.x) - box.lower.x);
             const double py = box.lower.y + fy * (static_cast<double>(box.upper.y) - box.lower.y);
             const double pz = box.lower.z + fz * (static_cast<double>(box.upper.z) - box.lower.z);
-            const double x = 0.5 * width + pixelsPerUnit * px / (10 - pz), y = 0.5 * height - pixelsPerUnit * py / (10 - pz);
+            const double x = 0.5 * width + pixelsPerUnit * px / (10 - pz),
+                         y = 0.5 * height - pixelsPerUnit * py / (10 - pz);
             x0 = std::min(x0, x), x1 = std::max(x1, x);
             y0 = std::min(y0, y), y1 = std::max(y1, y);
             const int column = static_cast<int>(std::floor(x)), row = static_cast<int>(std::floor(y));
@@ -247,7 +252,8 @@ TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meet
 {
     const dfb::PerspectiveCamera camera({0, 0, 5}, {0, 0, 0}, {0, 1, 0}, 60);
     const dfb::TileLayout layout(100, 80, 16);
-    const dfb::World world({{5, {{-1, -1, -1}, {0, 0, 0}}}, {3, {{0, 0, 0}, {1, 1, 1}}}, {9, {{-1, -1, 6}, {1, 1, 8}}}});
+    const dfb::World world(
+        {{5, {{-1, -1, -1}, {0, 0, 0}}}, {3, {{0, 0, 0}, {1, 1, 1}}}, {9, {{-1, -1, 6}, {1, 1, 8}}}});
     const auto pairs = dfb::visibleTiles(world, camera, layout);
     std::set<std::pair<int, int>> found;
     for (const auto& p : pairs)
@@ -256,7 +262,8 @@ TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meet
     std::set<std::pair<int, int>> expected;
     for (int brick = 0; brick < 3; ++brick)
         for (int tile = 0; tile < layout.tileCount(); ++tile)
-            if (camera.project(world.bricks()[static_cast<std::size_t>(brick)].bounds, 100, 80).meets(layout.region(tile)))
+            if (camera.project(world.bricks()[static_cast<std::size_t>(brick)].bounds, 100, 80)
+                    .meets(layout.region(tile)))
                 expected.emplace(tile, brick);
     CHECK(found == expected);
     CHECK(std::is_sorted(pairs.begin(), pairs.end(), [](const auto& a, const auto& b) { return a.tile < b.tile; }));

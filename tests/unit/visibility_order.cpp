@@ -105,6 +105,7 @@ TEST_CASE("Bricks that overlap or stand in a circle have no order", "[visibility
     const std::vector<dfb::Brick> beams{
         {1, {{0, 0, 1}, {9, 1, 2}}}, {2, {{8, 0, 2}, {9, 9, 3}}}, {3, {{0, 0.5f, 0}, {1, 9, 1}}}};
     CHECK(outcome(beams) == "fine");
-    const std::vector<dfb::Brick> circle{{1, {{0, 1, 2}, {9, 2, 3}}}, {2, {{2, 0, 1}, {3, 9, 2}}}, {3, {{1, 2, 0}, {2, 3, 9}}}};
+    const std::vector<dfb::Brick> circle{
+        {1, {{0, 1, 2}, {9, 2, 3}}}, {2, {{2, 0, 1}, {3, 9, 2}}}, {3, {{1, 2, 0}, {2, 3, 9}}}};
     CHECK(outcome(circle).find("circle") != std::string::npos);
 }

@@ -52,7 +52,8 @@ void fill(TileOf<Size>& tile, Content content, Random& random)
 {
     const int width = tile.region.width(), height = tile.region.height();
     const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f + 0x1p-30f; };
-    const int gapX = static_cast<int>(random() % static_cast<unsigned>(width)), gapY = static_cast<int>(random() % static_cast<unsigned>(height));
+    const int gapX = static_cast<int>(random() % static_cast<unsigned>(width)),
+              gapY = static_cast<int>(random() % static_cast<unsigned>(height));
     bool inSpan = false;
     const float constant[4] = {number(), number(), number(), number()};
     for (int y = 0; y < height; ++y)
@@ -129,7 +130,8 @@ dfb::FragmentEncoding expectedEncoding(Content content, bool withDepth, std::siz
         return dfb::FragmentEncoding::Empty;
     if (active < pixels)
         return dfb::FragmentEncoding::Sparse;
-    const bool constant = pixels == 1 || content == Content::Constant || (content == Content::ConstantColor && !withDepth);
+    const bool constant =
+        pixels == 1 || content == Content::Constant || (content == Content::ConstantColor && !withDepth);
     return constant ? dfb::FragmentEncoding::Constant : dfb::FragmentEncoding::Dense;
 }
 
@@ -147,7 +149,8 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             std::uint64_t nonFinite = 0;
             dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, wanted, 9, codec, nonFinite);
             std::uint64_t uncounted = 0;
-            const std::size_t rawBytes = dfb::detail::encodeFragment(*pool, *tile, wanted, 9, nullptr, uncounted).size();
+            const std::size_t rawBytes =
+                dfb::detail::encodeFragment(*pool, *tile, wanted, 9, nullptr, uncounted).size();
             INFO("size " << Size << ", content " << static_cast<int>(content) << ", depth " << withDepth << ", region "
                          << tile->region.width() << "x" << tile->region.height());
             std::size_t active = 0;
@@ -163,7 +166,8 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             CHECK(header.number == 77);
             CHECK(header.receiver == 9);
             const std::size_t sizeBefore = message.size();
-            const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, codec);
+            const dfb::Fragment fragment = dfb::detail::decodeFragment(
+                *pool, std::move(message), layout, [](int) { return 3; }, codec);
             const dfb::TileHeader& h = fragment.header();
             CHECK((h.frame == 77 && h.tile == index && h.region == tile->region && h.pass == 2 && h.generation == 5
                    && h.children == 3 && h.source == 0xfedcba98u && h.part == 0x7654));
@@ -181,7 +185,8 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             else if (encoding == dfb::FragmentEncoding::Dense)
                 CHECK(rawBytes == fragmentPrefix + pixels * pixelBytes);
             else
-                CHECK(rawBytes <= fragmentPrefix + active * pixelBytes + 4 * active + 2 * static_cast<std::size_t>(Size) + 15);
+                CHECK(rawBytes
+                      <= fragmentPrefix + active * pixelBytes + 4 * active + 2 * static_cast<std::size_t>(Size) + 15);
         }
 }
 
@@ -224,7 +229,8 @@ Outcome tryDecode(const std::vector<std::byte>& bytes, const dfb::TileLayout& la
     std::copy(bytes.begin(), bytes.end(), message.data());
     try {
         dfb::detail::readMessageHeader(message);
-        const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, codec);
+        const dfb::Fragment fragment = dfb::detail::decodeFragment(
+            *pool, std::move(message), layout, [](int) { return 3; }, codec);
         dfb::FragmentCursor cursor(fragment);
         const int width = fragment.header().region.width();
         std::uint32_t pixels = 0;
@@ -264,8 +270,9 @@ void prefixesAndFlips(const dfb::Codec* codec)
         REQUIRE(tryDecode(message, layout, codec) == Outcome::Decoded);
         std::size_t decodedPrefixes = 0;
         for (std::size_t length = 0; length < message.size(); ++length)
-            decodedPrefixes += tryDecode({message.begin(), message.begin() + static_cast<std::ptrdiff_t>(length)}, layout, codec)
-                               == Outcome::Decoded;
+            decodedPrefixes +=
+                tryDecode({message.begin(), message.begin() + static_cast<std::ptrdiff_t>(length)}, layout, codec)
+                == Outcome::Decoded;
         CHECK(decodedPrefixes == 0);
         auto longer = message;
         longer.push_back(std::byte{0});
@@ -273,7 +280,8 @@ void prefixesAndFlips(const dfb::Codec* codec)
         for (int i = 0; i < 3000; ++i) {
             auto broken = message;
             // Mostly in the header and the table, where it hurts.
-            const std::size_t range = i % 3 == 0 ? broken.size() : std::min<std::size_t>(broken.size(), fragmentPrefix + 32);
+            const std::size_t range =
+                i % 3 == 0 ? broken.size() : std::min<std::size_t>(broken.size(), fragmentPrefix + 32);
             for (std::uint64_t flips = 1 + random() % 3; flips > 0; --flips)
                 broken[random() % range] ^= static_cast<std::byte>(1u << random() % 8);
             CHECK_NOTHROW(tryDecode(broken, layout, codec) == Outcome::Decoded ? ++decodedFlips : ++refusedFlips);
@@ -294,15 +302,16 @@ TEST_CASE("Depth travels in canonical form, and what is not finite is counted on
     const dfb::TileLayout layout(8, 8, 8);
     auto tile = makeTile<8>(layout, 0);
     tile->pixel(0, 0)[3] = 1.0f, tile->depth[0] = -0.0f;
-    tile->pixel(1, 0)[3] = 1.0f, tile->depth[1] = notANumber;          // counted
-    tile->pixel(2, 0)[0] = tile->pixel(2, 0)[1] = infinity;            // counted once
-    tile->pixel(3, 0)[2] = notANumber, tile->depth[3] = notANumber;    // counted once
-    tile->pixel(4, 0)[3] = 1.0f, tile->depth[4] = infinity;            // a depth may be infinite
-    tile->depth[5] = notANumber;                                       // not active: does not travel
+    tile->pixel(1, 0)[3] = 1.0f, tile->depth[1] = notANumber;       // counted
+    tile->pixel(2, 0)[0] = tile->pixel(2, 0)[1] = infinity;         // counted once
+    tile->pixel(3, 0)[2] = notANumber, tile->depth[3] = notANumber; // counted once
+    tile->pixel(4, 0)[3] = 1.0f, tile->depth[4] = infinity;         // a depth may be infinite
+    tile->depth[5] = notANumber;                                    // not active: does not travel
     std::uint64_t nonFinite = 0;
     dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, nonFinite);
     CHECK(nonFinite == 3);
-    const dfb::Fragment fragment = dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, nullptr);
+    const dfb::Fragment fragment = dfb::detail::decodeFragment(
+        *pool, std::move(message), layout, [](int) { return 3; }, nullptr);
     dfb::FragmentCursor cursor(fragment);
     const dfb::FragmentRow row = cursor.next();
     REQUIRE(row.spanCount == 1);
@@ -334,7 +343,8 @@ TEST_CASE("A message of another version, byte order or codec is named as such", 
         std::copy(bytes.begin(), bytes.end(), message.data());
         try {
             dfb::detail::readMessageHeader(message);
-            dfb::detail::decodeFragment(*pool, std::move(message), layout, [](int) { return 3; }, nullptr);
+            dfb::detail::decodeFragment(
+                *pool, std::move(message), layout, [](int) { return 3; }, nullptr);
         } catch (const dfb::Error& e) {
             return std::string(e.what());
         }

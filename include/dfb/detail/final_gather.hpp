@@ -25,7 +25,7 @@ namespace dfb::detail {
 // What the messages to the display rank need to know.
 struct GatherSettings {
     OutputFormat format = OutputFormat::None;
-    ChannelMask channels = 0; // beside the colour
+    ChannelMask channels = 0;   // beside the colour
     std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
     bool atEnd = false; // nothing leaves before flush()
@@ -256,7 +256,8 @@ public:
     }
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
-    // background before and is of the same colour is left alone, as are tiles of an earlier frame that are `kept(tile)`.
+    // background before and is of the same colour is left alone, as are tiles of an earlier frame that are
+    // `kept(tile)`.
     template <class Kept>
     void fillBackground(const std::array<float, 4>& rgba, const Kept& kept)
     {
@@ -267,8 +268,7 @@ public:
         std::vector<double> row;
         for (int tile = 0; tile < layout_.tileCount(); ++tile) {
             auto& s = state_[static_cast<std::size_t>(tile)];
-            if (s == TileState::Received || (s == TileState::Background && same)
-                || (s == TileState::Old && kept(tile)))
+            if (s == TileState::Received || (s == TileState::Background && same) || (s == TileState::Old && kept(tile)))
                 continue;
             const Region region = layout_.region(tile);
             const Place place = inImage(region);

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/comm/messaging.hpp>
+#include <dfb/detail/frame_figures.hpp>
 #include <dfb/detail/frame_gate.hpp>
 #include <dfb/detail/job_share.hpp>
 #include <dfb/detail/manifest.hpp>
@@ -37,7 +38,8 @@ public:
     using Bytes = ReductionTable::Bytes;
 
     // `slot`: which of config.framesInFlight engines this is.
-    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp, int slot = 0)
+    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp,
+                int slot = 0)
         : pool_(messenger->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
         config_.progress = messenger->options().progress;
@@ -133,8 +135,7 @@ public:
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
         renderNs_ = 0;
-        figures_.clear();
-        mergeErrors_.clear();
+        figures_.newFrame();
         tilesLeft_ = countUnknown;
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
         for (const int tile : ownedTiles()) {
@@ -187,11 +188,8 @@ public:
     // See Frame.
     TileSamples samples(int tile) const { return pipeline_->table().samples(tile); }
 
-    void addFigure(std::uint64_t key, double value)
-    {
-        const std::lock_guard<std::mutex> lock(figuresMutex_);
-        figures_.push_back({key, value});
-    }
+    void addFigure(std::uint64_t key, double value) { figures_.add(key, value); }
+    void noteMergeError(int tile, double bound) { figures_.addMergeError(tile, bound / samples(tile).count); }
 
     JobRange nextJobs(std::int64_t count)
     {
@@ -211,12 +209,6 @@ public:
             askForJobs(count);
         }
         return range.value_or(JobRange{});
-    }
-
-    void noteMergeError(int tile, double bound)
-    {
-        const std::lock_guard<std::mutex> lock(figuresMutex_);
-        mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound / samples(tile).count});
     }
 
     void waitForRoom()
@@ -654,31 +646,13 @@ private:
                                      gate_.takeLateCount(),
                                      repeated - repeatedBefore_,
                                      reports.orderUndefinedPixels};
-                           for (const TileError& e : reports.errors)
-                               v.tileErrors.push_back({static_cast<std::uint64_t>(e.tile), e.error});
-                           sortByKey(v.tileErrors);
-                           {
-                               const std::lock_guard<std::mutex> lock(figuresMutex_);
-                               v.figures = figures_;
-                               v.mergeErrors = mergeErrors_;
-                           }
-                           for (auto* list : {&v.figures, &v.mergeErrors}) {
-                               sortByKey(*list);
-                               *list = Verdict::summed(std::move(*list));
-                           }
+                           v.tileErrors = FrameFigures::of(reports.errors);
+                           figures_.addTo(v);
                            repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
                            return v;
                        });
-    }
-
-    // Of values of one key, too, the order must not be that of the threads: they are added.
-    static void sortByKey(std::vector<Figure>& list)
-    {
-        std::sort(list.begin(), list.end(), [](const Figure& a, const Figure& b) {
-            return a.key != b.key ? a.key < b.key : a.value < b.value;
-        });
     }
 
     // Throws InvalidArgument for a plan that this framebuffer can not follow.
@@ -761,8 +735,7 @@ private:
     std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
     std::uint64_t lastAccumulationId_ = 0;
     bool frameOpen_ = false, lastFailed_ = false;
-    std::mutex figuresMutex_;
-    std::vector<Figure> figures_, mergeErrors_; // by key, by tile; under figuresMutex_
+    FrameFigures figures_;
     std::mutex strayMutex_;
     std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};

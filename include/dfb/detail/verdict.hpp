@@ -228,10 +228,11 @@ struct Agreement {
         const auto text = [](auto value) { return std::to_string(value); };
         return {true, "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width)
                           + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
-                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux " + text(c.aux)
-                          + ", display rank " + text(c.displayRank) + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
-                          + ", gather " + text(static_cast<int>(c.gather)) + ", checksums " + text(c.checksums)
-                          + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};
+                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux "
+                          + text(c.aux) + ", display rank " + text(c.displayRank) + ", frames in flight "
+                          + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0) + ", gather "
+                          + text(static_cast<int>(c.gather)) + ", checksums " + text(c.checksums) + ", message pool "
+                          + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};
     }
 
     std::vector<std::byte> bytes() const

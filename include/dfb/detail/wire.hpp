@@ -165,8 +165,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         h.spanCount = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
-    const std::size_t payload =
-        tableBytes + stored * sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
+    const std::size_t payload = tableBytes + stored * sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
     Buffer message = pool.acquire(fragmentPrefix + payload);

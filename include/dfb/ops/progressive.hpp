@@ -16,12 +16,13 @@
 
 namespace dfb {
 
-// `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The image
-// is the mean of all samples since FrameParams::accumulationId changed or a tile began with sample 0; a tile must get its
-// samples in order, in each frame those that follow. A tile without samples in a frame costs nothing and keeps its pixels.
-// For each finished tile TileReport::error is the standard error of its pixels' mean (root mean square over pixels and
-// RGBA) in the worst of its blocks of 8x8 pixels, so that a bright corner counts however dark the rest is; infinite before
-// the second sample. Memory: 45 bytes a pixel of a tile that is owned and was touched, and 36 with normals and albedo more.
+// `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The
+// image is the mean of all samples since FrameParams::accumulationId changed or a tile began with sample 0; a tile must
+// get its samples in order, in each frame those that follow. A tile without samples in a frame costs nothing and keeps
+// its pixels. For each finished tile TileReport::error is the standard error of its pixels' mean (root mean square over
+// pixels and RGBA) in the worst of its blocks of 8x8 pixels, so that a bright corner counts however dark the rest is;
+// infinite before the second sample. Memory: 45 bytes a pixel of a tile that is owned and was touched, and 36 with
+// normals and albedo more.
 template <class Base>
 class Progressive {
 public:
@@ -66,9 +67,10 @@ public:
     void report(TileReport& report) const
     {
         base_.report(report);
-        report.error = samples_ > 1 ? std::sqrt(worstBlock() / (4 * static_cast<double>(samples_ - 1)
-                                                                * static_cast<double>(samples_)))
-                                    : std::numeric_limits<double>::infinity();
+        report.error =
+            samples_ > 1
+                ? std::sqrt(worstBlock() / (4 * static_cast<double>(samples_ - 1) * static_cast<double>(samples_)))
+                : std::numeric_limits<double>::infinity();
     }
 
 private:

@@ -74,7 +74,8 @@ public:
             }
             return to.data();
         };
-        const auto ids = [&](std::vector<std::uint32_t>& to, const std::vector<NearestId>& from) -> const std::uint32_t* {
+        const auto ids = [&](std::vector<std::uint32_t>& to,
+                             const std::vector<NearestId>& from) -> const std::uint32_t* {
             if (from.empty())
                 return nullptr;
             to.resize(width);
@@ -223,8 +224,8 @@ protected:
 } // namespace detail
 
 // Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
-// announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over n
-// passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
+// announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
+// n passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
 // order is undefined. Of `Channels` beside colour, depth and farChannel what the image does not have does not travel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {

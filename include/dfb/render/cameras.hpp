@@ -1,6 +1,7 @@
 // Cameras beyond the pinhole: what per-pixel sorting allows (section 4.2 of the paper). Each gives a ray for a point of
 // the image and sample numbers for lens and time, and can tell which tiles a box may project to. A ray's sample numbers
-// must be a function of pixel, sample and seed alone, so that all bricks are seen along the same ray; each sample is a pass.
+// must be a function of pixel, sample and seed alone, so that all bricks are seen along the same ray; each sample is a
+// pass.
 //
 // Points of the image are in pixels, pixel centres at .5; sample numbers are in [0, 1); angles in degrees.
 #pragma once
@@ -64,8 +65,8 @@ public:
     // Looks along `view`, of any length. Throws InvalidArgument for what is no camera.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
-        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), radius_(static_cast<double>(apertureRadius)),
-          focus_(static_cast<double>(focusDistance))
+        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
+          radius_(static_cast<double>(apertureRadius)), focus_(static_cast<double>(focusDistance))
     {
         if (!(radius_ >= 0) || !(focus_ > 0))
             throw InvalidArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
@@ -75,8 +76,7 @@ public:
     {
         const double scale = 2 * tan_ / height;
         const detail::Point3 sharp =
-            focus_
-            * (pose_.forward + (x - 0.5 * width) * scale * pose_.right + (0.5 * height - y) * scale * pose_.up);
+            focus_ * (pose_.forward + (x - 0.5 * width) * scale * pose_.right + (0.5 * height - y) * scale * pose_.up);
         const double r = radius_ * std::sqrt(sample.lensU), angle = 2 * detail::pi * sample.lensV;
         const detail::Point3 onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
         return {detail::vecOf(pose_.eye + onLens), detail::vecOf(detail::normalized(sharp - onLens))};
@@ -88,9 +88,8 @@ public:
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const double scale = 0.5 * height / tan_;
-        return detail::projectBox(bounds, pose_, scale, width, height, 0, [&](double depth) {
-            return scale * radius_ * std::fabs(1 / depth - 1 / focus_);
-        });
+        return detail::projectBox(bounds, pose_, scale, width, height, 0,
+                                  [&](double depth) { return scale * radius_ * std::fabs(1 / depth - 1 / focus_); });
     }
 
 private:
@@ -104,8 +103,8 @@ class StereoCamera {
 public:
     // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument for what is no camera.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
-        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), separation_(static_cast<double>(separation)),
-          convergence_(static_cast<double>(convergence))
+        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
+          separation_(static_cast<double>(separation)), convergence_(static_cast<double>(convergence))
     {
         if (!(separation_ >= 0) || !(convergence_ > 0))
             throw InvalidArgument("eyes are 0 or more apart and converge at a distance above 0");
@@ -161,22 +160,23 @@ public:
         if (r > 1)
             return {detail::vecOf(pose_.eye), {0, 0, 0}};
         const double angle = r * border_, aside = r > 0 ? std::sin(angle) / r : 0;
-        const detail::Point3 d =
-            std::cos(angle) * pose_.forward + px * aside * pose_.right + py * aside * pose_.up;
+        const detail::Point3 d = std::cos(angle) * pose_.forward + px * aside * pose_.right + py * aside * pose_.up;
         return {detail::vecOf(pose_.eye), detail::vecOf(detail::normalized(d))};
     }
 
-    // Around the sphere that holds the box. Angles along a radius come out to scale; across, angles at theta off the view
-    // are stretched by theta / sin(theta).
+    // Around the sphere that holds the box. Angles along a radius come out to scale; across, angles at theta off the
+    // view are stretched by theta / sin(theta).
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const detail::Point3 lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
         const detail::Point3 to = 0.5 * (lower + upper) - pose_.eye;
-        const double sphere = 0.5 * detail::length(upper - lower) + 1e-6 * (detail::length(upper) + detail::length(pose_.eye)),
+        const double sphere = 0.5 * detail::length(upper - lower)
+                              + 1e-6 * (detail::length(upper) + detail::length(pose_.eye)),
                      distance = detail::length(to);
         if (distance <= sphere)
             return Footprint::whole(width, height);
-        const double half = std::asin(sphere / distance), x = detail::dot(to, pose_.right), y = detail::dot(to, pose_.up),
+        const double half = std::asin(sphere / distance), x = detail::dot(to, pose_.right),
+                     y = detail::dot(to, pose_.up),
                      theta = std::atan2(std::hypot(x, y), detail::dot(to, pose_.forward)), farthest = theta + half;
         if (theta - half > border_)
             return {};
@@ -222,8 +222,8 @@ public:
         return {detail::vecOf(pose.eye), detail::vecOf(detail::normalized(d))};
     }
 
-    // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho of
-    // the axis is never farther than rho times half the part's angle from where it is in the middle of the part.
+    // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho
+    // of the axis is never farther than rho times half the part's angle from where it is in the middle of the part.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {
         double rho = 0;

@@ -17,15 +17,16 @@
 
 namespace dfb {
 
-// Sorts segments, also those of one brick, and counts the pixels in which some overlap: FrameReport::orderUndefinedPixels.
+// Sorts segments, also those of one brick, and counts the pixels in which some overlap:
+// FrameReport::orderUndefinedPixels.
 template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
 // Collective. As renderDataParallel(), with the bounds of bricks enclosing what they have; they may overlap.
-// `renderBrick(brick, deep)` adds the segments of the pixels of deep.header().region to the empty DeepTile, of which each
-// pixel keeps `maxSegments` at most. FrameReport::mergeErrorBound is how much that may have changed a pixel. The first
-// segments of a brick's pixels announce the others as children: a pixel with one costs what it costs without.
+// `renderBrick(brick, deep)` adds the segments of the pixels of deep.header().region to the empty DeepTile, of which
+// each pixel keeps `maxSegments` at most. FrameReport::mergeErrorBound is how much that may have changed a pixel. The
+// first segments of a brick's pixels announce the others as children: a pixel with one costs what it costs without.
 template <class FrameBuffer, class Camera, class RenderBrick>
 FrameReport renderDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera, int maxSegments,
                                const RenderBrick& renderBrick, FrameParams params = {},

@@ -11,8 +11,8 @@
 
 namespace dfb {
 
-// Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many samples
-// is rendered by many ranks; the image does not depend on who renders what.
+// Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many
+// samples is rendered by many ranks; the image does not depend on who renders what.
 enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles
@@ -22,8 +22,8 @@ enum class WorkDistribution : std::uint8_t {
 
 // Collective. Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and ends
 // the frame. `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and
-// tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what Frame::end() throws; an exception of
-// renderTile becomes a FrameError on all ranks.
+// tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what Frame::end() throws; an exception
+// of renderTile becomes a FrameError on all ranks.
 template <class FrameBuffer, class RenderTile>
 FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigned, const RenderTile& renderTile,
                                 FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},

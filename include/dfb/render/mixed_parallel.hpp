@@ -1,6 +1,6 @@
 // The mixed-parallel rendering loop (Listing 5 of the paper): bricks that several ranks hold are rendered into each
-// tile by one of them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on all
-// ranks image-parallel rendering. And the same with bricks in a known order, without sorting.
+// tile by one of them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on
+// all ranks image-parallel rendering. And the same with bricks in a known order, without sorting.
 //
 // A tile-brick owner is any type with
 //   int operator()(const SharedBrick& brick, int tile, int pass);      the rank, one of brick.ranks
@@ -34,15 +34,16 @@ struct RoundRobinBricks {
 
     int operator()(const SharedBrick& brick, int tile, int pass) const
     {
-        const std::size_t turn = brick.brick.id + static_cast<std::size_t>(tile)
-                                 + static_cast<std::size_t>(sharePasses ? pass : 0);
+        const std::size_t turn =
+            brick.brick.id + static_cast<std::size_t>(tile) + static_cast<std::size_t>(sharePasses ? pass : 0);
         return brick.ranks[turn % brick.ranks.size()];
     }
 };
 
 // Deals them so that all ranks have equally much to do, going by what the same brick and tile have cost in the last
-// frame; where that is not known, by the mean of the brick, then of all. Call update() after each frame. Passes are dealt
-// one by one. The cost is what `renderBrick` returns, or else the time it took, summed over the ranks by the verdict.
+// frame; where that is not known, by the mean of the brick, then of all. Call update() after each frame. Passes are
+// dealt one by one. The cost is what `renderBrick` returns, or else the time it took, summed over the ranks by the
+// verdict.
 class MeasuredCostBricks {
 public:
     void update(const FrameReport& report)
@@ -202,15 +203,16 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
     } else {
         const auto start = std::chrono::steady_clock::now();
         renderBrick(brick, tile);
-        frame.addFigure(key, std::chrono::duration<double, std::nano>(std::chrono::steady_clock::now() - start).count());
+        frame.addFigure(key,
+                        std::chrono::duration<double, std::nano>(std::chrono::steady_clock::now() - start).count());
     }
 }
 
 } // namespace detail
 
-// Collective. As renderDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says which
-// of them renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is that of
-// renderDataParallel() bit for bit, whoever renders what.
+// Collective. As renderDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says
+// which of them renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is
+// that of renderDataParallel() bit for bit, whoever renders what.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
 FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const Camera& camera, TileBrickOwner& owner,
                                 const RenderBrick& renderBrick, FrameParams params = {},
@@ -246,8 +248,8 @@ FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const
 }
 
 // Collective. The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
-// visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no manifest.
-// Only where one order is right for all rays of a frame: not with an extended lens or several eyes.
+// visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
+// manifest. Only where one order is right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
 FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                           const std::vector<int>& order, TileBrickOwner& owner, const RenderBrick& renderBrick,
@@ -266,8 +268,9 @@ FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camer
             throw InvalidArgument("the order does not have each brick once");
         std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
         std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
-            return a.tile != b.tile ? a.tile < b.tile
-                                    : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
+            return a.tile != b.tile
+                       ? a.tile < b.tile
+                       : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
         });
         const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
         std::vector<int> firstPair(static_cast<std::size_t>(fb.layout().tileCount()), -1);

@@ -23,8 +23,8 @@ struct SharedBrick {
 // The same on all ranks. Memory and time to make it: proportional to the bricks of all ranks.
 class SharedWorld {
 public:
-    // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks if
-    // their bounds differ.
+    // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks
+    // if their bounds differ.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {

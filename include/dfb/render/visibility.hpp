@@ -3,8 +3,8 @@
 // A camera, for the loops in render/, is any type with
 //   Region project(const Box3& bounds, int width, int height) const;
 // the pixels of a width x height image that the box may cover for any sample position within a pixel: never too few;
-// too many cost a header each. Instead of a Region it may return a Footprint, which leaves out the tiles in the corners,
-// or a std::vector of those (a stereo camera has two).
+// too many cost a header each. Instead of a Region it may return a Footprint, which leaves out the tiles in the
+// corners, or a std::vector of those (a stereo camera has two).
 #pragma once
 
 #include <dfb/detail/manifest.hpp>
@@ -46,13 +46,13 @@ struct Pose {
     Point3 eye, forward, right, up;
 };
 
-// The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, and that has `pixelsPerUnit` at
-// distance 1. Of a box that reaches behind the eye: the whole image. `blur(depth)`: by how many pixels a point at that
-// distance along the view may be off to any side; it must be largest at one of the ends of the box's interval.
+// The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, and that has `pixelsPerUnit`
+// at distance 1. Of a box that reaches behind the eye: the whole image. `blur(depth)`: by how many pixels a point at
+// that distance along the view may be off to any side; it must be largest at one of the ends of the box's interval.
 //
-// The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the rounding
-// of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels is less than
-// 1/100) and for points some units of the last place of the coordinates.
+// The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the
+// rounding of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels
+// is less than 1/100) and for points some units of the last place of the coordinates.
 template <class Blur>
 Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit, int width, int height, double shiftX,
                      const Blur& blur)
@@ -193,11 +193,14 @@ std::vector<BrickInTile> visibleTiles(const World& world, const Camera& camera, 
     std::vector<BrickInTile> result;
     for (std::size_t b = 0; b < world.bricks().size(); ++b)
         detail::forEachTile(camera.project(world.bricks()[b].bounds, layout.width(), layout.height()), layout,
-                            [&](int tile) { result.push_back({static_cast<int>(b), tile}); });
+                            [&](int tile) {
+                                result.push_back({static_cast<int>(b), tile});
+                            });
     const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
     std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
-    result.erase(std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
-                 result.end());
+    result.erase(
+        std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
+        result.end());
     return result;
 }
 

@@ -34,8 +34,8 @@ struct Box3 {
 };
 
 // A convex region of space that overlaps no other brick, with what it holds. Camera rays see it within `bounds` only:
-// renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion, which
-// secondary rays see beyond the bounds as well.
+// renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion,
+// which secondary rays see beyond the bounds as well.
 struct Brick {
     std::uint32_t id = 0; // the same number means the same data, on any rank; bounds do not matter for that
     Box3 bounds;
@@ -56,8 +56,8 @@ public:
             add(brick);
     }
 
-    // Throws InvalidArgument for bounds that are not finite or have lower > upper, data bounds that do not hold the bounds,
-    // and an id that this rank has already.
+    // Throws InvalidArgument for bounds that are not finite or have lower > upper, data bounds that do not hold the
+    // bounds, and an id that this rank has already.
     void add(const Brick& brick)
     {
         check(brick);
