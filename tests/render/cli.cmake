@@ -67,5 +67,6 @@ if(EXISTS ${DFB_TEST_DATA}/boston_teapot_256x256x178_uint8.raw)
 endif()
 if(EXISTS ${DFB_TEST_DATA}/stanford_bunny.ply AND EXISTS ${DFB_TEST_DATA}/neghip_64x64x64_uint8.raw
     AND EXISTS ${DFB_TEST_DATA}/proteasome_3l5q.xyz)
+  _add_cli_case(real_data ranks3 np4)
   _add_cli_case(three_files one)
 endif()

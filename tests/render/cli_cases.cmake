@@ -276,10 +276,34 @@ elseif(CASE STREQUAL "algorithms")
     expect_hash(${image} ${START} demo ${small} --mode image --spp 2 --distribution ${distribution})
   endforeach()
 
+elseif(CASE STREQUAL "real_data")
+  set(small --size 96x80 --bricks 3)
+  foreach(options "stanford_bunny.ply --ao 2" "stanford_bunny.ply --mode image --path 2"
+      "stanford_bunny.ply --adaptive 0.03 --spp 16 --ao 1" "utah_teapot.obj --camera motion --spp 4"
+      "proteasome_3l5q.xyz --camera dof --spp 2" "proteasome_3l5q.xyz --interleave 3 --deep 8"
+      "neghip_64x64x64_uint8.raw --camera dome --camera-distance 0.6")
+    separate_arguments(options)
+    list(POP_FRONT options file)
+    hash(one ranks1 ${DATA}/${file} ${small} ${options})
+    expect_hash(${one} ${START} ${DATA}/${file} ${small} ${options})
+  endforeach()
+  hash(data ${START} ${DATA}/boston_teapot_256x256x178_uint8.raw ${small})
+  expect_hash(${data} ${START} ${DATA}/boston_teapot_256x256x178_uint8.raw ${small} --mode mixed --frames 1)
+
 elseif(CASE STREQUAL "wall_and_aux")
   foreach(start ranks1 ${START})
     succeed(${start} demo --size 90x70 --bricks 3 --wall 2x2 --bezel 6 --output wall.png)
     succeed(${start} demo --size 90x70 --bricks 3 --aux aux)
+    if(NOT start STREQUAL "ranks1") # several ranks per brick: the same
+      succeed(${start} demo --size 90x70 --bricks 3 --mode mixed --replicate 2 --aux mixed)
+      foreach(name normal.pfm albedo.pfm position.pfm primitive.png instance.png)
+        file(SHA256 ${work}/aux.${name} one)
+        file(SHA256 ${work}/mixed.${name} other)
+        if(NOT one STREQUAL "${other}")
+          wrong("expected the same ${name} data- and mixed-parallel")
+        endif()
+      endforeach()
+    endif()
     foreach(name wall.0.png wall.1.png wall.2.png wall.3.png aux.normal.pfm aux.albedo.pfm aux.position.pfm
         aux.primitive.png aux.instance.png)
       file(SHA256 ${work}/${name} hash)
