@@ -43,6 +43,7 @@ struct Options {
     std::uint64_t seed = 1;
     int ao = 0, path = 0; // 0: off
     float aoDistance = 0.1f;
+    bool shadows = false;
     View view;
 
     float opacity = 0.6f;
@@ -257,9 +258,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("N")
         ->group(picture);
     app.add_option("--ao-distance", options.aoDistance,
-                   "How far these rays look, in units of the scene's largest extent; default 0.1")
+                   "How far these rays look and shadows are cast, in units of the scene's largest extent; default 0.1")
         ->check(detail::number(1e-6, 10))
         ->option_text("D")
+        ->group(picture);
+    app.add_flag("--shadows", options.shadows, "Shadows of surfaces and spheres on each other, as far as --ao-distance")
         ->group(picture);
     app.add_option(
            "--path", options.path,

@@ -16,6 +16,7 @@ inline RenderSettings renderSettings(const Options& options)
     settings.passes = options.spp;
     settings.aoRays = options.ao;
     settings.aoDistance = options.aoDistance;
+    settings.shadows = options.shadows;
     settings.pathBounces = options.path;
     settings.seed = options.seed;
     settings.opacity = options.opacity;

@@ -27,6 +27,7 @@ struct RenderSettings {
     std::uint64_t seed = 0;
     int aoRays = 0;             // of ambient occlusion, per hit of a surface or sphere; 0: none
     float aoDistance = 0.1f;    // how far they look, in units of the scene's largest extent
+    bool shadows = false;       // of the light, as far as that
     int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
     float opacity = 0.6f;       // of a surface or sphere
     float earlyTermination = 0; // a ray ends when less than this passes through it; 0: never
@@ -57,7 +58,7 @@ inline FrameCamera frameCamera(const SceneInfo& scene, const RenderSettings& set
 // How far secondary rays reach beyond a brick's cell, in world space: so far it needs ghosts.
 inline float ghostReach(const SceneInfo& scene, const RenderSettings& settings)
 {
-    return settings.aoRays > 0 ? settings.aoDistance * scene.bounds.largestExtent() : 0;
+    return settings.aoRays > 0 || settings.shadows ? settings.aoDistance * scene.bounds.largestExtent() : 0;
 }
 
 class Renderer {
@@ -278,6 +279,13 @@ private:
 
     static Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
+    // Also of what is beyond the cell, as far as shadows are cast.
+    bool isInShadow(const Vec3& point, const Light& light) const
+    {
+        const float reach = ghostReach(scene_, settings_);
+        return surfaces_.occluded(point, light.direction, 1e-3f * reach, reach);
+    }
+
     // Diffuse light from a bright sky, over the bounces of one path that begins at a hit. Volumes are left out.
     Vec3 pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits,
                    std::int64_t& cost) const
@@ -356,9 +364,13 @@ private:
         auto hit = hits.begin();
         const auto addHits = [&](float before) {
             for (; hit != hits.end() && hit->t <= before; ++hit) {
-                Vec3 c = light.shade(hit->color, hit->normal, direction) * settings_.opacity;
+                const Vec3 point = pointAt(origin, direction, hit->t);
+                const bool inShadow = settings_.shadows && settings_.opacity > 0 && isInShadow(point, light);
+                Vec3 c = (inShadow ? hit->color * light.ambient : light.shade(hit->color, hit->normal, direction))
+                         * settings_.opacity;
+                sum.cost += settings_.shadows;
                 if (settings_.aoRays > 0 && settings_.opacity > 0) {
-                    c = c * openness(*hit, pointAt(origin, direction, hit->t), direction, key);
+                    c = c * openness(*hit, point, direction, key);
                     sum.cost += settings_.aoRays;
                 }
                 sum.addSurface(*hit, settings_.opacity);

@@ -71,9 +71,10 @@ private:
 // One distant light that moves with the camera, so that every frame of an orbit is lit.
 struct Light {
     Vec3 direction; // unit, from the surface to the light
+    static constexpr float ambient = 0.30f;
 
     // Diffuse and ambient part for a unit normal of which either side counts.
-    float diffuse(const Vec3& normal) const { return 0.30f + 0.80f * std::fabs(dot(normal, direction)); }
+    float diffuse(const Vec3& normal) const { return ambient + 0.80f * std::fabs(dot(normal, direction)); }
 
     // Highlight for a unit normal and the unit direction of the view ray.
     float specular(const Vec3& normal, const Vec3& view) const

@@ -247,7 +247,7 @@ elseif(CASE STREQUAL "too_large")
 elseif(CASE STREQUAL "algorithms")
   # Whatever is asked for, the image does not show how many ranks there were.
   set(small --size 72x56 --bricks 3)
-  foreach(options "--ao 2" "--camera dof --spp 3" "--camera motion --spp 3" "--camera stereo" "--camera dome"
+  foreach(options "--ao 2" "--shadows" "--camera dof --spp 3" "--camera motion --spp 3" "--camera stereo" "--camera dome"
       "--mode image --path 2 --spp 2" "--interleave 3 --deep 8" "--interleave 3"
       "--adaptive 0.02 --spp 24 --ao 1" "--mode image --adaptive 0.02 --spp 24 --ao 1")
     separate_arguments(options)

@@ -252,13 +252,14 @@ TEST_CASE("Every camera sees the same scene, cut or whole", "[cut]")
     }
 }
 
-TEST_CASE("Ambient occlusion is the same, cut or whole, and needs its ghosts", "[cut]")
+TEST_CASE("Ambient occlusion and shadows are the same, cut or whole, and need their ghosts", "[cut]")
 {
     const Scene scene = example::demoScene(3);
     example::RenderSettings settings = settingsOf(96, 64);
     const Picture plain = render(scene, settings, {1, 0});
     settings.aoRays = 6;
     settings.aoDistance = 0.15f;
+    settings.shadows = true;
     const Picture whole = render(scene, settings, {1, 0});
     CHECK(largestDifference(plain.rgba, whole.rgba) > 0.1f);
     for (const int bricks : {1, 2, 5, 8}) {
