@@ -504,7 +504,7 @@ private:
 
     void submitFinish(int tile)
     {
-        gate_.enter(gate_.frame()); // we are inside, so it is open
+        gate_.enterAgain(); // we are inside
         messaging_->submit([this, tile] {
             ErrorInfo where;
             where.tile = tile;

@@ -80,6 +80,14 @@ public:
         return open_;
     }
 
+    // Once more, by somebody who is inside, for work that will go on after he has left: also while the gate closes, which
+    // then waits for that, too.
+    void enterAgain()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ++inside_;
+    }
+
     void leave()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
