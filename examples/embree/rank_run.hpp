@@ -171,7 +171,14 @@ public:
                 pixelOp.second.wall = wall_.get();
             config.format = dfb::OutputFormat::None;
         }
-        fb_ = std::make_unique<FrameBuffer>(messenger_, config, pixelOp);
+        try {
+            fb_ = std::make_unique<FrameBuffer>(messenger_, config, pixelOp);
+        } catch (const dfb::InvalidArgument&) {
+            // All ranks throw it. A messenger that ends while an exception passes tells the others that it has failed.
+            wall_.reset();
+            messenger_.reset();
+            throw;
+        }
     }
 
     // The exit code, the same on all ranks.
