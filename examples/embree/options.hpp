@@ -16,6 +16,7 @@
 namespace example {
 
 enum class Mode { Data, Image, Mixed };
+enum class Blending { Sort, Order, Nearest };
 enum class Balance { Cost, RoundRobin };
 enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
 enum class Compression { None, Snappy };
@@ -28,6 +29,7 @@ struct Options {
     int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;    // 0: one per rank
     int replicate = 2; // ranks that hold each brick, in mixed mode
+    Blending blend = Blending::Sort;
     Balance balance = Balance::Cost;
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
@@ -191,6 +193,12 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                    "default cost")
         ->transform(detail::choice({"cost", "round-robin"}))
         ->option_text("cost|round-robin")
+        ->group(how);
+    app.add_option("--blend", options.blend,
+                   "How the bricks of a pixel become one: sorted by depth; in the order of the bricks from the eye, "
+                   "without sorting or depth; or the nearest alone, for opaque scenes; default sort")
+        ->transform(detail::choice({"sort", "order", "nearest"}))
+        ->option_text("sort|order|nearest")
         ->group(how);
     app.add_option("--distribution", options.distribution,
                    "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on "
@@ -402,6 +410,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                 throw CLI::ValidationError(option, why);
         };
         const bool isData = options.mode == Mode::Data;
+        refuse(options.mode == Mode::Image, "--blend", "does not go with --mode image");
+        for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
+            refuse(options.blend != Blending::Sort, other, "does not go with --blend order or nearest");
+        refuse(options.blend == Blending::Order && options.view.kind != CameraKind::Perspective, "--camera",
+               "does not go with --blend order: one order is not right for all its rays");
         refuse(options.mode != Mode::Mixed, "--replicate", "needs --mode mixed");
         refuse(options.mode != Mode::Mixed, "--balance", "needs --mode mixed");
         refuse(options.mode != Mode::Image, "--distribution", "needs --mode image");

@@ -28,6 +28,8 @@ namespace example {
 inline constexpr dfb::ChannelMask tileChannels = dfb::allChannels & ~dfb::farChannel;
 using Blend = dfb::BasicAlphaBlend<64, tileChannels>;
 using Single = dfb::BasicImageParallel<64, tileChannels>;
+using Ordered = dfb::BasicOrderedBlend<64, tileChannels>;
+using Nearest = dfb::BasicDepthComposite<64, tileChannels>;
 // Samples are saved tile by tile: smaller tiles save more.
 using AdaptiveBlend = dfb::Progressive<dfb::BasicAlphaBlend<16, tileChannels>>;
 using AdaptiveSingle = dfb::Progressive<dfb::BasicImageParallel<16, tileChannels>>;
@@ -195,7 +197,7 @@ public:
         if (o_.background)
             params_.background = {(*o_.background)[0], (*o_.background)[1], (*o_.background)[2], 1.0f};
         const dfb::World world = worldOf(*scene_, settings_);
-        if (o_.mode == Mode::Mixed)
+        if (o_.mode == Mode::Mixed || std::is_same_v<TileOp, Ordered>)
             shared_.emplace(*fb_, world);
         ProgressLine progress(fb_->isDisplayRank(), o_.frames);
         for (int frame = 0; frame < o_.frames; ++frame) {
@@ -290,6 +292,10 @@ private:
                 *fb_, distribution,
                 [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, {},
                 pixelData);
+        } else if constexpr (std::is_same_v<TileOp, Ordered>) {
+            const Vec3& eye = camera.pose().origin;
+            const std::vector<int> order = dfb::visibilityOrder(*shared_, {eye.x, eye.y, eye.z});
+            report = dfb::renderOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, {}, pixelData);
         } else if (!shared_) {
             report = dfb::renderDataParallel(*fb_, world, camera, renderBrick, params, {}, pixelData);
         } else if (o_.balance == Balance::Cost) {
@@ -457,6 +463,10 @@ int runWith(const typename Transport::Communicator& communicator, const Options&
     using ToneMapToWall = dfb::PixelOpChain<dfb::ToneMap, ToWall>;
     if (o.deep > 0 || o.interleave > 1)
         return run(dfb::DeepBlend(), dfb::NoPixelOp());
+    if (o.blend == Blending::Order)
+        return run(Ordered(), dfb::NoPixelOp());
+    if (o.blend == Blending::Nearest)
+        return run(Nearest(), dfb::NoPixelOp());
     const bool isImage = o.mode == Mode::Image;
     if (o.adaptive > 0)
         return isImage ? run(AdaptiveSingle(), dfb::NoPixelOp()) : run(AdaptiveBlend(), dfb::NoPixelOp());
