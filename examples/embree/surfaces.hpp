@@ -80,14 +80,7 @@ public:
         query.cell = &cell_;
         query.hits = &hits;
         RTCRayHit ray{};
-        ray.ray.org_x = origin.x;
-        ray.ray.org_y = origin.y;
-        ray.ray.org_z = origin.z;
-        ray.ray.dir_x = direction.x;
-        ray.ray.dir_y = direction.y;
-        ray.ray.dir_z = direction.z;
-        ray.ray.tfar = std::numeric_limits<float>::infinity();
-        ray.ray.mask = ~0u;
+        ray.ray = rayOf(origin, direction, std::numeric_limits<float>::infinity());
         ray.hit.geomID = RTC_INVALID_GEOMETRY_ID;
 #if RTC_VERSION_MAJOR >= 4
         rtcInitRayQueryContext(&query.context);
@@ -120,15 +113,7 @@ public:
         query.direction = direction;
         query.from = static_cast<double>(from);
         query.to = static_cast<double>(to);
-        RTCRay ray{};
-        ray.org_x = origin.x;
-        ray.org_y = origin.y;
-        ray.org_z = origin.z;
-        ray.dir_x = direction.x;
-        ray.dir_y = direction.y;
-        ray.dir_z = direction.z;
-        ray.tfar = 1.001f * to; // it is our own distance that decides
-        ray.mask = ~0u;
+        RTCRay ray = rayOf(origin, direction, 1.001f * to); // it is our own distance that decides
 #if RTC_VERSION_MAJOR >= 4
         rtcInitRayQueryContext(&query.context);
         RTCOccludedArguments arguments;
@@ -143,6 +128,20 @@ public:
     }
 
 private:
+    static RTCRay rayOf(const Vec3& origin, const Vec3& direction, float farthest)
+    {
+        RTCRay ray{};
+        ray.org_x = origin.x;
+        ray.org_y = origin.y;
+        ray.org_z = origin.z;
+        ray.dir_x = direction.x;
+        ray.dir_y = direction.y;
+        ray.dir_z = direction.z;
+        ray.tfar = farthest;
+        ray.mask = ~0u;
+        return ray;
+    }
+
 #if RTC_VERSION_MAJOR >= 4
     using Context = RTCRayQueryContext;
 #else
