@@ -34,6 +34,7 @@ struct Options {
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
     int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
+    int inFlight = 1;                                // frames that may be open at once
     int threads = 0;                                 // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
     OwnerMap ownerMap = OwnerMap::Lattice;
@@ -239,6 +240,12 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->transform(detail::choice({"lattice", "linear", "hash"}))
         ->option_text("lattice|linear|hash")
         ->group(how);
+    app.add_option("--in-flight", options.inFlight,
+                   "Frames under way at once: a rank that has rendered its part of one begins the next while others "
+                   "still render; default 1")
+        ->check(detail::number(1, 64))
+        ->option_text("N")
+        ->group(how);
 
     const char* picture = "Picture";
     app.add_option("--size", size, "Of the image in pixels, each side 1 to 65536; default 1024x1024")
@@ -429,6 +436,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.adaptive > 0, "--exposure", "does not go with --adaptive");
         refuse(options.adaptive > 0 && options.spp < 8, "--adaptive",
                "needs --spp 8 or more: the most samples per pixel");
+        for (const char* other : {"--adaptive", "--wall"})
+            refuse(options.inFlight > 1, other, "does not go with --in-flight");
         for (const char* file : {"--alpha", "--depth", "--aux"})
             refuse(options.wallColumns > 0, file, "is not written for a wall");
         if (background.size() == 3)

@@ -157,6 +157,7 @@ struct RunStats {
     int width = 0, height = 0;
     std::string imageHash; // of the last frame
     double meanAlpha = 0;
+    double runMs = 0; // from the start of the first frame to the end of the last
     std::uint64_t samplesTaken = 0, samplesSaved = 0; // of pixels, in the last frame
     std::vector<FrameStats> frames;
 };
@@ -171,6 +172,7 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
     json["height"] = run.height;
     json["image_hash"] = run.imageHash;
     json["mean_alpha"] = run.meanAlpha;
+    json["run_ms"] = run.runMs;
     json["samples_taken"] = run.samplesTaken;
     json["samples_saved"] = run.samplesSaved;
     json["frames"] = nlohmann::ordered_json::array();

@@ -10,9 +10,11 @@
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstring>
+#include <deque>
 #include <exception>
 #include <limits>
 #include <memory>
@@ -56,6 +58,7 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
                     : !o.output.empty() || !o.depth.empty() || !o.aux.empty() ? dfb::OutputFormat::SRGBA8
                                                                               : dfb::OutputFormat::None;
     config.depth = !o.depth.empty();
+    config.framesInFlight = std::min(o.inFlight, o.frames);
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
@@ -200,15 +203,23 @@ public:
         if (o_.mode == Mode::Mixed || std::is_same_v<TileOp, Ordered>)
             shared_.emplace(*fb_, world);
         ProgressLine progress(fb_->isDisplayRank(), o_.frames);
+        const auto begin = std::chrono::steady_clock::now();
+        std::deque<typename FrameBuffer::Frame> open;
         for (int frame = 0; frame < o_.frames; ++frame) {
             progress.beginFrame(frame);
-            tiles_ = samples_ = 0;
-            if constexpr (is_adaptive_v<TileOp>)
-                renderAdaptively(frame, world, progress);
-            else
-                addReport(renderFrame(frame, world, params_, progress));
-            perRank_.push_back(ofAllRanks());
+            tiles_ = work_ = 0;
+            if constexpr (is_adaptive_v<TileOp>) {
+                reports_.push_back(renderAdaptively(frame, world, progress));
+            } else {
+                if (static_cast<int>(open.size()) == fb_->config().framesInFlight)
+                    endFirst(open);
+                open.push_back(startFrame(frame, world, params_, progress));
+            }
+            rendered_.insert(rendered_.end(), {tiles_, work_});
         }
+        while (!open.empty())
+            endFirst(open);
+        runMs_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - begin).count();
         progress.end();
         return finish() ? 0 : 1;
     }
@@ -254,8 +265,9 @@ private:
             requireWritable(path);
     }
 
-    dfb::FrameReport renderFrame(int frame, const dfb::World& world, const dfb::FrameParams& params,
-                                 ProgressLine& progress)
+    // Renders what this rank has to.
+    typename FrameBuffer::Frame startFrame(int frame, const dfb::World& world, const dfb::FrameParams& params,
+                                           ProgressLine& progress)
     {
         const FrameCamera camera = frameCamera(scene_->info, settings_, frame);
         typename FrameBuffer::PixelFrameData pixelData{};
@@ -265,16 +277,15 @@ private:
             pixelData.first.exposure = o_.exposure;
         const auto count = [&](std::int64_t cost) {
             ++tiles_;
-            samples_ += cost;
+            work_ += cost;
             progress.tileDone();
             return static_cast<double>(cost);
         };
         const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
             return count(scene_->of(brick.id).front().renderTile(tile, frame));
         };
-        dfb::FrameReport report;
         if constexpr (is_deep_v<TileOp>) {
-            report = dfb::renderDeepParallel(
+            return dfb::startDeepParallel(
                 *fb_, world, camera, std::max(1, o_.deep),
                 [&](const dfb::Brick& brick, dfb::DeepTile& deep) {
                     std::int64_t cost = 0;
@@ -288,28 +299,34 @@ private:
                                       : o_.distribution == Distribution::RoundRobin ? dfb::WorkDistribution::RoundRobin
                                       : o_.distribution == Distribution::Dynamic    ? dfb::WorkDistribution::Dynamic
                                                                                     : dfb::WorkDistribution::Owned;
-            report = dfb::renderImageParallel(
+            return dfb::startImageParallel(
                 *fb_, distribution,
                 [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, {},
                 pixelData);
         } else if constexpr (std::is_same_v<TileOp, Ordered>) {
             const Vec3& eye = camera.pose().origin;
             const std::vector<int> order = dfb::visibilityOrder(*shared_, {eye.x, eye.y, eye.z});
-            report = dfb::renderOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, {}, pixelData);
+            return dfb::startOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, {}, pixelData);
         } else if (!shared_) {
-            report = dfb::renderDataParallel(*fb_, world, camera, renderBrick, params, {}, pixelData);
+            return dfb::startDataParallel(*fb_, world, camera, renderBrick, params, {}, pixelData);
         } else if (o_.balance == Balance::Cost) {
-            report = dfb::renderMixedParallel(*fb_, *shared_, camera, byCost_, renderBrick, params, {}, pixelData);
-            byCost_.update(report);
+            return dfb::startMixedParallel(*fb_, *shared_, camera, byCost_, renderBrick, params, {}, pixelData);
         } else {
-            report = dfb::renderMixedParallel(*fb_, *shared_, camera, inTurn_, renderBrick, params, {}, pixelData);
+            return dfb::startMixedParallel(*fb_, *shared_, camera, inTurn_, renderBrick, params, {}, pixelData);
         }
-        if constexpr (hasWall)
-            wall_->finish(report.frame);
-        return report;
     }
 
-    void renderAdaptively(int frame, const dfb::World& world, ProgressLine& progress)
+    void endFirst(std::deque<typename FrameBuffer::Frame>& open)
+    {
+        reports_.push_back(open.front().end());
+        open.pop_front();
+        if (o_.mode == Mode::Mixed && o_.balance == Balance::Cost)
+            byCost_.update(reports_.back());
+        if constexpr (hasWall)
+            wall_->finish(reports_.back().frame);
+    }
+
+    dfb::FrameReport renderAdaptively(int frame, const dfb::World& world, ProgressLine& progress)
     {
         if (!sampler_)
             sampler_.emplace(fb_->layout(), dfb::SamplingSettings{o_.adaptive, std::min(8, o_.spp), o_.spp, 64});
@@ -317,7 +334,7 @@ private:
             sampler_->reset();
         std::optional<dfb::FrameReport> sum;
         while (!sampler_->done()) {
-            const dfb::FrameReport report = renderFrame(frame, world, sampler_->next(params_), progress);
+            const dfb::FrameReport report = startFrame(frame, world, sampler_->next(params_), progress).end();
             sampler_->update(report);
             if (!sum) {
                 sum = report;
@@ -330,21 +347,17 @@ private:
             sum->messagesSent += report.messagesSent;
             sum->peakMemoryBytes = std::max(sum->peakMemoryBytes, report.peakMemoryBytes);
         }
-        addReport(*sum);
+        return *sum;
     }
 
-    void addReport(const dfb::FrameReport& report) { reports_.push_back(report); }
-
-    // Tiles and samples of each rank in this frame.
-    std::vector<std::pair<std::int64_t, std::int64_t>> ofAllRanks()
+    // What `rendered_` is on each rank.
+    std::vector<std::vector<std::int64_t>> renderedByAll()
     {
-        const std::int64_t mine[2] = {tiles_, samples_};
-        const auto* first = reinterpret_cast<const std::byte*>(mine);
-        std::vector<std::pair<std::int64_t, std::int64_t>> all;
-        for (const auto& bytes : fb_->allGather(std::vector<std::byte>(first, first + sizeof mine))) {
-            std::int64_t of[2];
-            std::memcpy(of, bytes.data(), sizeof of);
-            all.emplace_back(of[0], of[1]);
+        const auto* first = reinterpret_cast<const std::byte*>(rendered_.data());
+        std::vector<std::vector<std::int64_t>> all;
+        for (const auto& bytes : fb_->allGather({first, first + rendered_.size() * sizeof(std::int64_t)})) {
+            all.emplace_back(rendered_.size());
+            std::memcpy(all.back().data(), bytes.data(), bytes.size());
         }
         return all;
     }
@@ -359,12 +372,13 @@ private:
         }
         overheadNs = fb_->allReduce(overheadNs, Reduce::Min);
         totalNs = fb_->allReduce(totalNs, Reduce::Max);
+        const auto rendered = renderedByAll();
         if (hasWall && !o_.output.empty() && !onAllRanks([&] { writeDisplays(); }))
             return false;
         return onAllRanks([&] {
             if (!fb_->isDisplayRank())
                 return;
-            const RunStats stats = statsOf(overheadNs, totalNs);
+            const RunStats stats = statsOf(overheadNs, totalNs, rendered);
             writeFiles(o_, fb_->image(), stats);
             say(stats);
         });
@@ -378,7 +392,8 @@ private:
                     writeImage(numbered(o_.output, d), wall_->image(d));
     }
 
-    RunStats statsOf(const std::vector<std::int64_t>& overheadNs, const std::vector<std::int64_t>& totalNs) const
+    RunStats statsOf(const std::vector<std::int64_t>& overheadNs, const std::vector<std::int64_t>& totalNs,
+                     const std::vector<std::vector<std::int64_t>>& rendered) const
     {
         RunStats stats;
         stats.ranks = fb_->size();
@@ -386,6 +401,7 @@ private:
         stats.mode = o_.mode == Mode::Data ? "data" : o_.mode == Mode::Image ? "image" : "mixed";
         stats.width = o_.width;
         stats.height = o_.height;
+        stats.runMs = runMs_;
         for (std::size_t i = 0; i < reports_.size(); ++i) {
             const dfb::FrameReport& r = reports_[i];
             FrameStats s;
@@ -399,9 +415,9 @@ private:
             s.peakMemoryBytes = static_cast<std::uint64_t>(r.peakMemoryBytes);
             s.orderUndefinedPixels = static_cast<std::uint64_t>(r.orderUndefinedPixels);
             s.mergeErrorBound = r.mergeErrorBound;
-            for (const auto& [tiles, samples] : perRank_[i]) {
-                s.tilesRendered.push_back(static_cast<std::uint64_t>(tiles));
-                s.workOfRanks.push_back(static_cast<std::uint64_t>(samples));
+            for (const auto& ofRank : rendered) {
+                s.tilesRendered.push_back(static_cast<std::uint64_t>(ofRank[2 * i]));
+                s.workOfRanks.push_back(static_cast<std::uint64_t>(ofRank[2 * i + 1]));
             }
             stats.frames.push_back(s);
         }
@@ -417,12 +433,10 @@ private:
 
     void say(const RunStats& stats) const
     {
-        double total = 0;
-        for (const FrameStats& s : stats.frames)
-            total += s.totalMs;
         std::printf("%d %s of %dx%d on %d %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n",
                     o_.frames, o_.frames == 1 ? "frame" : "frames", o_.width, o_.height, stats.ranks,
-                    stats.ranks == 1 ? "rank" : "ranks", total / o_.frames, stats.frames.back().compositingOverheadMs);
+                    stats.ranks == 1 ? "rank" : "ranks", stats.runMs / o_.frames,
+                    stats.frames.back().compositingOverheadMs);
         if (sampler_)
             std::printf("%.1f %% of the samples of --spp %d were taken\n",
                         100.0 * static_cast<double>(stats.samplesTaken)
@@ -447,9 +461,10 @@ private:
     dfb::MeasuredCostBricks byCost_;
     dfb::RoundRobinBricks inTurn_;
     std::optional<dfb::AdaptiveSampler> sampler_;
-    std::atomic<std::int64_t> tiles_{0}, samples_{0}; // of this rank in this frame
+    std::atomic<std::int64_t> tiles_{0}, work_{0}; // of this rank in this frame
+    std::vector<std::int64_t> rendered_;           // both, of each frame
+    double runMs_ = 0;
     std::vector<dfb::FrameReport> reports_;
-    std::vector<std::vector<std::pair<std::int64_t, std::int64_t>>> perRank_;
 };
 
 // Picks the operations that the options ask for.

@@ -3,4 +3,5 @@
 #include "in_flight.hpp"
 
 template algorithms::Result algorithms::inProcess<algorithms::TwoFrames>(int);
+template algorithms::Result algorithms::inProcess<algorithms::LoopsInFlight>(int);
 template algorithms::Result algorithms::inProcess<algorithms::TwoFrameBuffers>(int);

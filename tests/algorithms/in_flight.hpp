@@ -3,6 +3,7 @@
 
 #include "everywhere.hpp"
 
+#include <deque>
 #include <memory>
 #include <utility>
 
@@ -76,6 +77,46 @@ struct TwoFrames {
     }
 };
 
+// Frames of different loops, each begun before the one before has ended.
+struct LoopsInFlight {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 3);
+        auto config = configOf(s, 2);
+        config.framesInFlight = 3;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+        dfb::World world;
+        for (const dfb::Brick& b : bricksOf(s, fb.rank(), fb.size()))
+            world.add(b);
+        const dfb::SharedWorld shared(fb, world);
+        dfb::RoundRobinBricks inTurn;
+        const auto render = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
+        std::deque<decltype(fb.begin())> open;
+        for (int round = 0; round < 9; ++round) {
+            if (open.size() == 3) {
+                const dfb::FrameReport report = open.front().end();
+                open.pop_front();
+                result.expect(report.frame == round - 2, "not the oldest");
+                if (fb.isDisplayRank()) {
+                    const scene::Picture picture(fb.image(), report);
+                    result.expect(wrongValues(picture, referenceOf(s)) == 0, "values");
+                    result.hash = picture.hash();
+                }
+            }
+            open.push_back(round % 2 == 0
+                               ? dfb::startDataParallel(fb, world, scene::FlatCamera(), render, paramsOf(s))
+                               : dfb::startMixedParallel(fb, shared, scene::FlatCamera(), inTurn, render, paramsOf(s)));
+        }
+        while (open.size() > 1) {
+            open.front().end();
+            open.pop_front();
+        }
+        return result; // the last is not ended: it is cancelled
+    }
+};
+
 // Two framebuffers of other sizes and operations, over one messenger.
 struct TwoFrameBuffers {
     template <class Transport>
@@ -109,6 +150,7 @@ struct TwoFrameBuffers {
 
 // In in_flight.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<TwoFrames>(int);
+extern template Result inProcess<LoopsInFlight>(int);
 extern template Result inProcess<TwoFrameBuffers>(int);
 
 } // namespace algorithms
@@ -117,6 +159,11 @@ extern template Result inProcess<TwoFrameBuffers>(int);
 TEST_CASE("Two frames of one framebuffer at once do not disturb each other", "[in_flight]")
 {
     everywhere<algorithms::TwoFrames>();
+}
+
+TEST_CASE("Rendering loops begin a frame before others have ended", "[in_flight]")
+{
+    everywhere<algorithms::LoopsInFlight>();
 }
 
 TEST_CASE("Two framebuffers with open frames do not disturb each other", "[in_flight]")

@@ -11,17 +11,17 @@
 
 namespace dfb {
 
-// Collective. Renders all bricks of `world` into the tiles that they may project to, and ends the frame; every brick
-// must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once, for each
-// pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
+// Renders all bricks of `world` into the tiles that they may project to, and returns the frame, which is to be ended;
+// every brick must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once,
+// for each pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
 // brick.bounds into the cleared tile, depth growing away from the camera. Unlike in Listing 3 the owners do not count
 // the bricks that project to their tiles: each rank declares what it will send, so the two can not disagree. Throws
-// what Frame::end() throws; an exception of renderBrick becomes a FrameError on all ranks.
+// what FrameBuffer::begin() throws; an exception of renderBrick becomes a FrameError of Frame::end() on all ranks.
 template <class FrameBuffer, class Camera, class RenderBrick>
-FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera& camera,
-                               const RenderBrick& renderBrick, FrameParams params = {},
-                               const typename FrameBuffer::TileFrameData& tileData = {},
-                               const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startDataParallel(FrameBuffer& fb, const World& world, const Camera& camera,
+                                                            const RenderBrick& renderBrick, FrameParams params = {},
+                                                            const typename FrameBuffer::TileFrameData& tileData = {},
+                                                            const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
@@ -39,7 +39,17 @@ FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera
         renderBrick(brick, tile);
         frame.setTile(tile);
     });
-    return frame.end();
+    return frame;
+}
+
+// Collective. The same, and ends the frame. Throws what Frame::end() throws.
+template <class FrameBuffer, class Camera, class RenderBrick>
+FrameReport renderDataParallel(FrameBuffer& fb, const World& world, const Camera& camera,
+                               const RenderBrick& renderBrick, const FrameParams& params = {},
+                               const typename FrameBuffer::TileFrameData& tileData = {},
+                               const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startDataParallel(fb, world, camera, renderBrick, params, tileData, pixelData).end();
 }
 
 } // namespace dfb

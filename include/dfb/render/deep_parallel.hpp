@@ -23,15 +23,16 @@ template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
-// Collective. As renderDataParallel(), with the bounds of bricks enclosing what they have; they may overlap.
+// As startDataParallel(), with the bounds of bricks enclosing what they have; they may overlap.
 // `renderBrick(brick, deep)` adds the segments of the pixels of deep.header().region to the empty DeepTile, of which
 // each pixel keeps `maxSegments` at most. FrameReport::mergeErrorBound is how much that may have changed a pixel. The
 // first segments of a brick's pixels announce the others as children: a pixel with one costs what it costs without.
 template <class FrameBuffer, class Camera, class RenderBrick>
-FrameReport renderDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera, int maxSegments,
-                               const RenderBrick& renderBrick, FrameParams params = {},
-                               const typename FrameBuffer::TileFrameData& tileData = {},
-                               const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera,
+                                                            int maxSegments, const RenderBrick& renderBrick,
+                                                            FrameParams params = {},
+                                                            const typename FrameBuffer::TileFrameData& tileData = {},
+                                                            const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     if (maxSegments < 1 || maxSegments > 65535)
         throw InvalidArgument("a pixel has 1 to 65535 segments");
@@ -78,7 +79,17 @@ FrameReport renderDeepParallel(FrameBuffer& fb, const World& world, const Camera
         const std::lock_guard<std::mutex> lock(mutex);
         spare.push_back(std::move(deep));
     });
-    return frame.end();
+    return frame;
+}
+
+// Collective. The same, and ends the frame. Throws what Frame::end() throws.
+template <class FrameBuffer, class Camera, class RenderBrick>
+FrameReport renderDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera, int maxSegments,
+                               const RenderBrick& renderBrick, const FrameParams& params = {},
+                               const typename FrameBuffer::TileFrameData& tileData = {},
+                               const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startDeepParallel(fb, world, camera, maxSegments, renderBrick, params, tileData, pixelData).end();
 }
 
 } // namespace dfb

@@ -20,14 +20,15 @@ enum class WorkDistribution : std::uint8_t {
     Dynamic     // one half as with Linear, the other handed out on demand, in shares that shrink
 };
 
-// Collective. Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and ends
-// the frame. `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and
-// tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what Frame::end() throws; an exception
-// of renderTile becomes a FrameError on all ranks.
+// Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and returns the
+// frame, which is to be ended. `renderTile(tile)` is called from several threads at once, for each pass with its own
+// tile.pass and tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what
+// FrameBuffer::begin() throws; an exception of renderTile becomes a FrameError of Frame::end() on all ranks.
 template <class FrameBuffer, class RenderTile>
-FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigned, const RenderTile& renderTile,
-                                FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startImageParallel(FrameBuffer& fb, const std::vector<int>& assigned,
+                                                             const RenderTile& renderTile, FrameParams params = {},
+                                                             const typename FrameBuffer::TileFrameData& tileData = {},
+                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = false;
     params.declarationKey = 0;
@@ -40,17 +41,19 @@ FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigne
         renderTile(tile);
         frame.setTile(tile);
     });
-    return frame.end();
+    return frame;
 }
 
-// The same, the tiles and passes distributed in one of these ways, the same on all ranks.
+// The same, the tiles and passes distributed in one of these ways, the same on all ranks. Collective with
+// WorkDistribution::Dynamic.
 template <class FrameBuffer, class RenderTile>
-FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, const RenderTile& renderTile,
-                                FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startImageParallel(FrameBuffer& fb, WorkDistribution distribution,
+                                                             const RenderTile& renderTile, FrameParams params = {},
+                                                             const typename FrameBuffer::TileFrameData& tileData = {},
+                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     if (distribution == WorkDistribution::Owned)
-        return renderImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
+        return startImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
     params.declared = false;
     params.declarationKey = 0;
     auto frame = fb.begin(params, tileData, pixelData);
@@ -83,7 +86,26 @@ FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, 
         break;
     case WorkDistribution::Owned: break;
     }
-    return frame.end();
+    return frame;
+}
+
+// Collective. Renders the tiles of startImageParallel() and ends the frame. Throws what Frame::end() throws.
+template <class FrameBuffer, class RenderTile>
+FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigned, const RenderTile& renderTile,
+                                const FrameParams& params = {},
+                                const typename FrameBuffer::TileFrameData& tileData = {},
+                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startImageParallel(fb, assigned, renderTile, params, tileData, pixelData).end();
+}
+
+template <class FrameBuffer, class RenderTile>
+FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, const RenderTile& renderTile,
+                                const FrameParams& params = {},
+                                const typename FrameBuffer::TileFrameData& tileData = {},
+                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startImageParallel(fb, distribution, renderTile, params, tileData, pixelData).end();
 }
 
 // The same, each rank rendering the tiles that it owns.
@@ -92,7 +114,7 @@ FrameReport renderImageParallel(FrameBuffer& fb, const RenderTile& renderTile, c
                                 const typename FrameBuffer::TileFrameData& tileData = {},
                                 const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
-    return renderImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
+    return renderImageParallel(fb, WorkDistribution::Owned, renderTile, params, tileData, pixelData);
 }
 
 } // namespace dfb

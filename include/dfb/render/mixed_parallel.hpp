@@ -210,14 +210,15 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
 
 } // namespace detail
 
-// Collective. As renderDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says
-// which of them renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is
-// that of renderDataParallel() bit for bit, whoever renders what.
+// As startDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says which of them
+// renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is that of data-
+// parallel rendering bit for bit, whoever renders what.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const Camera& camera, TileBrickOwner& owner,
-                                const RenderBrick& renderBrick, FrameParams params = {},
-                                const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startMixedParallel(FrameBuffer& fb, const SharedWorld& world,
+                                                             const Camera& camera, TileBrickOwner& owner,
+                                                             const RenderBrick& renderBrick, FrameParams params = {},
+                                                             const typename FrameBuffer::TileFrameData& tileData = {},
+                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
@@ -244,17 +245,28 @@ FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const
             frame.setTile(tile);
         });
     });
-    return frame.end();
+    return frame;
 }
 
-// Collective. The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
+// Collective. The same, and ends the frame. Throws what Frame::end() throws.
+template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
+FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const Camera& camera, TileBrickOwner& owner,
+                                const RenderBrick& renderBrick, const FrameParams& params = {},
+                                const typename FrameBuffer::TileFrameData& tileData = {},
+                                const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startMixedParallel(fb, world, camera, owner, renderBrick, params, tileData, pixelData).end();
+}
+
+// The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
 // visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
 // manifest. Only where one order is right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                          const std::vector<int>& order, TileBrickOwner& owner, const RenderBrick& renderBrick,
-                          FrameParams params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
-                          const typename FrameBuffer::PixelFrameData& pixelData = {})
+[[nodiscard]] typename FrameBuffer::Frame startOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+                                                       const std::vector<int>& order, TileBrickOwner& owner,
+                                                       const RenderBrick& renderBrick, FrameParams params = {},
+                                                       const typename FrameBuffer::TileFrameData& tileData = {},
+                                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = false;
     params.declarationKey = 0;
@@ -297,7 +309,17 @@ FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camer
             frame.setTile(tile);
         });
     });
-    return frame.end();
+    return frame;
+}
+
+// Collective. The same, and ends the frame. Throws what Frame::end() throws.
+template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
+FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+                          const std::vector<int>& order, TileBrickOwner& owner, const RenderBrick& renderBrick,
+                          const FrameParams& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                          const typename FrameBuffer::PixelFrameData& pixelData = {})
+{
+    return startOrdered(fb, world, camera, order, owner, renderBrick, params, tileData, pixelData).end();
 }
 
 } // namespace dfb
