@@ -3,6 +3,8 @@
 
 #include "camera.hpp"
 
+#include <dfb/wire_format.hpp>
+
 #include <CLI/CLI.hpp>
 
 #include <array>
@@ -34,8 +36,12 @@ struct Options {
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
     int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
-    int inFlight = 1;                                // frames that may be open at once
-    int threads = 0;                                 // per rank; 0: as many as the machine has
+    dfb::WireFormat wire = dfb::WireFormat::Float32, wireDepth = dfb::WireFormat::Float32;
+    double errorBudget = 0;     // 0: `wire`
+    float minTransmittance = 0; // 0: off
+    bool verify = false;
+    int inFlight = 1; // frames that may be open at once
+    int threads = 0;  // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
     OwnerMap ownerMap = OwnerMap::Lattice;
 
@@ -235,6 +241,30 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option("--compression", options.compression, "Of messages between ranks; default none")
         ->transform(detail::choice({"none", "snappy"}))
         ->option_text("none|snappy")
+        ->group(how);
+    app.add_option("--wire", options.wire,
+                   "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
+                   "tiles stay float32; default float32")
+        ->transform(detail::choice({"float32", "float16", "unorm16", "unorm8"}))
+        ->option_text("float32|float16|unorm16|unorm8")
+        ->group(how);
+    app.add_option("--error-budget", options.errorBudget,
+                   "Take the cheapest of these formats that is sure to change no pixel by more than this, before it is "
+                   "converted for output; default 0: --wire says")
+        ->check(detail::number(0, 1))
+        ->option_text("E")
+        ->group(how);
+    app.add_option("--wire-depth", options.wireDepth, "Format of the depth of tiles on their way; default float32")
+        ->transform(detail::choice({"float32", "float16"}))
+        ->option_text("float32|float16")
+        ->group(how);
+    app.add_option("--min-transmittance", options.minTransmittance,
+                   "Leave out what is behind bricks that let less than this part of the light through; default 0")
+        ->check(detail::number(0, 0.99))
+        ->option_text("T")
+        ->group(how);
+    app.add_flag("--verify", options.verify,
+                 "Check each finished tile against an exact reference of what it was made of; slow")
         ->group(how);
     app.add_option("--owner-map", options.ownerMap, "Which rank owns which tile; default lattice")
         ->transform(detail::choice({"lattice", "linear", "hash"}))
@@ -436,6 +466,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.adaptive > 0, "--exposure", "does not go with --adaptive");
         refuse(options.adaptive > 0 && options.spp < 8, "--adaptive",
                "needs --spp 8 or more: the most samples per pixel");
+        refuse(options.errorBudget > 0, "--wire", "does not go with --error-budget");
+        for (const char* other : {"--adaptive", "--interleave", "--deep", "--exposure", "--blend", "--wall"})
+            refuse(options.verify, other, "does not go with --verify");
         for (const char* other : {"--adaptive", "--wall"})
             refuse(options.inFlight > 1, other, "does not go with --in-flight");
         for (const char* file : {"--alpha", "--depth", "--aux"})

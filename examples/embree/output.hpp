@@ -149,6 +149,8 @@ struct FrameStats {
     std::vector<std::uint64_t> tilesRendered, workOfRanks;
     std::uint64_t orderUndefinedPixels = 0;
     double mergeErrorBound = 0;
+    std::string wireColor; // the format of the colour on its way
+    double wireErrorBound = 0;
 };
 
 struct RunStats {
@@ -188,6 +190,8 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["peak_memory_bytes"] = frame.peakMemoryBytes;
         entry["order_undefined_pixels"] = frame.orderUndefinedPixels;
         entry["merge_error_bound"] = frame.mergeErrorBound;
+        entry["wire_color"] = frame.wireColor;
+        entry["wire_error_bound"] = frame.wireErrorBound;
         entry["tiles_rendered"] = frame.tilesRendered;
         entry["work_of_ranks"] = frame.workOfRanks;
         json["frames"].push_back(entry);

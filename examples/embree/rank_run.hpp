@@ -7,6 +7,7 @@
 #include "rank_scene.hpp"
 
 #include <dfb/dfb.hpp>
+#include <dfb/testing/verified.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -36,8 +37,14 @@ using Nearest = dfb::BasicDepthComposite<64, tileChannels>;
 using AdaptiveBlend = dfb::Progressive<dfb::BasicAlphaBlend<16, tileChannels>>;
 using AdaptiveSingle = dfb::Progressive<dfb::BasicImageParallel<16, tileChannels>>;
 
+using VerifiedBlend = dfb::testing::Verified<Blend>;
+using VerifiedSingle = dfb::testing::Verified<Single>;
+
 template <class TileOp>
-inline constexpr bool is_single_v = std::is_same_v<TileOp, Single> || std::is_same_v<TileOp, AdaptiveSingle>;
+inline constexpr bool is_single_v =
+    std::is_same_v<TileOp, Single> || std::is_same_v<TileOp, AdaptiveSingle> || std::is_same_v<TileOp, VerifiedSingle>;
+template <class TileOp>
+inline constexpr bool is_verified_v = std::is_same_v<TileOp, VerifiedBlend> || std::is_same_v<TileOp, VerifiedSingle>;
 template <class TileOp>
 inline constexpr bool is_adaptive_v = std::is_same_v<TileOp, AdaptiveBlend> || std::is_same_v<TileOp, AdaptiveSingle>;
 template <class TileOp>
@@ -58,6 +65,9 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
                     : !o.output.empty() || !o.depth.empty() || !o.aux.empty() ? dfb::OutputFormat::SRGBA8
                                                                               : dfb::OutputFormat::None;
     config.depth = !o.depth.empty();
+    config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
+    config.wire.depth = o.wireDepth;
+    config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
@@ -197,6 +207,7 @@ public:
             return 1;
         settings_ = renderSettings(o_);
         params_.passes = o_.spp;
+        params_.maxLayers = static_cast<int>(scene_->bounds.size()) * std::max(1, o_.deep);
         if (o_.background)
             params_.background = {(*o_.background)[0], (*o_.background)[1], (*o_.background)[2], 1.0f};
         const dfb::World world = worldOf(*scene_, settings_);
@@ -275,6 +286,9 @@ private:
             pixelData.exposure = o_.exposure;
         if constexpr (std::is_same_v<PixelOp, ToneMapToWall>)
             pixelData.first.exposure = o_.exposure;
+        typename FrameBuffer::TileFrameData tileData{};
+        if constexpr (is_verified_v<TileOp>)
+            tileData = &verification_;
         const auto count = [&](std::int64_t cost) {
             ++tiles_;
             work_ += cost;
@@ -293,7 +307,7 @@ private:
                         cost += cell.renderDeep(deep, frame);
                     count(cost);
                 },
-                params, {}, pixelData);
+                params, tileData, pixelData);
         } else if constexpr (is_single_v<TileOp>) {
             const auto distribution = o_.distribution == Distribution::Linear       ? dfb::WorkDistribution::Linear
                                       : o_.distribution == Distribution::RoundRobin ? dfb::WorkDistribution::RoundRobin
@@ -301,18 +315,18 @@ private:
                                                                                     : dfb::WorkDistribution::Owned;
             return dfb::startImageParallel(
                 *fb_, distribution,
-                [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, {},
+                [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, tileData,
                 pixelData);
         } else if constexpr (std::is_same_v<TileOp, Ordered>) {
             const Vec3& eye = camera.pose().origin;
             const std::vector<int> order = dfb::visibilityOrder(*shared_, {eye.x, eye.y, eye.z});
-            return dfb::startOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, {}, pixelData);
+            return dfb::startOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, tileData, pixelData);
         } else if (!shared_) {
-            return dfb::startDataParallel(*fb_, world, camera, renderBrick, params, {}, pixelData);
+            return dfb::startDataParallel(*fb_, world, camera, renderBrick, params, tileData, pixelData);
         } else if (o_.balance == Balance::Cost) {
-            return dfb::startMixedParallel(*fb_, *shared_, camera, byCost_, renderBrick, params, {}, pixelData);
+            return dfb::startMixedParallel(*fb_, *shared_, camera, byCost_, renderBrick, params, tileData, pixelData);
         } else {
-            return dfb::startMixedParallel(*fb_, *shared_, camera, inTurn_, renderBrick, params, {}, pixelData);
+            return dfb::startMixedParallel(*fb_, *shared_, camera, inTurn_, renderBrick, params, tileData, pixelData);
         }
     }
 
@@ -373,6 +387,9 @@ private:
         overheadNs = fb_->allReduce(overheadNs, Reduce::Min);
         totalNs = fb_->allReduce(totalNs, Reduce::Max);
         const auto rendered = renderedByAll();
+        const dfb::testing::ErrorReport checked = verification_.report();
+        const auto verified = fb_->allReduce(
+            {checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes}, Reduce::Sum);
         if (hasWall && !o_.output.empty() && !onAllRanks([&] { writeDisplays(); }))
             return false;
         return onAllRanks([&] {
@@ -381,6 +398,9 @@ private:
             const RunStats stats = statsOf(overheadNs, totalNs, rendered);
             writeFiles(o_, fb_->image(), stats);
             say(stats);
+            if (o_.verify)
+                std::printf("%lld of %lld values are not the exact result rounded\n",
+                            static_cast<long long>(verified[0] - verified[1]), static_cast<long long>(verified[0]));
         });
     }
 
@@ -415,6 +435,8 @@ private:
             s.peakMemoryBytes = static_cast<std::uint64_t>(r.peakMemoryBytes);
             s.orderUndefinedPixels = static_cast<std::uint64_t>(r.orderUndefinedPixels);
             s.mergeErrorBound = r.mergeErrorBound;
+            s.wireColor = dfb::nameOf(r.wireColor);
+            s.wireErrorBound = r.wireErrorBound;
             for (const auto& ofRank : rendered) {
                 s.tilesRendered.push_back(static_cast<std::uint64_t>(ofRank[2 * i]));
                 s.workOfRanks.push_back(static_cast<std::uint64_t>(ofRank[2 * i + 1]));
@@ -446,6 +468,10 @@ private:
             std::printf("order undefined at %llu pixels; merging changed none by more than %.3g\n",
                         static_cast<unsigned long long>(stats.frames.back().orderUndefinedPixels),
                         stats.frames.back().mergeErrorBound);
+        const FrameStats& last = stats.frames.back();
+        if (last.wireErrorBound > 0)
+            std::printf("tiles travelled as %s: no pixel is off by more than %.3g\n", last.wireColor.c_str(),
+                        last.wireErrorBound);
         for (const std::string& path : files())
             std::printf("wrote %s\n", path.c_str());
     }
@@ -464,6 +490,7 @@ private:
     std::atomic<std::int64_t> tiles_{0}, work_{0}; // of this rank in this frame
     std::vector<std::int64_t> rendered_;           // both, of each frame
     double runMs_ = 0;
+    dfb::testing::Verification verification_;
     std::vector<dfb::FrameReport> reports_;
 };
 
@@ -478,6 +505,8 @@ int runWith(const typename Transport::Communicator& communicator, const Options&
     using ToneMapToWall = dfb::PixelOpChain<dfb::ToneMap, ToWall>;
     if (o.deep > 0 || o.interleave > 1)
         return run(dfb::DeepBlend(), dfb::NoPixelOp());
+    if (o.verify)
+        return o.mode == Mode::Image ? run(VerifiedSingle(), dfb::NoPixelOp()) : run(VerifiedBlend(), dfb::NoPixelOp());
     if (o.blend == Blending::Order)
         return run(Ordered(), dfb::NoPixelOp());
     if (o.blend == Blending::Nearest)

@@ -5,9 +5,11 @@
 // in (depth, position in the list of layers), colour and alpha accumulate as A += T * a, and T *= 1 - a is
 // carried by itself. For colour and alpha that are finite floats, alpha in [0, 1], colour non-negative, and up
 // to 65536 layers the accumulated double is within 2^-36 (relative) of the exact sum, so rounding it to float is
-// within 1 ulp of exact. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
+// within 1 ulp of exact. Where that is not enough to tell which of two 8-bit levels is nearer, the row is composited
+// again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
 #pragma once
 
+#include <dfb/double_double.hpp>
 #include <dfb/fragment.hpp>
 
 #include <algorithm>
@@ -48,21 +50,27 @@ struct CompositeRow {
     std::vector<double> rgba;          // 4 * width, premultiplied
     std::vector<double> transmittance; // width
     std::vector<float> depth;          // width: of the nearest layer with alpha > 0, else +infinity
+    // What the first two have beyond a double; of the same sizes, or empty: not computed.
+    std::vector<double> rgbaLow, transmittanceLow;
     AuxPixels aux;
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
+    bool countTies = false;                // equal depths make a pixel undefined
+    double minTransmittance = 0;           // what lets less through counts as opaque
 
-    // `wanted`: of the auxiliary channels.
-    void reset(int width, ChannelMask wanted = 0)
+    // `wanted`: of the auxiliary channels. `exactly`: in twice the precision of double.
+    void reset(int width, ChannelMask wanted = 0, bool exactly = false)
     {
         const auto pixels = static_cast<std::size_t>(width);
         rgba.assign(4 * pixels, 0.0);
         transmittance.assign(pixels, 1.0);
+        rgbaLow.assign(exactly ? 4 * pixels : 0, 0.0);
+        transmittanceLow.assign(exactly ? pixels : 0, 0.0);
         depth.assign(pixels, std::numeric_limits<float>::infinity());
         aux.reset(pixels, wanted);
         reach.assign(wanted & farChannel ? pixels : 0, -std::numeric_limits<float>::infinity());
-        isUndefined.assign(reach.size(), 0);
+        isUndefined.assign(wanted & farChannel || countTies ? pixels : 0, 0);
     }
 };
 
@@ -78,13 +86,35 @@ struct Layer {
     }
 };
 
+namespace detail {
+
+// Adds to a pixel of a row what is let through of `rgba`, in twice the precision, and darkens what is behind.
+inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
+{
+    DoubleDouble t{row.transmittance[x], row.transmittanceLow[x]};
+    for (std::size_t c = 4 * x; c < 4 * x + 4; ++c) {
+        const DoubleDouble sum =
+            DoubleDouble{row.rgba[c], row.rgbaLow[c]} + t * DoubleDouble{static_cast<double>(rgba[c - 4 * x]), 0};
+        row.rgba[c] = sum.high;
+        row.rgbaLow[c] = sum.low;
+    }
+    t = t * DoubleDouble::sum(1.0, -static_cast<double>(rgba[3]));
+    row.transmittance[x] = t.high;
+    row.transmittanceLow[x] = t.low;
+}
+
+} // namespace detail
+
 // Composites `count` pixels of a layer under what is already in `row` at pixels [x, x + count).
 inline void over(CompositeRow& row, int x, int count, const Layer& layer)
 {
+    const bool exactly = !row.rgbaLow.empty();
+    for (int i = 0; exactly && i < count; ++i)
+        detail::overExactly(row, static_cast<std::size_t>(x + i), layer.color + 4 * i);
     double* acc = row.rgba.data() + 4 * static_cast<std::size_t>(x);
     double* transmittance = row.transmittance.data() + x;
     const float* c = layer.color;
-    for (int i = 0; i < count; ++i, acc += 4, c += 4) {
+    for (int i = 0; !exactly && i < count; ++i, acc += 4, c += 4) {
         const double t = transmittance[i];
         acc[0] += t * static_cast<double>(c[0]);
         acc[1] += t * static_cast<double>(c[1]);
@@ -98,6 +128,16 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
             if (layer.color[4 * i + 3] > 0.0f && layer.depth[i] < nearest[i])
                 nearest[i] = layer.depth[i];
     }
+}
+
+// Whether nothing of what is behind `count` pixels from x on can be seen. Makes those opaque that count as such.
+inline bool isClosed(CompositeRow& row, int x, int count)
+{
+    double* t = row.transmittance.data() + x;
+    if (row.minTransmittance > 0)
+        for (int i = 0; i < count; ++i)
+            t[i] = t[i] < row.minTransmittance ? 0.0 : t[i];
+    return t[0] == 0.0 && std::all_of(t, t + count, [](double value) { return value == 0.0; });
 }
 
 // The same for the auxiliary channels that `row` has; to be called before over(), of which it needs what was there
@@ -156,7 +196,9 @@ inline void overBackground(CompositeRow& row, const float (&rgba)[4])
     const std::size_t width = row.transmittance.size();
     for (std::size_t x = 0; x < row.aux.weight.size(); ++x)
         row.aux.weight[x] = row.rgba[4 * x + 3];
-    for (std::size_t x = 0; x < width; ++x)
+    for (std::size_t x = 0; x < row.transmittanceLow.size(); ++x)
+        detail::overExactly(row, x, rgba);
+    for (std::size_t x = 0; x < width && row.rgbaLow.empty(); ++x)
         for (std::size_t c = 0; c < 4; ++c)
             row.rgba[4 * x + c] += row.transmittance[x] * static_cast<double>(rgba[c]);
 }
@@ -200,6 +242,9 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
             if (l.aux)
                 overAux(row, x + begin, end - begin, l, l.aux->from(static_cast<std::size_t>(begin)));
             over(row, x + begin, end - begin, l);
+            // Behind what is opaque there is nothing to blend; ids and the like may still come from there.
+            if (isClosed(row, x + begin, end - begin) && !l.aux)
+                break;
         }
     };
     order.resize(n);
@@ -212,8 +257,17 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
         return;
     }
     for (int begin = 0; begin < count;) {
-        // Insertion sort: the order of the last pixel is nearly always nearly right.
+        // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
+        std::size_t movesLeft = 8 * n;
         for (std::size_t i = 1; i < n; ++i) {
+            if (movesLeft < i) {
+                std::sort(order.begin(), order.end(), [&](int a, int b) {
+                    const float depthOfA = layers[static_cast<std::size_t>(a)].depth[begin];
+                    const float depthOfB = layers[static_cast<std::size_t>(b)].depth[begin];
+                    return depthOfA != depthOfB ? depthOfA < depthOfB : a < b;
+                });
+                break;
+            }
             const int layer = order[i];
             const float depth = layers[static_cast<std::size_t>(layer)].depth[begin];
             std::size_t j = i;
@@ -225,12 +279,21 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
                 order[j] = before;
             }
             order[j] = layer;
+            movesLeft -= i - j;
         }
         int end = count;
         for (std::size_t i = 1; i < n && end > begin + 1; ++i)
             end = detail::firstOutOfOrder(layers[static_cast<std::size_t>(order[i - 1])].depth,
                                           layers[static_cast<std::size_t>(order[i])].depth, order[i - 1] < order[i],
                                           begin + 1, end);
+        if (row.countTies)
+            for (std::size_t i = 1; i < n; ++i)
+                for (int p = begin; p < end; ++p) {
+                    const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
+                    if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
+                        && depth < std::numeric_limits<float>::infinity())
+                        row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
+                }
         blend(begin, end);
         begin = end;
     }
@@ -243,6 +306,9 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
         if (layer.aux)
             overAux(row, x, count, layer, *layer.aux);
         over(row, x, count, layer);
+        // The nearest depth may be that of any.
+        if (isClosed(row, x, count) && !layer.aux && !layer.depth)
+            break;
     }
 }
 
@@ -253,9 +319,17 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
 {
     for (int i = 0; i < count; ++i) {
         const Layer* nearest = nullptr;
-        for (const Layer& layer : layers)
-            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i]))
+        bool isTie = false;
+        for (const Layer& layer : layers) {
+            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i])) {
                 nearest = &layer;
+                isTie = false;
+            } else {
+                isTie = isTie || (layer.depth && layer.depth[i] == nearest->depth[i]);
+            }
+        }
+        if (row.countTies && isTie)
+            row.isUndefined[static_cast<std::size_t>(x + i)] = 1;
         const Layer l = nearest->from(i);
         if (l.aux)
             overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)));
@@ -284,6 +358,13 @@ public:
         for (; begin != end; ++begin)
             if (!(*begin)->empty())
                 cursors_.emplace_back(**begin);
+    }
+
+    void skipRows(int count)
+    {
+        for (FragmentCursor& cursor : cursors_)
+            for (int i = 0; i < count; ++i)
+                cursor.next();
     }
 
     // Composites the next row of all fragments under `row`, which has been reset to the region's width.

@@ -67,6 +67,9 @@ public:
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
         bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
 
+        // As FrameParams::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
+        void expectLayers(int layers) { engine_->expectLayers(layers); }
+
         // How many samples a tile gets in this frame, and which.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 

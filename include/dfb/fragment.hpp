@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/tile.hpp>
+#include <dfb/wire_format.hpp>
 
 #include <cstddef>
 #include <cstdint>
@@ -51,6 +52,7 @@ public:
         const std::uint16_t* rowSpanCounts = nullptr; // Sparse: one per row in [rowBegin, rowEnd)
         const Span* spans = nullptr;                  // Sparse: all spans, row by row; else one full-width span
         ChannelMask channels = colorChannel;
+        WireFormat colorFormat = WireFormat::Float32; // that it came in
         const float* color = nullptr;
         const float* depth = nullptr;
         detail::ConstPlanes aux; // all but colour and depth
@@ -71,6 +73,15 @@ public:
     bool hasDepth() const noexcept { return parts_.depth != nullptr; }
     ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
+    WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // that it came in
+
+    // Colour of the pixels that are stored: all that are active, or with FragmentEncoding::Constant a row of equal
+    // ones.
+    const float* color() const noexcept { return parts_.color; }
+    std::size_t storedPixels() const noexcept
+    {
+        return parts_.encoding == FragmentEncoding::Constant ? parts_.fullRow.count : parts_.activePixels;
+    }
 
 private:
     friend class FragmentCursor;

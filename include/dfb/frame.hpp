@@ -6,6 +6,7 @@
 #include <dfb/comm/transport.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/tile_layout.hpp>
+#include <dfb/wire_format.hpp>
 
 #include <array>
 #include <cstddef>
@@ -32,6 +33,11 @@ struct FrameBufferConfig {
     int framesInFlight = 1;               // the most that may be open at once; memory grows with it
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
+    // How exactly inputs travel: a WireFormat, an ErrorBudget, or all of it. Finished tiles travel in `format`.
+    WirePrecision wire{};
+    // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
+    // left out. That changes it by no more than this times the largest colour.
+    float minTransmittance = 0;
     GatherMode gather = GatherMode::Batches;
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
@@ -55,6 +61,9 @@ struct FrameParams {
     // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile
     // operation that keepsState may a tile have none or not begin with sample 0.
     SamplePlan samples;
+    // For an ErrorBudget: no pixel has more inputs than this in a pass; 0: not known, taken for 65536. Loops that know
+    // better say so themselves.
+    int maxLayers = 0;
     std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
     // True: each rank says with Frame::declare() what it will send, and owners count on that.
@@ -84,17 +93,20 @@ struct Figure {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    double totalMs = 0;                    // begin() to the return of end(), this rank
-    double renderMs = 0;                   // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0;      // the call of end() to its return, this rank
-    double renderMsMax = 0;                // all: the longest renderMs
-    std::int64_t bytesSent = 0;            // all: message bytes to other ranks, without the transport's own
-    std::int64_t messagesSent = 0;         // all
-    std::int64_t tilesTotal = 0;           // in the image
-    std::int64_t tilesTouched = 0;         // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (see detail/wire.hpp)
-    std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
-    double mergeErrorBound = 0;            // all: how much merging segments may have changed a pixel, see DeepTile
+    double totalMs = 0;                         // begin() to the return of end(), this rank
+    double renderMs = 0;                        // begin() to the call of end(), this rank
+    double compositingOverheadMs = 0;           // the call of end() to its return, this rank
+    double renderMsMax = 0;                     // all: the longest renderMs
+    std::int64_t bytesSent = 0;                 // all: message bytes to other ranks, without the transport's own
+    std::int64_t messagesSent = 0;              // all
+    std::int64_t tilesTotal = 0;                // in the image
+    std::int64_t tilesTouched = 0;              // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinity or NaN (see detail/wire.hpp)
+    std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
+    std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
+    WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
+    double wireErrorBound = 0; // all: how far a pixel may be off for WirePrecision and minTransmittance, from what came
+    double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key
     std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict

@@ -4,6 +4,7 @@
 
 #include <dfb/buffer.hpp>
 #include <dfb/channels.hpp>
+#include <dfb/double_double.hpp>
 #include <dfb/error.hpp>
 
 #include <algorithm>
@@ -62,6 +63,21 @@ inline std::uint8_t toUnorm8(double value) noexcept
     // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
     const double shift = 4503599627370496.0;
     return static_cast<std::uint8_t>((value * 255.0 + shift) - shift);
+}
+
+// The same for a value that is known to about 100 bits. What is nearer to a tie than that is one.
+inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
+{
+    if (!(value.high > 0.0))
+        return 0;
+    if (value.high >= 1.0 && value.high + value.low >= 1.0)
+        return 255;
+    const DoubleDouble scaled = value * DoubleDouble{255.0, 0.0};
+    const int below = static_cast<int>(scaled.high);
+    const DoubleDouble overTie = scaled + DoubleDouble{-below - 0.5, 0.0};
+    if (std::abs(overTie.high) <= 0x1p-90)
+        return static_cast<std::uint8_t>(below + below % 2);
+    return static_cast<std::uint8_t>(below + (overTie.high > 0 ? 1 : 0));
 }
 
 // thresholds()[k] is the least double whose sRGB level is k + 1: the decision is a comparison and so exact, where

@@ -42,6 +42,8 @@ struct TileInfo {
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
     std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
+    float minTransmittance = 0;                  // what lets less through counts as opaque
+    bool depthIsRounded = false;                 // equal depths need not have been equal
     ChannelMask wanted = 0;                      // what the image has beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
 };
@@ -67,6 +69,7 @@ public:
     const Region& region() const noexcept { return region_; }
     int width() const noexcept { return region_.width(); }
     int height() const noexcept { return region_.height(); }
+    OutputFormat format() const noexcept { return format_; }
     bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
     // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
@@ -95,6 +98,20 @@ public:
         set(detail::InstanceId, aux.instanceId, noId);
     }
 
+    // What setRow() has made of a row; null if the colour is not wanted.
+    const std::byte* colorRow(int y) const noexcept
+    {
+        const std::byte* first = to_.at[detail::Color];
+        return first ? first + static_cast<std::size_t>(y) * stride_ * bytesPerPixel(format_) : nullptr;
+    }
+
+    // For 8-bit formats, after setRow(): another level for value i in [0, 4 * width()) of row y.
+    void setLevel(int y, int i, std::uint8_t level)
+    {
+        const std::size_t pixel = static_cast<std::size_t>(y) * stride_;
+        to_.at[detail::Color][4 * pixel + static_cast<std::size_t>(i)] = static_cast<std::byte>(level);
+    }
+
 private:
     Region region_;
     OutputFormat format_;
@@ -104,8 +121,10 @@ private:
 
 // What a TileOp says of a tile that it has finished, if it has a member report().
 struct TileReport {
-    double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
-    std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
+    double error = -1; // how far the tile's pixels may be off, in units of colour; < 0: not known
+    // Whose inputs overlap in depth, so that no order of them is right, or have equal depths that were rounded, so that
+    // it is not known.
+    std::int64_t orderUndefinedPixels = 0;
 };
 
 struct NoFrameData {};

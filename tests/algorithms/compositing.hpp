@@ -13,7 +13,7 @@
 
 namespace algorithms {
 
-using reference::Exact;
+using dfb::testing::Exact;
 
 // ---- auxiliary channels ----------------------------------------------------------------------------------------
 
@@ -23,7 +23,7 @@ struct AuxSample {
 };
 
 // What a sample of the scene has beside colour and depth.
-inline AuxSample auxOf(const scene::Scene& s, const reference::Sample& sample, int pass, int x, int y)
+inline AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
 {
     const std::uint64_t h = scene::mix(scene::mix(s.seed * 77 + sample.source) + static_cast<std::uint64_t>(pass) * 7919
                                        + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
@@ -55,7 +55,7 @@ inline AuxPixel auxReference(const scene::Scene& s, int x, int y)
     AuxPixel p;
     float primitiveDepth = 0, instanceDepth = 0;
     for (int pass = 0; pass < s.passes; ++pass) {
-        std::vector<reference::Sample> samples;
+        std::vector<dfb::testing::Sample> samples;
         for (const dfb::Brick& brick : s.bricks)
             if (const auto sample = sampleOf(s, brick, pass, x, y))
                 samples.push_back(*sample);
@@ -145,9 +145,9 @@ inline std::size_t wrongAux(const scene::Scene& s, const dfb::Image& image)
 inline std::uint64_t hashAux(const dfb::Image& image)
 {
     const std::size_t n = image.pixelCount();
-    return reference::hashOf(image.rgba32f(), 16 * n) ^ 3 * reference::hashOf(image.normal(), 12 * n)
-           ^ 5 * reference::hashOf(image.albedo(), 12 * n) ^ 7 * reference::hashOf(image.position(), 12 * n)
-           ^ 9 * reference::hashOf(image.primitiveId(), 4 * n) ^ 11 * reference::hashOf(image.instanceId(), 4 * n);
+    return dfb::testing::hashOf(image.rgba32f(), 16 * n) ^ 3 * dfb::testing::hashOf(image.normal(), 12 * n)
+           ^ 5 * dfb::testing::hashOf(image.albedo(), 12 * n) ^ 7 * dfb::testing::hashOf(image.position(), 12 * n)
+           ^ 9 * dfb::testing::hashOf(image.primitiveId(), 4 * n) ^ 11 * dfb::testing::hashOf(image.instanceId(), 4 * n);
 }
 
 struct AuxChannels {
@@ -232,12 +232,12 @@ struct Nearest {
             [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOf(s));
         if (!fb.isDisplayRank())
             return result;
-        std::vector<reference::Pixel> expected;
+        std::vector<dfb::testing::Pixel> expected;
         for (int y = 0; y < s.height; ++y)
             for (int x = 0; x < s.width; ++x) {
-                std::vector<reference::Pixel> passes;
+                std::vector<dfb::testing::Pixel> passes;
                 for (int pass = 0; pass < s.passes; ++pass) {
-                    std::vector<reference::Sample> nearest;
+                    std::vector<dfb::testing::Sample> nearest;
                     for (const dfb::Brick& brick : s.bricks)
                         if (const auto sample = sampleOf(s, brick, pass, x, y)) {
                             const bool seen = std::any_of(sample->rgba.begin(), sample->rgba.end(),
@@ -245,9 +245,9 @@ struct Nearest {
                             if (seen && (nearest.empty() || sample->depth < nearest[0].depth))
                                 nearest = {*sample};
                         }
-                    passes.push_back(reference::composite(nearest, s.background));
+                    passes.push_back(dfb::testing::composite(nearest, s.background));
                 }
-                expected.push_back(reference::mean(passes));
+                expected.push_back(dfb::testing::mean(passes));
             }
         const scene::Picture picture(fb.image(), report);
         const std::size_t wrong = wrongValues(picture, expected);

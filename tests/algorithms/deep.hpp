@@ -45,22 +45,22 @@ struct Interleaved {
         return mine;
     }
 
-    std::vector<reference::Pixel> image(int passCount) const
+    std::vector<dfb::testing::Pixel> image(int passCount) const
     {
-        std::vector<reference::Pixel> result;
+        std::vector<dfb::testing::Pixel> result;
         for (int y = 0; y < height; ++y)
             for (int x = 0; x < width; ++x) {
-                std::vector<reference::Pixel> passes;
+                std::vector<dfb::testing::Pixel> passes;
                 for (int pass = 0; pass < passCount; ++pass) {
-                    std::vector<reference::Sample> samples;
+                    std::vector<dfb::testing::Sample> samples;
                     for (int slot = 0; slot < slots; ++slot)
                         if (brickAt(x, y, slot, pass) < bricks) {
                             const dfb::Segment s = segmentAt(x, y, slot, pass);
                             samples.push_back({s.rgba, s.depth, 0, 0});
                         }
-                    passes.push_back(reference::composite(samples, background));
+                    passes.push_back(dfb::testing::composite(samples, background));
                 }
-                result.push_back(reference::mean(passes));
+                result.push_back(dfb::testing::mean(passes));
             }
         return result;
     }
@@ -117,7 +117,7 @@ struct Deep {
         const dfb::World world = scene.world(fb.rank(), fb.size());
         dfb::FrameParams params;
         params.background = scene.background;
-        const auto largestError = [&](const std::vector<reference::Pixel>& expected) {
+        const auto largestError = [&](const std::vector<dfb::testing::Pixel>& expected) {
             double largest = 0;
             for (std::size_t i = 0; i < expected.size(); ++i)
                 for (std::size_t c = 0; c < 4; ++c)

@@ -243,7 +243,7 @@ struct Ordered {
         bytes = report.bytesSent;
         if (!fb.isDisplayRank())
             return;
-        const std::uint64_t hash = reference::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
+        const std::uint64_t hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
         result.expect(result.hash == 0 || result.hash == hash, "another image, " + std::to_string(copies) + " copies");
         result.hash = hash;
     }

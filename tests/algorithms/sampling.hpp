@@ -291,7 +291,7 @@ struct Adaptive {
                           == static_cast<std::int64_t>(s.width) * s.height * sampler.samplesOf(27),
                       "samples saved");
         if (fb.isDisplayRank())
-            result.hash = reference::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
+            result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
 
         dfb::AdaptiveSampler uniform(fb.layout(), {0, 8, 256, 8});
         std::int64_t needed = 0;
@@ -327,7 +327,7 @@ struct DarkCorners {
                 fb, [&](auto& tile) { s.render(tile); }, sampler.next()));
         if (!fb.isDisplayRank())
             return result;
-        result.hash = reference::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
+        result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
         for (int tile = 0; tile < fb.layout().tileCount(); ++tile) {
             const dfb::Region r = fb.layout().region(tile);
             // The error that was promised is that of the block of 8x8 pixels that has the corner.

@@ -56,7 +56,7 @@ struct Wall {
                                                   + std::to_string(frame));
             }
             if (single.isDisplayRank())
-                result.hash = result.hash * 31 + reference::hashOf(pixels.data(), pixels.size());
+                result.hash = result.hash * 31 + dfb::testing::hashOf(pixels.data(), pixels.size());
         }
     }
 

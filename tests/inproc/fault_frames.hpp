@@ -63,7 +63,7 @@ struct FaultEnding {
 // One rank's part: frames until one ends in a TransportError, after which nothing more can be done.
 template <class Base>
 std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communicator, const FaultGroup& group,
-                                     const std::vector<reference::Pixel>& expected, int frames)
+                                     const std::vector<dfb::testing::Pixel>& expected, int frames)
 {
     using Transport = dfb::testing::FaultTransport<Base>;
     using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;

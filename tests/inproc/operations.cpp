@@ -81,7 +81,7 @@ std::int64_t worstUlps(const Picture& picture, const std::vector<float>& expecte
     std::int64_t worst =
         picture.bytes.size() == expected.size() * sizeof(float) ? 0 : std::numeric_limits<std::int64_t>::max();
     for (std::size_t i = 0; worst < 1000000 && i < expected.size(); ++i)
-        worst = std::max(worst, reference::ulpsBetween(picture.value(i), expected[i]));
+        worst = std::max(worst, dfb::testing::ulpsBetween(picture.value(i), expected[i]));
     return worst;
 }
 
@@ -217,10 +217,10 @@ TEST_CASE("ToneMap is Reinhard's operator on the composited float image", "[oper
             REQUIRE(bytes.bytes.size() == expected.size());
             std::size_t wrong = 0;
             for (std::size_t i = 0; i < expected.size(); ++i) {
-                const reference::Exact v = floats.value(i);
+                const dfb::testing::Exact v = floats.value(i);
                 const bool srgb = format == dfb::OutputFormat::SRGBA8 && i % 4 != 3;
                 wrong += static_cast<std::uint8_t>(bytes.bytes[i])
-                         != (srgb ? reference::toSrgb8(v) : reference::toUnorm8(v));
+                         != (srgb ? dfb::testing::toSrgb8(v) : dfb::testing::toUnorm8(v));
             }
             CHECK(wrong == 0);
         }
@@ -235,10 +235,10 @@ TEST_CASE("ToneMap keeps emission and alpha", "[operations]")
     dfb::PixelTile tile{0, {0, 0, 3, 1}, pixels.data(), nullptr};
     op.process(tile);
     // c = 1, k c = 2: 2/3, times alpha; c = 0.5: 1/2; emission 1: 2/3.
-    CHECK(reference::ulpsBetween(pixels[0], 1.0f / 3) <= 4);
+    CHECK(dfb::testing::ulpsBetween(pixels[0], 1.0f / 3) <= 4);
     CHECK(pixels[1] == 0.25f);
     CHECK(pixels[3] == 0.5f);
-    CHECK(reference::ulpsBetween(pixels[4], 2.0f / 3) <= 4);
+    CHECK(dfb::testing::ulpsBetween(pixels[4], 2.0f / 3) <= 4);
     CHECK(pixels[7] == 0.0f);
     CHECK(pixels[8] == 0.0f);
 }

@@ -3,9 +3,8 @@
 // MPI.
 #pragma once
 
-#include "../reference.hpp"
-
 #include <dfb/dfb.hpp>
+#include <dfb/testing/reference.hpp>
 
 #include <algorithm>
 #include <array>
@@ -69,7 +68,7 @@ inline Scene makeScene(int brickCount, std::uint64_t seed = 1, int width = 97, i
 }
 
 // What a brick has at a pixel; nothing where it is not, or has a hole.
-inline std::optional<reference::Sample> sampleOf(const Scene& s, const dfb::Brick& brick, int pass, int x, int y)
+inline std::optional<dfb::testing::Sample> sampleOf(const Scene& s, const dfb::Brick& brick, int pass, int x, int y)
 {
     if (!FlatCamera().project(brick.bounds, s.width, s.height).contains(x, y))
         return std::nullopt;
@@ -77,7 +76,7 @@ inline std::optional<reference::Sample> sampleOf(const Scene& s, const dfb::Bric
                                 + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
     if (h % 8 == 0)
         return std::nullopt;
-    reference::Sample sample;
+    dfb::testing::Sample sample;
     sample.source = brick.id;
     sample.depth = static_cast<float>((h >> 8) % 5); // many ties
     const auto part = [h](int shift) { return static_cast<float>((h >> shift) & 0x3ff) / 1024.0f; };
@@ -207,8 +206,8 @@ struct Picture {
 
     std::uint64_t hash() const
     {
-        return reference::hashOf(bytes.data(), bytes.size())
-               ^ 3 * reference::hashOf(depth.data(), depth.size() * sizeof(float));
+        return dfb::testing::hashOf(bytes.data(), bytes.size())
+               ^ 3 * dfb::testing::hashOf(depth.data(), depth.size() * sizeof(float));
     }
     float value(std::size_t i) const
     {
@@ -218,26 +217,26 @@ struct Picture {
     }
 };
 
-inline std::vector<reference::Pixel> referenceOf(const Scene& s)
+inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
 {
-    std::vector<reference::Pixel> result;
+    std::vector<dfb::testing::Pixel> result;
     for (int y = 0; y < s.height; ++y)
         for (int x = 0; x < s.width; ++x) {
-            std::vector<reference::Pixel> passes;
+            std::vector<dfb::testing::Pixel> passes;
             for (int pass = 0; pass < s.passes; ++pass) {
-                std::vector<reference::Sample> samples;
+                std::vector<dfb::testing::Sample> samples;
                 for (const dfb::Brick& brick : s.bricks)
                     if (const auto sample = sampleOf(s, brick, pass, x, y))
                         samples.push_back(*sample);
-                passes.push_back(reference::composite(std::move(samples), s.background));
+                passes.push_back(dfb::testing::composite(std::move(samples), s.background));
             }
-            result.push_back(reference::mean(passes));
+            result.push_back(dfb::testing::mean(passes));
         }
     return result;
 }
 
 // Number of values that are off: floats by more than 1 ulp, bytes and depths at all. All of them if the size is wrong.
-inline std::size_t wrongValues(const Picture& picture, const std::vector<reference::Pixel>& expected)
+inline std::size_t wrongValues(const Picture& picture, const std::vector<dfb::testing::Pixel>& expected)
 {
     const std::size_t count = expected.size();
     if (picture.bytes.size() != count * dfb::bytesPerPixel(picture.format) || picture.bytes.empty()
@@ -246,13 +245,13 @@ inline std::size_t wrongValues(const Picture& picture, const std::vector<referen
     std::size_t wrong = 0;
     for (std::size_t i = 0; i < count; ++i) {
         for (std::size_t c = 0; c < 4; ++c) {
-            const reference::Exact exact = expected[i].rgba[c];
+            const dfb::testing::Exact exact = expected[i].rgba[c];
             if (picture.format == dfb::OutputFormat::RGBA32F) {
-                wrong += reference::ulpsBetween(picture.value(4 * i + c), reference::toFloat(exact)) > 1;
+                wrong += dfb::testing::ulpsBetween(picture.value(4 * i + c), dfb::testing::toFloat(exact)) > 1;
             } else {
                 const bool srgb = picture.format == dfb::OutputFormat::SRGBA8 && c < 3;
                 wrong += static_cast<std::uint8_t>(picture.bytes[4 * i + c])
-                         != (srgb ? reference::toSrgb8(exact) : reference::toUnorm8(exact));
+                         != (srgb ? dfb::testing::toSrgb8(exact) : dfb::testing::toUnorm8(exact));
             }
         }
         wrong += !picture.depth.empty() && picture.depth[i] != expected[i].depth;

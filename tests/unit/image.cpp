@@ -1,8 +1,8 @@
 // Image: rounding to the output formats, exactly; and what an image lets one see.
 #include "catch.hpp"
-#include "reference.hpp"
 
 #include <dfb/image.hpp>
+#include <dfb/testing/reference.hpp>
 
 #include <cmath>
 #include <cstdint>
@@ -39,7 +39,7 @@ std::size_t wrongLinear()
     std::size_t wrong = 0;
     for (int k = 0; k <= 510; ++k) // levels and the ties between them
         for (Real v : neighbourhood(static_cast<Real>(k / 510.0L), 40))
-            wrong += dfb::detail::toUnorm8(static_cast<double>(v)) != reference::toUnorm8(v);
+            wrong += dfb::detail::toUnorm8(static_cast<double>(v)) != dfb::testing::toUnorm8(v);
     return wrong;
 }
 
@@ -49,7 +49,7 @@ std::size_t wrongSrgb()
     std::size_t wrong = 0;
     for (int k = 0; k < 255; ++k)
         for (Real v : neighbourhood(srgbThreshold<Real>(k), 6))
-            wrong += dfb::detail::toSrgb8(static_cast<double>(v)) != reference::toSrgb8(v);
+            wrong += dfb::detail::toSrgb8(static_cast<double>(v)) != dfb::testing::toSrgb8(v);
     return wrong;
 }
 

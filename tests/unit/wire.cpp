@@ -146,11 +146,14 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             auto tile = makeTile<Size>(layout, index);
             fill(*tile, content, random);
             const auto wanted = static_cast<dfb::ChannelMask>(dfb::colorChannel | (withDepth ? dfb::depthChannel : 0));
-            std::uint64_t nonFinite = 0;
-            dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, wanted, 9, codec, nonFinite);
-            std::uint64_t uncounted = 0;
+            dfb::detail::InputFaults faults;
+            dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, wanted, 9, codec, dfb::detail::WireCoder(),
+                                                              dfb::WireFormat::Float32, faults);
+            dfb::detail::InputFaults uncounted;
             const std::size_t rawBytes =
-                dfb::detail::encodeFragment(*pool, *tile, wanted, 9, nullptr, uncounted).size();
+                dfb::detail::encodeFragment(*pool, *tile, wanted, 9, nullptr, dfb::detail::WireCoder(),
+                                            dfb::WireFormat::Float32, uncounted)
+                    .size();
             INFO("size " << Size << ", content " << static_cast<int>(content) << ", depth " << withDepth << ", region "
                          << tile->region.width() << "x" << tile->region.height());
             std::size_t active = 0;
@@ -159,7 +162,7 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
                     active += isActive(tile->pixel(x, y));
             const auto pixels = static_cast<std::size_t>(tile->region.width() * tile->region.height());
 
-            CHECK(nonFinite == 0);
+            CHECK(faults.nonFinite == 0);
             CHECK(message.size() <= rawBytes);
             const auto header = dfb::detail::readMessageHeader(message);
             CHECK(header.kind == dfb::detail::MessageKind::Fragment);
@@ -167,7 +170,7 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
             CHECK(header.receiver == 9);
             const std::size_t sizeBefore = message.size();
             const dfb::Fragment fragment = dfb::detail::decodeFragment(
-                *pool, std::move(message), layout, [](int) { return 3; }, codec);
+                *pool, std::move(message), layout, [](int) { return 3; }, codec, dfb::detail::WireCoder());
             const dfb::TileHeader& h = fragment.header();
             CHECK((h.frame == 77 && h.tile == index && h.region == tile->region && h.pass == 2 && h.generation == 5
                    && h.children == 3 && h.source == 0xfedcba98u && h.part == 0x7654));
@@ -212,8 +215,9 @@ std::vector<std::vector<std::byte>> validMessages(const dfb::TileLayout& layout,
          {Content::Empty, Content::OnePixel, Content::Spans, Content::OneGap, Content::Dense, Content::Constant}) {
         auto tile = makeTile<8>(layout, 1);
         fill(*tile, content, random);
-        std::uint64_t nonFinite = 0;
-        const dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 9, codec, nonFinite);
+        dfb::detail::InputFaults faults;
+        const dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 9, codec, dfb::detail::WireCoder(),
+                                                                dfb::WireFormat::Float32, faults);
         messages.emplace_back(message.data(), message.data() + message.size());
     }
     return messages;
@@ -230,7 +234,7 @@ Outcome tryDecode(const std::vector<std::byte>& bytes, const dfb::TileLayout& la
     try {
         dfb::detail::readMessageHeader(message);
         const dfb::Fragment fragment = dfb::detail::decodeFragment(
-            *pool, std::move(message), layout, [](int) { return 3; }, codec);
+            *pool, std::move(message), layout, [](int) { return 3; }, codec, dfb::detail::WireCoder());
         dfb::FragmentCursor cursor(fragment);
         const int width = fragment.header().region.width();
         std::uint32_t pixels = 0;
@@ -307,11 +311,12 @@ TEST_CASE("Depth travels in canonical form, and what is not finite is counted on
     tile->pixel(3, 0)[2] = notANumber, tile->depth[3] = notANumber; // counted once
     tile->pixel(4, 0)[3] = 1.0f, tile->depth[4] = infinity;         // a depth may be infinite
     tile->depth[5] = notANumber;                                    // not active: does not travel
-    std::uint64_t nonFinite = 0;
-    dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, nonFinite);
-    CHECK(nonFinite == 3);
+    dfb::detail::InputFaults faults;
+    dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, dfb::detail::WireCoder(),
+                                                      dfb::WireFormat::Float32, faults);
+    CHECK(faults.nonFinite == 3);
     const dfb::Fragment fragment = dfb::detail::decodeFragment(
-        *pool, std::move(message), layout, [](int) { return 3; }, nullptr);
+        *pool, std::move(message), layout, [](int) { return 3; }, nullptr, dfb::detail::WireCoder());
     dfb::FragmentCursor cursor(fragment);
     const dfb::FragmentRow row = cursor.next();
     REQUIRE(row.spanCount == 1);
@@ -320,14 +325,16 @@ TEST_CASE("Depth travels in canonical form, and what is not finite is counted on
     CHECK(row.depth[1] == infinity);
     CHECK(row.depth[4] == infinity);
 
-    nonFinite = 0;
-    dfb::detail::encodeFragment(*pool, *tile, dfb::colorChannel, 0, nullptr, nonFinite);
-    CHECK(nonFinite == 2); // depth that does not travel is not looked at
+    faults = {};
+    dfb::detail::encodeFragment(*pool, *tile, dfb::colorChannel, 0, nullptr, dfb::detail::WireCoder(),
+                                dfb::WireFormat::Float32, faults);
+    CHECK(faults.nonFinite == 2); // depth that does not travel is not looked at
 
     tile->fill({notANumber, 0, 0, 1}, 0.0f);
-    nonFinite = 0;
-    dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, nonFinite);
-    CHECK(nonFinite == 64); // also where the tile is constant and travels as one pixel
+    faults = {};
+    dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, dfb::detail::WireCoder(), dfb::WireFormat::Float32,
+                                faults);
+    CHECK(faults.nonFinite == 64); // also where the tile is constant and travels as one pixel
 }
 
 TEST_CASE("Bytes that are no message are refused or decode to something valid", "[wire]") { prefixesAndFlips(nullptr); }
@@ -344,7 +351,7 @@ TEST_CASE("A message of another version, byte order or codec is named as such", 
         try {
             dfb::detail::readMessageHeader(message);
             dfb::detail::decodeFragment(
-                *pool, std::move(message), layout, [](int) { return 3; }, nullptr);
+                *pool, std::move(message), layout, [](int) { return 3; }, nullptr, dfb::detail::WireCoder());
         } catch (const dfb::Error& e) {
             return std::string(e.what());
         }
@@ -373,9 +380,14 @@ TEST_CASE("Compressed tiles come through as they were, never larger than raw", "
     auto tile = makeTile<64>(layout, 0);
     tile->fill({0.5f, 0.5f, 0.5f, 0.5f}, 1.0f);
     tile->pixel(0, 0)[0] = 0.25f;
-    std::uint64_t nonFinite = 0;
-    const std::size_t raw = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, nonFinite).size();
-    CHECK(dfb::detail::encodeFragment(*pool, *tile, 3, 0, &codec, nonFinite).size() < raw / 10);
+    dfb::detail::InputFaults faults;
+    const std::size_t raw = dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, dfb::detail::WireCoder(),
+                                                        dfb::WireFormat::Float32, faults)
+                                .size();
+    CHECK(dfb::detail::encodeFragment(*pool, *tile, 3, 0, &codec, dfb::detail::WireCoder(), dfb::WireFormat::Float32,
+                                      faults)
+              .size()
+          < raw / 10);
 }
 
 TEST_CASE("Compressed bytes that are no message are refused or decode to something valid", "[wire]")

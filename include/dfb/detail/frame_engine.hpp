@@ -61,6 +61,7 @@ public:
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
+            checkWire();
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
@@ -101,6 +102,8 @@ public:
             throw InvalidArgument("begin() while a frame is open: end() it first");
         if (params.passes < 1)
             throw InvalidArgument("a frame has at least 1 pass, not " + std::to_string(params.passes));
+        if (params.maxLayers < 0)
+            throw InvalidArgument("at most " + std::to_string(params.maxLayers) + " layers");
         checkSamples(params);
         if (params.declarationKey != 0 && !params.declared)
             throw InvalidArgument("a declarationKey without declared inputs");
@@ -125,7 +128,7 @@ public:
         info.background = params.background;
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, tileData, pixelData);
+            pipeline_->newFrame(info, params.samples, params.maxLayers, tileData, pixelData);
         } catch (...) {
             userError = std::current_exception();
         }
@@ -186,6 +189,7 @@ public:
     }
 
     // See Frame.
+    void expectLayers(int layers) { pipeline_->setLayers(layers); }
     TileSamples samples(int tile) const { return pipeline_->table().samples(tile); }
 
     void addFigure(std::uint64_t key, double value) { figures_.add(key, value); }
@@ -264,6 +268,7 @@ public:
         report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
         report.compositingOverheadMs = report.totalMs - report.renderMs;
         report.tilesTotal = layout().tileCount();
+        report.wireColor = pipeline_->wireColor();
         verdict.addTo(report);
         return report;
     }
@@ -645,7 +650,9 @@ private:
                                      pipeline_->nonFinitePixels(),
                                      gate_.takeLateCount(),
                                      repeated - repeatedBefore_,
-                                     reports.orderUndefinedPixels};
+                                     reports.orderUndefinedPixels,
+                                     pipeline_->alphaOutsidePixels()};
+                           v.wireErrorBound = reports.wireErrorBound;
                            v.tileErrors = FrameFigures::of(reports.errors);
                            figures_.addTo(v);
                            repeatedBefore_ = repeated;
@@ -653,6 +660,18 @@ private:
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
                            return v;
                        });
+    }
+
+    void checkWire() const
+    {
+        const WirePrecision& w = config_.wire;
+        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f) || !(w.depthFar > w.depthNear)
+            || !(w.depthFar - w.depthNear < std::numeric_limits<float>::infinity()))
+            throw InvalidArgument("an error budget of " + std::to_string(w.budget) + ", colours up to "
+                                  + std::to_string(w.maxColor) + ", depths from " + std::to_string(w.depthNear) + " to "
+                                  + std::to_string(w.depthFar));
+        if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
+            throw InvalidArgument("a least transmittance of " + std::to_string(config_.minTransmittance));
     }
 
     // Throws InvalidArgument for a plan that this framebuffer can not follow.

@@ -6,12 +6,14 @@
 #include <dfb/detail/float_environment.hpp>
 #include <dfb/detail/tile_table.hpp>
 #include <dfb/detail/wire.hpp>
+#include <dfb/detail/wire_losses.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/ops/pixel_ops.hpp>
 
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -39,7 +41,8 @@ public:
                  rank, rankCount),
           gather_(pool_, table_.layout(),
                   {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd},
-                  rank == config.displayRank, rank, rankCount, std::move(sendToDisplay))
+                  rank == config.displayRank, rank, rankCount, std::move(sendToDisplay)),
+          coder_(config.wire)
     {
     }
 
@@ -67,13 +70,19 @@ public:
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
-    void newFrame(const TileInfo& info, const SamplePlan& plan, const typename FrameDataOf<TileOp>::type& tileData,
+    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers,
+                  const typename FrameDataOf<TileOp>::type& tileData,
                   const typename FrameDataOf<PixelOp>::type& pixelData)
     {
-        nonFinite_ = 0;
+        nonFinite_ = alphaOutside_ = 0;
         reports_ = {};
         gather_.newFrame(info.frame);
+        info.minTransmittance = config_.minTransmittance;
+        info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
         table_.newFrame(info, plan, tileData);
+        background_ = info.background;
+        losses_.newFrame(config_.wire.maxColor, largestBackground(), config_.minTransmittance);
+        setLayers(maxLayers);
         if constexpr (HasPixelNewFrame<PixelOp>::value)
             pixelOp_.newFrame(pixelData);
         else
@@ -105,11 +114,14 @@ public:
     Buffer encode(const Tile& tile)
     {
         const FloatEnvironment floatEnvironment;
-        std::uint64_t nonFinite = 0;
-        Buffer message = encodeFragment(*pool_, tile, travelling(config_), address_,
-                                        table_.isMine(tile.tile) ? nullptr : config_.codec.get(), nonFinite);
-        if (nonFinite)
-            nonFinite_ += static_cast<std::int64_t>(nonFinite);
+        InputFaults faults;
+        Buffer message =
+            encodeFragment(*pool_, tile, travelling(config_), address_,
+                           table_.isMine(tile.tile) ? nullptr : config_.codec.get(), coder_, wireColor_, faults);
+        if (faults.nonFinite)
+            nonFinite_ += static_cast<std::int64_t>(faults.nonFinite);
+        if (faults.alphaOutside)
+            alphaOutside_ += static_cast<std::int64_t>(faults.alphaOutside);
         return message;
     }
 
@@ -119,7 +131,7 @@ public:
     {
         Fragment fragment = decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
-            config_.codec.get());
+            config_.codec.get(), coder_);
         const TileHeader& h = fragment.header();
         const int tile = h.tile;
         where.tile = tile;
@@ -128,6 +140,8 @@ public:
         where.source = h.source;
         if (!table_.isMine(tile))
             failMalformed("an input for a tile of another owner");
+        if (isLossy())
+            losses_.add(fragment, coder_);
         return table_.arrive(std::move(fragment)) ? tile : -1;
     }
 
@@ -179,12 +193,32 @@ public:
         }
         if constexpr (HasReport<TileOp>::value)
             addReport(tile);
+        if (isLossy()) {
+            const double bound = losses_.boundOf(tile, std::max(1, table_.samples(tile).count));
+            const std::lock_guard<std::mutex> lock(reportsMutex_);
+            reports_.wireErrorBound = std::max(reports_.wireErrorBound, bound);
+        }
     }
+
+    // No pixel has more inputs than `maxLayers` in a pass; 0: not known. Picks the format of what is encoded from now
+    // on.
+    void setLayers(int maxLayers)
+    {
+        const double largest = largestBackground();
+        WireFormat color = config_.wire.color;
+        if (config_.wire.budget > 0) {
+            const auto maxColor = static_cast<double>(config_.wire.maxColor);
+            const double left = config_.wire.budget
+                                - static_cast<double>(config_.minTransmittance) * std::max({1.0, maxColor, largest});
+            color = cheapestWithin(left, maxLayers, maxColor, largest);
+        }
+        wireColor_ = color;
+    }
+    WireFormat wireColor() const noexcept { return wireColor_; }
 
     // What the pixel operation makes of the background; throws what it throws.
     void finishBackground()
     {
-        background_ = table_.frameInfo().background;
         if constexpr (IsPointwise<PixelOp>::value) {
             const float depth = std::numeric_limits<float>::infinity();
             PixelTile pixel;
@@ -204,11 +238,13 @@ public:
 
     // Input pixels of this frame, set on this rank, that had an infinity or NaN.
     std::int64_t nonFinitePixels() const noexcept { return nonFinite_; }
+    std::int64_t alphaOutsidePixels() const noexcept { return alphaOutside_; } // of the others
 
     // What the operation has said of this rank's tiles, up to now.
     struct Reports {
         std::vector<TileError> errors;
         std::int64_t orderUndefinedPixels = 0;
+        double wireErrorBound = 0;
     };
     Reports reports()
     {
@@ -217,6 +253,18 @@ public:
     }
 
 private:
+    bool isLossy() const noexcept
+    {
+        return config_.wire.color != WireFormat::Float32 || config_.wire.budget > 0 || config_.minTransmittance > 0;
+    }
+    double largestBackground() const
+    {
+        double largest = 0;
+        for (const float channel : table_.frameInfo().background)
+            largest = std::max(largest, std::abs(static_cast<double>(channel)));
+        return largest;
+    }
+
     void addReport(int tile)
     {
         const TileReport report = table_.report(tile);
@@ -235,7 +283,10 @@ private:
     TileTable<TileOp> table_;
     FinalGather gather_;
     std::array<float, 4> background_{};
-    std::atomic<std::int64_t> nonFinite_{0};
+    const WireCoder coder_;
+    std::atomic<WireFormat> wireColor_{WireFormat::Float32};
+    WireLosses losses_;
+    std::atomic<std::int64_t> nonFinite_{0}, alphaOutside_{0};
     std::mutex reportsMutex_;
     Reports reports_; // under reportsMutex_
 };

@@ -69,6 +69,7 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
     if (p.samples)
         for (const TileSamples& t : *p.samples)
             f.add(static_cast<std::uint64_t>(t.first) << 32 | static_cast<std::uint32_t>(t.count));
+    f.add(static_cast<std::uint64_t>(p.maxLayers));
     f.add(p.accumulationId);
     f.add(p.declared);
     f.add(p.declarationKey);
@@ -79,9 +80,11 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
 struct Verdict {
     std::optional<ErrorInfo> error;
     std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
-    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order.
-    std::array<std::int64_t, 7> sums{};
+    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
+    // pixels with alpha outside [0, 1].
+    std::array<std::int64_t, 8> sums{};
     std::array<std::int64_t, 3> maxima{}; // peak memory in bytes, rendering in ns, peak of the inbox in bytes
+    double wireErrorBound = 0;            // a maximum
     std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
     std::vector<Figure> figures;          // by key; sums
     std::vector<Figure> mergeErrors;      // by tile; sums
@@ -95,6 +98,7 @@ struct Verdict {
         out.put(paramsHash);
         out.put(sums);
         out.put(maxima);
+        out.put(wireErrorBound);
         for (const auto* list : {&tileErrors, &figures, &mergeErrors}) {
             out.put(static_cast<std::uint32_t>(list->size()));
             for (const Figure& figure : *list)
@@ -112,6 +116,7 @@ struct Verdict {
         v.paramsHash = in.get<std::uint64_t>();
         v.sums = in.get<decltype(v.sums)>();
         v.maxima = in.get<decltype(v.maxima)>();
+        v.wireErrorBound = in.get<double>();
         for (auto* list : {&v.tileErrors, &v.figures, &v.mergeErrors})
             for (auto left = in.get<std::uint32_t>(); left > 0; --left)
                 list->push_back(in.get<Figure>());
@@ -131,6 +136,8 @@ struct Verdict {
         report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
         report.peakInboxBytes = maxima[2];
         report.orderUndefinedPixels = sums[6];
+        report.alphaOutsidePixels = sums[7];
+        report.wireErrorBound = wireErrorBound;
         report.mergeErrorBound = 0;
         for (const Figure& f : mergeErrors)
             report.mergeErrorBound = std::max(report.mergeErrorBound, f.value);
@@ -167,9 +174,9 @@ struct Verdict {
     {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
-        info.message =
-            "the frame was begun with different parameters (background, passes, samples, accumulationId, declared, "
-            "declarationKey, timeoutMs)";
+        info.message = "the frame was begun with different parameters (background, passes, samples, maxLayers, "
+                       "accumulationId, declared, "
+                       "declarationKey, timeoutMs)";
         return info;
     }
 
@@ -205,6 +212,7 @@ struct Verdict {
             a.sums[i] += b.sums[i];
         for (std::size_t i = 0; i < a.maxima.size(); ++i)
             a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
+        a.wireErrorBound = std::max(a.wireErrorBound, b.wireErrorBound);
         a.tileErrors = merged(a.tileErrors, b.tileErrors);
         a.figures = merged(a.figures, b.figures);
         a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
@@ -231,8 +239,12 @@ struct Agreement {
                           + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux "
                           + text(c.aux) + ", display rank " + text(c.displayRank) + ", frames in flight "
                           + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0) + ", gather "
-                          + text(static_cast<int>(c.gather)) + ", checksums " + text(c.checksums) + ", message pool "
-                          + text(c.messagePoolBytes) + ", owner map " + text(owners.value())};
+                          + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color)
+                          + ", error budget " + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor)
+                          + ", wire depth " + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to "
+                          + text(c.wire.depthFar) + ", least transmittance " + text(c.minTransmittance) + ", checksums "
+                          + text(c.checksums) + ", message pool " + text(c.messagePoolBytes) + ", owner map "
+                          + text(owners.value())};
     }
 
     std::vector<std::byte> bytes() const

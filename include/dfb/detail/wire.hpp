@@ -5,14 +5,18 @@
 //   Dense:     planes: all pixels of the region row by row
 //   Constant:  planes: one pixel
 //   Empty:     nothing
-// The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ...
+// The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ..., each
+// from a multiple of 4 on. A payload that is compressed has its planes split into bytes before that, see PlaneFilter.
 #pragma once
 
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/message.hpp>
+#include <dfb/detail/plane_filter.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/tile_layout.hpp>
+#include <dfb/wire_format.hpp>
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -38,7 +42,7 @@ struct FragmentHeader {
     ChannelMask channels = 0;
     FragmentEncoding encoding = FragmentEncoding::Empty;
     std::uint8_t codec = 0; // 0: the payload is raw
-    std::uint16_t reserved = 0;
+    WireFormat colorFormat = WireFormat::Float32, depthFormat = WireFormat::Float32;
 };
 static_assert(sizeof(FragmentHeader) == 40 && std::is_trivially_copyable_v<FragmentHeader>);
 
@@ -47,8 +51,39 @@ static_assert(fragmentPrefix % 16 == 0, "pixels are read in place");
 
 inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
 
-// The most that a fragment message can have. A row's second span costs less than the pixel that parts it from the
-// first.
+// What a plane of so many pixels takes up in a message.
+inline std::size_t planeBytes(const FragmentHeader& h, std::size_t channel, std::size_t pixels)
+{
+    const WireFormat format = channel == Color ? h.colorFormat : channel == Depth ? h.depthFormat : WireFormat::Float32;
+    return (bytesOf(format) * static_cast<std::size_t>(channelWords[channel]) * pixels + 3) / 4 * 4;
+}
+inline std::size_t planesBytes(const FragmentHeader& h, std::size_t pixels)
+{
+    std::size_t bytes = 0;
+    for (std::size_t c = 0; c < channelCount; ++c)
+        if (hasChannel(h.channels, c))
+            bytes += planeBytes(h, c, pixels);
+    return bytes;
+}
+
+// Splits the planes of a payload, or joins them again; what comes before, the table, is copied.
+template <class Transform>
+void transformPlanes(const FragmentHeader& h, std::size_t tableBytes, std::size_t pixels, const std::byte* in,
+                     std::byte* out, const Transform& transform)
+{
+    std::memcpy(out, in, tableBytes);
+    std::size_t at = tableBytes;
+    for (std::size_t c = 0; c < channelCount; ++c)
+        if (hasChannel(h.channels, c)) {
+            const std::size_t bytes = planeBytes(h, c, pixels);
+            const WireFormat format = c == Color ? h.colorFormat : c == Depth ? h.depthFormat : WireFormat::Float32;
+            transform(in + at, bytes, bytesOf(format), static_cast<std::size_t>(channelWords[c]), out + at);
+            at += bytes;
+        }
+}
+
+// The most that a fragment message can have. No format is larger than Float32. A row's second span costs less than the
+// pixel that parts it from the first.
 inline std::size_t largestFragment(int tileSize, ChannelMask channels)
 {
     const auto side = static_cast<std::size_t>(tileSize), pixels = side * side;
@@ -121,17 +156,34 @@ bool isConstant(const TileType& tile, const ConstPlanes& planes)
     return true;
 }
 
+template <class TileType>
+bool allInRange(const TileType& tile, const ActiveSpans& active, const WireCoder& coder)
+{
+    const Span* span = active.spans.data();
+    for (int y = active.rowBegin; y < active.rowEnd; ++y)
+        for (int i = 0; i < active.rowCounts[static_cast<std::size_t>(y - active.rowBegin)]; ++i, ++span)
+            if (!coder.inRange(tile.pixel(span->x, y), span->count))
+                return false;
+    return true;
+}
+
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
 inline float canonicalDepth(float depth)
 {
     return depth == depth ? depth + 0.0f : std::numeric_limits<float>::infinity();
 }
 
-// Makes the message for a tile, with the channels of `wanted` that the tile has. Adds to `nonFinite` the number of
-// pixels that have an infinity or a NaN in the colour, or a NaN for a depth. `codec` may be null.
+// What is wrong with the pixels of an input.
+struct InputFaults {
+    std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
+    std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
+};
+
+// Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
+// its range. Adds to `faults`. `codec` may be null.
 template <class TileType>
 Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t receiver,
-                      const Codec* codec, std::uint64_t& nonFinite)
+                      const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
 {
     static thread_local ActiveSpans active;
     active.find(tile);
@@ -165,7 +217,10 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         h.spanCount = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
-    const std::size_t payload = tableBytes + stored * sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
+    const bool fits = color != WireFormat::Float32 && allInRange(tile, active, coder);
+    h.colorFormat = fits ? color : WireFormat::Float32;
+    h.depthFormat = coder.depth();
+    const std::size_t payload = tableBytes + planesBytes(h, stored);
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
     Buffer message = pool.acquire(fragmentPrefix + payload);
@@ -186,17 +241,20 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     for (std::size_t c = 0; c < channelCount; ++c)
         if (planes.at[c]) {
             to.at[c] = section;
-            section += 4 * stored * static_cast<std::size_t>(channelWords[c]);
+            section += planeBytes(h, c, stored);
+            if (stored > 0)
+                std::memset(section - 4, 0, 4); // what fills it up
         }
     const bool hasMore = (channels & ~(colorChannel | depthChannel)) != 0;
     const std::uint64_t repeats = h.encoding == FragmentEncoding::Constant ? active.pixels : 1;
     const auto copyPixels = [&](int x, int y, int count) {
         const float* from = tile.pixel(x, y);
         const std::size_t first = static_cast<std::size_t>(y) * TileType::size + static_cast<std::size_t>(x);
-        std::memcpy(to.at[Color], from, 4 * sizeof(float) * static_cast<std::size_t>(count));
-        to.at[Color] += 4 * sizeof(float) * static_cast<std::size_t>(count);
+        coder.encodeColor(h.colorFormat, from, count, to.at[Color]);
+        to.at[Color] += 4 * bytesOf(h.colorFormat) * static_cast<std::size_t>(count);
         const float* fromDepth = planes.at[Depth] ? floatsOf(planes.at[Depth]) + first : nullptr;
-        auto* depth = floatsOf(to.at[Depth]);
+        float rounded[256];
+        float* depth = h.depthFormat == WireFormat::Float32 ? floatsOf(to.at[Depth]) : rounded;
         for (int i = 0; i < count; ++i) {
             bool finite = (from[4 * i] - from[4 * i]) + (from[4 * i + 1] - from[4 * i + 1])
                               + (from[4 * i + 2] - from[4 * i + 2]) + (from[4 * i + 3] - from[4 * i + 3])
@@ -206,10 +264,15 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
                 finite = finite && d == d;
                 depth[i] = canonicalDepth(d);
             }
-            nonFinite += finite ? 0 : repeats;
+            const bool alphaInside = from[4 * i + 3] >= 0.0f && from[4 * i + 3] <= 1.0f;
+            faults.nonFinite += finite ? 0 : repeats;
+            faults.alphaOutside += finite && !alphaInside ? repeats : 0;
         }
-        if (fromDepth)
-            to.at[Depth] += sizeof(float) * static_cast<std::size_t>(count);
+        if (fromDepth) {
+            if (depth == rounded)
+                coder.encodeDepth(h.depthFormat, rounded, count, to.at[Depth]);
+            to.at[Depth] += bytesOf(h.depthFormat) * static_cast<std::size_t>(count);
+        }
         if (!hasMore)
             return;
         for (std::size_t c = Normal; c < channelCount; ++c)
@@ -232,8 +295,11 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     }
 
     if (codec && payload > 0) {
+        static thread_local std::vector<std::byte> split;
+        split.resize(payload);
+        transformPlanes(h, tableBytes, stored, out, split.data(), PlaneFilter::split);
         Buffer packed = pool.acquire(fragmentPrefix + codec->bound(payload));
-        const std::size_t packedBytes = codec->compress(out, payload, packed.data() + fragmentPrefix);
+        const std::size_t packedBytes = codec->compress(split.data(), payload, packed.data() + fragmentPrefix);
         if (packedBytes < payload) {
             packed.shrink(fragmentPrefix + packedBytes);
             message = std::move(packed);
@@ -257,11 +323,36 @@ inline ConstPlanes planesAt(const std::byte* data, ChannelMask channels, std::si
     return planes;
 }
 
+// A body with its planes as Float32.
+inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t tableBytes, std::size_t pixels,
+                       const std::byte* body, const WireCoder& coder)
+{
+    FragmentHeader wide = h;
+    wide.colorFormat = wide.depthFormat = WireFormat::Float32;
+    Buffer floats = pool.acquire(tableBytes + planesBytes(wide, pixels));
+    std::memcpy(floats.data(), body, tableBytes);
+    const std::byte* in = body + tableBytes;
+    std::byte* out = floats.data() + tableBytes;
+    for (std::size_t c = 0; c < channelCount; ++c) {
+        if (!hasChannel(h.channels, c))
+            continue;
+        if (c == Color)
+            coder.decodeColor(h.colorFormat, in, pixels, floatsOf(out));
+        else if (c == Depth)
+            coder.decodeDepth(h.depthFormat, in, pixels, floatsOf(out));
+        else
+            std::memcpy(out, in, planeBytes(h, c, pixels));
+        in += planeBytes(h, c, pixels);
+        out += planeBytes(wide, c, pixels);
+    }
+    return floats;
+}
+
 // Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
 // decompressed form). `passesOf(tile)`: how many passes the tile has. Throws Error (MalformedMessage).
 template <class PassesOf>
 Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
-                        const Codec* codec)
+                        const Codec* codec, const WireCoder& coder)
 {
     if (message.size() < fragmentPrefix)
         failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
@@ -273,6 +364,10 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
         failMalformed("pass outside the tile's", passes - 1, h.pass);
     if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
+
+    if (h.colorFormat > WireFormat::Unorm8 || h.depthFormat > WireFormat::Unorm8)
+        failMalformed("unknown format of colour or depth", static_cast<std::int64_t>(WireFormat::Unorm8),
+                      static_cast<std::int64_t>(std::max(h.colorFormat, h.depthFormat)));
 
     TileHeader header;
     header.frame = m.number;
@@ -312,7 +407,7 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     }
     if (stored > pixelCount)
         failMalformed("more pixels than the tile has", pixelCount, static_cast<std::int64_t>(stored));
-    const std::size_t payload = tableBytes + stored * pixelBytes;
+    const std::size_t payload = tableBytes + planesBytes(h, stored);
     if (h.rawPayloadBytes != payload)
         failMalformed("wrong payload size", static_cast<std::int64_t>(payload), h.rawPayloadBytes);
 
@@ -323,14 +418,21 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
         Buffer raw = pool.acquire(payload);
         if (!codec->decompress(message.data() + fragmentPrefix, message.size() - fragmentPrefix, raw.data(), payload))
             failMalformed("the payload does not decompress to its size", static_cast<std::int64_t>(payload), -1);
-        message = std::move(raw);
+        message = pool.acquire(payload);
+        transformPlanes(h, tableBytes, stored, raw.data(), message.data(), PlaneFilter::join);
         offset = 0;
     } else if (message.size() - fragmentPrefix != payload) {
         failMalformed("wrong message size", static_cast<std::int64_t>(fragmentPrefix + payload),
                       static_cast<std::int64_t>(message.size()));
     }
 
+    if (h.colorFormat != WireFormat::Float32 || h.depthFormat != WireFormat::Float32) {
+        message = expanded(pool, h, tableBytes, stored, message.data() + offset, coder);
+        offset = 0;
+    }
+
     Fragment::Parts parts;
+    parts.colorFormat = h.colorFormat;
     parts.encoding = h.encoding;
     parts.activePixels = h.activePixels;
     parts.rowEnd = height;

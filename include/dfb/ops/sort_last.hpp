@@ -6,6 +6,7 @@
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
@@ -56,8 +57,8 @@ public:
 
     const double* rgba(std::size_t pixel) const noexcept { return rgba_.data() + 4 * pixel; }
 
-    // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y.
-    void write(FinishedTile& out, int y, std::size_t first, std::int64_t count)
+    // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y. Returns its colour.
+    const double* write(FinishedTile& out, int y, std::size_t first, std::int64_t count)
     {
         const auto width = static_cast<std::size_t>(out.width());
         row_.resize(4 * width);
@@ -89,6 +90,7 @@ public:
         aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
         aux.instanceId = ids(instanceId_, aux_.instanceId);
         out.setRow(y, row_.data(), depth_.data() + first, aux);
+        return row_.data();
     }
 
 private:
@@ -148,7 +150,10 @@ public:
                                      info_.background[3]};
         const int width = info_.region.width();
         for (int y = 0; y < info_.region.height(); ++y) {
-            scratch.isUndefined.assign(tracked_ & farChannel ? static_cast<std::size_t>(width) : 0, 0);
+            scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
+            scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
+            const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
+            scratch.isUndefined.assign(tracksOrder ? static_cast<std::size_t>(width) : 0, 0);
             for (std::size_t pass = 0; pass < passes; ++pass) {
                 scratch.row.reset(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
@@ -171,13 +176,14 @@ public:
         compositePasses([&](int y, int pass, const CompositeRow& row) {
             if (direct) {
                 out.setRow(y, row.rgba.data(), row.depth.data());
+                roundExactly(out, y, row.rgba.data());
                 return;
             }
             if (pass == 0)
                 sums.reset(static_cast<std::size_t>(out.width()), tracked_);
             sums.add(0, row);
             if (pass == last)
-                sums.write(out, y, 0, info_.passes);
+                roundExactly(out, y, sums.write(out, y, 0, info_.passes));
         });
     }
 
@@ -185,6 +191,57 @@ public:
     std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
 
 private:
+    // Where double does not tell which 8-bit level is nearer, finds out. `rgba`: the row, as it has been written.
+    void roundExactly(FinishedTile& out, int y, const double* rgba)
+    {
+        const int step = out.format() == OutputFormat::RGBA8 ? 1 : 4; // of SRGBA8 alpha alone
+        if (out.format() != OutputFormat::RGBA8 && out.format() != OutputFormat::SRGBA8)
+            return;
+        // Of 3 roundings for each layer and pass.
+        const double uncertain =
+            255 * 0x1p-53 * (4.0 * static_cast<double>(fragments_.size()) + 4.0 * info_.passes + 8);
+        bool isKnown = true;
+        for (int i = step - 1; i < 4 * out.width(); i += step) {
+            const double value = rgba[i] > 0 && rgba[i] < 1 ? rgba[i] : 0.0; // the others, and NaN, are no question
+            const double scaled = 255 * value, overTie = scaled - static_cast<double>(static_cast<int>(scaled)) - 0.5;
+            isKnown = isKnown && std::abs(overTie) > uncertain;
+        }
+        if (isKnown || fragments_.empty())
+            return;
+        const std::vector<DoubleDouble> exact = exactRow(y);
+        for (int i = step - 1; i < 4 * out.width(); i += step)
+            out.setLevel(y, i, toUnorm8(exact[static_cast<std::size_t>(i)]));
+    }
+
+    // Row y in twice the precision, the mean of the passes.
+    std::vector<DoubleDouble> exactRow(int y)
+    {
+        const int width = info_.region.width();
+        const float background[4] = {info_.background[0], info_.background[1], info_.background[2],
+                                     info_.background[3]};
+        std::vector<DoubleDouble> mean(4 * static_cast<std::size_t>(width));
+        CompositeRow row;
+        row.minTransmittance = static_cast<double>(info_.minTransmittance);
+        std::vector<const Fragment*> pointers;
+        FragmentCompositor compositor(Rule);
+        for (int pass = 0; pass < info_.passes; ++pass) {
+            pointers.clear();
+            for (const Fragment& fragment : fragments_)
+                if (fragment.header().pass == pass)
+                    pointers.push_back(&fragment);
+            compositor.start(pointers.begin(), pointers.end());
+            compositor.skipRows(y);
+            row.reset(width, 0, true);
+            compositor.nextRow(row);
+            overBackground(row, background);
+            for (std::size_t i = 0; i < mean.size(); ++i)
+                mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
+        }
+        for (DoubleDouble& value : mean)
+            value = value / info_.passes;
+        return mean;
+    }
+
     struct Scratch {
         std::vector<const Fragment*> pointers;
         std::vector<FragmentCompositor> compositors;
@@ -204,6 +261,7 @@ class SortLast {
 public:
     static constexpr int tileSize = TileSize;
     static constexpr ChannelMask channels = Channels;
+    static constexpr BlendRule rule = Rule;
 
     void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
     void add(Fragment&& fragment) { store_.add(std::move(fragment)); }

@@ -32,6 +32,7 @@ template <class FrameBuffer, class RenderTile>
 {
     params.declared = false;
     params.declarationKey = 0;
+    params.maxLayers = 1;
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(assigned.size(), [&](std::size_t i) { return frame.samples(assigned[i]).count; });
     detail::TileLoop<FrameBuffer> loop(fb, frame);
@@ -56,6 +57,7 @@ template <class FrameBuffer, class RenderTile>
         return startImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
     params.declared = false;
     params.declarationKey = 0;
+    params.maxLayers = 1;
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(static_cast<std::size_t>(fb.layout().tileCount()),
                                 [&](std::size_t tile) { return frame.samples(static_cast<int>(tile)).count; });

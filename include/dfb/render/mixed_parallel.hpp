@@ -172,6 +172,16 @@ struct MixedJob {
     int pass = 0;
 };
 
+// The most bricks that meet in a tile.
+inline int mostPerTile(const std::vector<BrickInTile>& pairs, int tileCount)
+{
+    std::vector<int> counts(static_cast<std::size_t>(tileCount), 0);
+    int most = 1;
+    for (const BrickInTile& pair : pairs)
+        most = std::max(most, ++counts[static_cast<std::size_t>(pair.tile)]);
+    return most;
+}
+
 template <class Frame, class Owner>
 std::vector<MixedJob> mixedJobs(const Frame& frame, const SharedWorld& world, const std::vector<BrickInTile>& pairs,
                                 Owner& owner)
@@ -225,6 +235,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     detail::TileLoop<FrameBuffer> loop(fb, frame);
     loop.guard([&] {
         const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+        frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
         const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
         if (frame.wantsDeclaration()) {
             // The tile, whoever renders it, is declared by the first of those that hold the brick.
@@ -285,6 +296,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
                        : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
         });
         const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
+        frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
         std::vector<int> firstPair(static_cast<std::size_t>(fb.layout().tileCount()), -1);
         for (std::size_t p = pairs.size(); p-- > 0;)
             firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);

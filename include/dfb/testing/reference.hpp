@@ -1,5 +1,6 @@
 // The serial reference that results are compared with: per pixel, in arithmetic of more than twice the precision
-// of double, with no thought of speed. It shares no code with the library.
+// of double (with compilers that have no __float128, of long double), with no thought of speed. It shares no code with
+// the library.
 #pragma once
 
 #include <algorithm>
@@ -13,7 +14,7 @@
 #include <type_traits>
 #include <vector>
 
-namespace reference {
+namespace dfb::testing {
 
 #if defined(__SIZEOF_FLOAT128__)
 __extension__ typedef __float128 Exact; // 113 bits
@@ -36,15 +37,18 @@ struct Pixel {
 
 using Color = std::array<float, 4>;
 
-// Front to back by (depth, source, part), a NaN for a depth being farthest: A += T a, T *= 1 - a; the background last.
-inline Pixel composite(std::vector<Sample> samples, const Color& background)
+// As a depth is compared: NaN is farthest.
+inline float comparable(float depth) { return std::isnan(depth) ? std::numeric_limits<float>::infinity() : depth; }
+
+inline bool isInFront(const Sample& a, const Sample& b)
 {
-    for (Sample& s : samples)
-        if (std::isnan(s.depth))
-            s.depth = std::numeric_limits<float>::infinity();
-    std::stable_sort(samples.begin(), samples.end(), [](const Sample& a, const Sample& b) {
-        return std::tie(a.depth, a.source, a.part) < std::tie(b.depth, b.source, b.part);
-    });
+    return std::make_tuple(comparable(a.depth), a.source, a.part)
+           < std::make_tuple(comparable(b.depth), b.source, b.part);
+}
+
+// OrderedBlend: in the order of the samples, front to back: A += T a, T *= 1 - a; the background last.
+inline Pixel compositeInOrder(const std::vector<Sample>& samples, const Color& background)
+{
     Pixel result;
     Exact transmittance = 1;
     for (const Sample& s : samples) {
@@ -52,11 +56,26 @@ inline Pixel composite(std::vector<Sample> samples, const Color& background)
             result.rgba[c] += transmittance * static_cast<Exact>(s.rgba[c]);
         transmittance *= 1 - static_cast<Exact>(s.rgba[3]);
         if (s.rgba[3] > 0.0f)
-            result.depth = std::min(result.depth, s.depth);
+            result.depth = std::min(result.depth, comparable(s.depth));
     }
     for (std::size_t c = 0; c < 4; ++c)
         result.rgba[c] += transmittance * static_cast<Exact>(background[c]);
     return result;
+}
+
+// AlphaBlend: the same, sorted by (depth, source, part).
+inline Pixel composite(std::vector<Sample> samples, const Color& background)
+{
+    std::stable_sort(samples.begin(), samples.end(), isInFront);
+    return compositeInOrder(samples, background);
+}
+
+// DepthComposite: the first of these alone.
+inline Pixel nearest(const std::vector<Sample>& samples, const Color& background)
+{
+    if (samples.empty())
+        return compositeInOrder({}, background);
+    return compositeInOrder({*std::min_element(samples.begin(), samples.end(), isInFront)}, background);
 }
 
 // The mean of passes that were composited each by itself; the nearest of their depths.
@@ -75,8 +94,8 @@ inline Pixel mean(const std::vector<Pixel>& passes)
 
 inline float toFloat(Exact value) { return static_cast<float>(value); }
 
-// To the nearest of 0..255, ties to even, clamped; NaN gives 0. What is within the rounding of Exact of a tie is one: the
-// mean of 3 passes can be 1/6, that is 42.5 / 255, which no binary number is.
+// To the nearest of 0..255, ties to even, clamped; NaN gives 0. What is within the rounding of Exact of a tie is one:
+// the mean of 3 passes can be 1/6, that is 42.5 / 255, which no binary number is.
 inline std::uint8_t toUnorm8(Exact value)
 {
     if (!(value > 0))
@@ -86,13 +105,14 @@ inline std::uint8_t toUnorm8(Exact value)
     const Exact scaled = value * 255;
     const int below = static_cast<int>(scaled);
     const Exact overTie = scaled - below - static_cast<Exact>(0.5);
-    const Exact rounding = scaled * static_cast<Exact>(sizeof(Exact) == 16 && !std::is_same_v<Exact, long double> ? 0x1p-108 : 0x1p-60);
+    const Exact rounding =
+        scaled * static_cast<Exact>(sizeof(Exact) == 16 && !std::is_same_v<Exact, long double> ? 0x1p-108 : 0x1p-60);
     const bool isTie = overTie <= rounding && -overTie <= rounding;
     return static_cast<std::uint8_t>(below + (isTie ? below % 2 : overTie > 0 ? 1 : 0));
 }
 
-// Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. With the
-// fifth power on both sides there is no root to take.
+// Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. With
+// the fifth power on both sides there is no root to take.
 inline bool isAboveSrgbLevel(Exact value, int level)
 {
     const Exact s = static_cast<Exact>(2 * level + 1) / 510;
@@ -136,4 +156,4 @@ inline std::uint64_t hashOf(const void* data, std::size_t byteCount)
     return hash;
 }
 
-} // namespace reference
+} // namespace dfb::testing

@@ -1,0 +1,549 @@
+// Time against error: what every way to send tiles costs and how exact its image is; beside IceT with floats and bytes,
+// and a plain loop in float, on the same partial images in the same run, frame by frame in turn. And what samples cost
+// in a scene with noise.
+//   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--svg FILE] [--table FILE] [--commit
+//   ID]
+#include "direct_send.hpp"
+#include "results.hpp"
+#ifdef DFB_BENCH_HAS_ICET
+#include "icet.hpp"
+#endif
+
+#include <dfb/dfb.hpp>
+#include <dfb/testing/error_report.hpp>
+
+#include <cstring>
+#include <functional>
+#include <map>
+#include <memory>
+#include <sstream>
+
+namespace {
+
+using bench::BrickImage;
+using bench::Result;
+using dfb::testing::ErrorReport;
+using Messenger = dfb::Messenger<dfb::MpiTransport>;
+using Exact = std::vector<dfb::testing::Pixel>;
+
+struct Options {
+    int width = 1024, height = 1024, frames = 21;
+    std::string json, svg, table, commit;
+};
+
+// Something that makes an image of what all ranks have, and what is known of it.
+struct System {
+    std::string name, config, output; // output: of the image, "float" or "8 bit"
+    std::function<void()> frame;      // collective
+    // Of the last frame on rank 0: 4 a pixel, one of the two.
+    std::function<const float*()> floats;
+    std::function<const std::uint8_t*()> bytes;
+    std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
+    bool trafficIsOfAll = false;
+    std::function<double()> peakMemory;
+    bool isDefault = false;
+    std::vector<double> ms{}, cpuMs{};
+    Result result{};
+};
+
+// ---- dfb: inputs that are ready are copied into tiles
+
+// Each rank has one brick, and knows where it is in the image.
+struct ViewportCamera {
+    const BrickImage* image;
+    dfb::Region project(const dfb::Box3&, int, int) const
+    {
+        const auto& v = image->viewport;
+        return {v[0], v[1], v[0] + v[2], v[1] + v[3]};
+    }
+};
+
+template <int TileSize>
+void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
+            const std::string& config, const dfb::WirePrecision& wire, std::shared_ptr<const dfb::Codec> codec,
+            float minTransmittance, bool isDefault = false)
+{
+    using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<TileSize>>;
+    for (const bool toBytes : {false, true}) {
+        dfb::FrameBufferConfig c;
+        c.width = image.width;
+        c.height = image.height;
+        c.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
+        c.wire = wire;
+        c.codec = codec;
+        c.minTransmittance = minTransmittance;
+        c.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        const auto fb = std::make_shared<FrameBuffer>(messenger, c);
+        const auto report = std::make_shared<dfb::FrameReport>();
+        const BrickImage* from = &image;
+        System s;
+        s.name = "dfb";
+        s.config = config;
+        s.output = toBytes ? "8 bit" : "float";
+        s.isDefault = isDefault;
+        s.frame = [fb, report, from] {
+            dfb::World world;
+            if (from->viewport[2] > 0)
+                world.add({static_cast<std::uint32_t>(fb->rank()), {}});
+            dfb::FrameParams params;
+            params.maxLayers = fb->size();
+            *report = dfb::renderDataParallel(
+                *fb, world, ViewportCamera{from},
+                [&](const dfb::Brick&, auto& tile) {
+                    const dfb::Region& r = tile.region;
+                    const auto width = static_cast<std::size_t>(r.width());
+                    for (int y = 0; y < r.height(); ++y) {
+                        const std::size_t first =
+                            static_cast<std::size_t>(r.y0 + y) * static_cast<std::size_t>(from->width)
+                            + static_cast<std::size_t>(r.x0);
+                        std::memcpy(tile.pixel(0, y), &from->rgba[4 * first], 4 * sizeof(float) * width);
+                        std::memcpy(tile.depth + y * TileSize, &from->depth[first], sizeof(float) * width);
+                    }
+                },
+                params);
+        };
+        if (toBytes)
+            s.bytes = [fb] { return fb->image().rgba8(); };
+        else
+            s.floats = [fb] { return fb->image().rgba32f(); };
+        s.traffic = [report] { return std::make_pair(report->bytesSent, report->messagesSent); };
+        s.trafficIsOfAll = true;
+        s.peakMemory = [report] { return static_cast<double>(report->peakMemoryBytes); };
+        systems.push_back(std::move(s));
+    }
+}
+
+void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image)
+{
+    using dfb::WireFormat;
+    const auto add = [&](const std::string& config, const dfb::WirePrecision& wire,
+                         const std::shared_ptr<const dfb::Codec>& codec = {}, float minTransmittance = 0,
+                         bool isDefault = false) {
+        addDfb<64>(systems, messenger, image, config, wire, codec, minTransmittance, isDefault);
+    };
+    add("float32", WireFormat::Float32, {}, 0, true);
+    for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8})
+        add(nameOf(format), format);
+    for (const double budget : {1e-2, 2e-3, 5e-4, 1e-5}) {
+        std::ostringstream name;
+        name << "budget " << budget;
+        add(name.str(), dfb::ErrorBudget{budget});
+    }
+    add("float32, transmittance 1e-3", WireFormat::Float32, {}, 1e-3f);
+    addDfb<32>(systems, messenger, image, "float32, tiles of 32", WireFormat::Float32, {}, 0);
+    addDfb<128>(systems, messenger, image, "float32, tiles of 128", WireFormat::Float32, {}, 0);
+#if defined(DFB_HAS_SNAPPY)
+    const auto snappy = std::make_shared<dfb::SnappyCodec>();
+    for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})
+        add(std::string(nameOf(format)) + ", snappy", format, snappy);
+#endif
+}
+
+// ---- the peers
+
+void addPlain(std::vector<System>& systems, MPI_Comm comm, const bench::BrickScene& scene, const BrickImage& image,
+              const std::vector<std::array<int, 4>>& viewports)
+{
+    for (const bool toBytes : {false, true}) {
+        const auto plain =
+            std::make_shared<bench::DirectSend>(comm, scene.order(), viewports, image.width, image.height, toBytes);
+        const auto out = std::make_shared<const std::byte*>(nullptr);
+        System s;
+        s.name = "plain";
+        s.config = "direct send, float";
+        s.output = toBytes ? "8 bit" : "float";
+        s.frame = [plain, out, &image] { *out = plain->composite(image.rgba); };
+        if (toBytes)
+            s.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
+        else
+            s.floats = [out] { return reinterpret_cast<const float*>(*out); };
+        s.traffic = [plain] { return std::make_pair(plain->bytesSent(), plain->messagesSent()); };
+        systems.push_back(std::move(s));
+    }
+}
+
+#ifdef DFB_BENCH_HAS_ICET
+// As a user would, whose renderer has floats: for bytes they are converted first; for bytes out of floats, afterwards.
+void addIceT(std::vector<System>& systems, MPI_Comm comm, const bench::BrickScene& scene, const BrickImage& image)
+{
+    enum class Way { Floats, FloatsToBytes, Bytes };
+    for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {
+        const std::string name = strategy.name;
+        if (name != "direct" && name != "sequential, radix-k" && name != "sequential, binary swap"
+            && name != "sequential, tree")
+            continue;
+        for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes}) {
+            bench::IceTSettings settings;
+            settings.strategy = strategy.strategy;
+            settings.singleImage = strategy.singleImage;
+            settings.ubyte = way == Way::Bytes;
+            const auto icet = std::make_shared<bench::IceT>(comm, settings, image.width, image.height);
+            const std::size_t values =
+                4 * static_cast<std::size_t>(image.width) * static_cast<std::size_t>(image.height);
+            const auto converted = std::make_shared<std::vector<std::uint8_t>>(way == Way::Floats ? 0 : values);
+            const auto out = std::make_shared<const void*>(nullptr);
+            const auto toBytes = [](const float* from, std::uint8_t* to, std::size_t count) {
+                for (std::size_t i = 0; i < count; ++i)
+                    to[i] = static_cast<std::uint8_t>(std::min(std::max(from[i], 0.0f), 1.0f) * 255 + 0.5f);
+            };
+            System s;
+            s.name = "icet";
+            s.config = (way == Way::Bytes ? "ubyte, " : "float, ") + name;
+            s.output = way == Way::Floats ? "float" : "8 bit";
+            const std::vector<int> order = scene.order();
+            s.frame = [=, &image] {
+                const auto& v = image.viewport;
+                const void* input = image.rgba.data();
+                if (way == Way::Bytes) {
+                    for (int y = v[1]; y < v[1] + v[3]; ++y) {
+                        const std::size_t first = 4
+                                                  * (static_cast<std::size_t>(y) * static_cast<std::size_t>(image.width)
+                                                     + static_cast<std::size_t>(v[0]));
+                        toBytes(&image.rgba[first], converted->data() + first, 4 * static_cast<std::size_t>(v[2]));
+                    }
+                    input = converted->data();
+                }
+                icet->resetTraffic();
+                *out = icet->composite(input, v.data(), order);
+                if (way == Way::FloatsToBytes && *out) {
+                    toBytes(static_cast<const float*>(*out), converted->data(), values);
+                    *out = converted->data();
+                }
+            };
+            if (way == Way::Floats)
+                s.floats = [out] { return static_cast<const float*>(*out); };
+            else
+                s.bytes = [out] { return static_cast<const std::uint8_t*>(*out); };
+            s.traffic = [icet] { return std::make_pair(icet->bytesSent(), icet->messagesSent()); };
+            systems.push_back(std::move(s));
+        }
+    }
+}
+#endif
+
+// ---- measuring
+
+// Of an image, 4 values a pixel, one of the two.
+ErrorReport errorOf(const float* floats, const std::uint8_t* bytes, const Exact& exact)
+{
+    ErrorReport report;
+    for (std::size_t i = 0; i < 4 * exact.size(); ++i) {
+        const auto value = exact[i / 4].rgba[i % 4];
+        const std::uint8_t level = dfb::testing::toUnorm8(value);
+        if (floats) {
+            report.add(floats[i], value);
+            report.addByte(dfb::testing::toUnorm8(static_cast<dfb::testing::Exact>(floats[i])), level);
+        } else {
+            report.add(static_cast<float>(bytes[i]) / 255, value);
+            report.addByte(bytes[i], level);
+        }
+    }
+    return report;
+}
+
+class Bench {
+public:
+    Bench(MPI_Comm comm, Options o) : comm_(comm), o_(std::move(o))
+    {
+        MPI_Comm_rank(comm, &rank_);
+        MPI_Comm_size(comm, &size_);
+    }
+
+    void bricks()
+    {
+        const bench::BrickScene scene(size_, o_.width, o_.height);
+        const BrickImage image = scene.render(rank_);
+        std::vector<std::array<int, 4>> viewports;
+        for (int rank = 0; rank < size_; ++rank)
+            viewports.push_back(rank == rank_ ? image.viewport : scene.render(rank).viewport);
+        Exact exact;
+        if (rank_ == 0)
+            exact = scene.exact();
+        bench::meet(comm_);
+        const auto messenger = std::make_shared<Messenger>(comm_);
+        std::vector<System> systems;
+        addAllDfb(systems, messenger, image);
+        addPlain(systems, comm_, scene, image, viewports);
+#ifdef DFB_BENCH_HAS_ICET
+        addIceT(systems, comm_, scene, image);
+#endif
+        for (int frame = -1; frame < o_.frames; ++frame) // the first touches memory
+            for (std::size_t i = 0; i < systems.size(); ++i)
+                time(systems[(i + static_cast<std::size_t>(frame + 1)) % systems.size()], frame >= 0);
+        for (System& s : systems) {
+            describe(s, "bricks");
+            const auto traffic = s.traffic();
+            s.result.bytes = static_cast<double>(traffic.first);
+            s.result.messages = static_cast<double>(traffic.second);
+            if (!s.trafficIsOfAll) {
+                s.result.bytes = bench::reduce(comm_, s.result.bytes, MPI_SUM);
+                s.result.messages = bench::reduce(comm_, s.result.messages, MPI_SUM);
+            }
+            if (rank_ == 0) {
+                const ErrorReport e = errorOf(s.floats ? s.floats() : nullptr, s.bytes ? s.bytes() : nullptr, exact);
+                s.result.maxError = e.maxAbs;
+                s.result.rmse = e.rmse();
+                s.result.levels = e.maxLevels;
+            }
+            if (s.peakMemory)
+                s.result.peakMemoryBytes = s.peakMemory();
+        }
+        // Of a system that makes 8 bits out of an image in float, the error is that of the image.
+        for (System& s : systems)
+            for (const System& f : systems)
+                if (s.bytes && f.floats && s.name == f.name && s.config == f.config) {
+                    s.result.maxError = f.result.maxError;
+                    s.result.rmse = f.result.rmse;
+                }
+        for (System& s : systems)
+            if (rank_ == 0)
+                (s.bytes ? bytes_ : floats_).push_back({s.result, s.output, s.isDefault});
+    }
+
+    // A disc with a noisy rim and half of it in noisy light before a background without any: what samples cost, of
+    // which each takes 1 us.
+    void noise()
+    {
+        const int width = 256, height = 256;
+        const auto meanOf = [=](int x, int y) {
+            const double u = (x + 0.5) / width - 0.5, v = (y + 0.5) / height - 0.5, r = std::sqrt(u * u + v * v);
+            return r < 0.2 ? 0.3 + 0.4 * (0.5 + u) : 0.1;
+        };
+        const auto spreadOf = [=](int x, int y) {
+            const double u = (x + 0.5) / width - 0.5, v = (y + 0.5) / height - 0.5, r = std::sqrt(u * u + v * v);
+            return r > 0.2 ? 0.0 : r > 0.18 || u > 0 ? 0.25 : 0.05;
+        };
+        using Op = dfb::Progressive<dfb::BasicImageParallel<16>>;
+        const auto render = [=](auto& tile) {
+            const double until = bench::now() + 1e-6 * tile.region.width() * tile.region.height();
+            tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+                std::uint64_t h =
+                    static_cast<std::uint64_t>(y * width + x) * 1000003u + static_cast<std::uint64_t>(tile.sample);
+                h = (h ^ h >> 31) * 0x9e3779b97f4a7c15u;
+                h = (h ^ h >> 29) * 0xbf58476d1ce4e5b9u;
+                const double random = static_cast<double>(h >> 11) * 0x1p-53;
+                const auto value = static_cast<float>(meanOf(x, y) + spreadOf(x, y) * (2 * random - 1));
+                for (int c = 0; c < 3; ++c)
+                    rgba[c] = value;
+                rgba[3] = 1;
+            });
+            while (bench::now() < until) {
+            }
+        };
+        dfb::FrameBufferConfig c;
+        c.width = width;
+        c.height = height;
+        c.format = dfb::OutputFormat::RGBA32F;
+        c.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::DistributedFrameBuffer<Op> fb(comm_, c);
+        Exact exact;
+        for (int i = 0; i < width * height; ++i) {
+            dfb::testing::Pixel pixel;
+            for (std::size_t k = 0; k < 4; ++k)
+                pixel.rgba[k] = k == 3 ? 1.0 : meanOf(i % width, i / width);
+            exact.push_back(pixel);
+        }
+        std::uint64_t accumulation = 1;
+        std::vector<System> systems;
+        const auto add = [&](const std::string& config, int samples, double threshold) {
+            System s;
+            s.name = "dfb";
+            s.config = config;
+            s.output = "float";
+            const auto bytes = std::make_shared<std::pair<std::int64_t, std::int64_t>>();
+            s.frame = [&fb, &accumulation, render, samples, threshold, bytes] {
+                *bytes = {0, 0};
+                const auto take = [&](const dfb::FrameReport& report) {
+                    bytes->first += report.bytesSent;
+                    bytes->second += report.messagesSent;
+                    return report;
+                };
+                dfb::FrameParams params;
+                params.accumulationId = ++accumulation;
+                if (threshold > 0) {
+                    dfb::AdaptiveSampler sampler(fb.layout(), {threshold, 8, samples, 64});
+                    while (!sampler.done())
+                        sampler.update(take(dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, render,
+                                                                     sampler.next(params))));
+                } else {
+                    params.passes = samples;
+                    take(dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, render, params));
+                }
+            };
+            s.floats = [&fb] { return fb.image().rgba32f(); };
+            s.traffic = [bytes] { return *bytes; };
+            systems.push_back(std::move(s));
+        };
+        for (const int samples : {1, 4, 16, 64})
+            add(std::to_string(samples) + " samples", samples, 0);
+        for (const double threshold : {0.05, 0.02, 0.01}) {
+            std::ostringstream name;
+            name << "adaptive, " << threshold;
+            add(name.str(), 256, threshold);
+        }
+        const int frames = std::max(3, o_.frames / 4);
+        for (System& s : systems)
+            for (int frame = -1; frame < frames; ++frame) {
+                time(s, frame >= 0);
+                if (frame + 1 == frames && rank_ == 0) {
+                    const ErrorReport e = errorOf(s.floats(), nullptr, exact);
+                    s.result.maxError = e.maxAbs;
+                    s.result.rmse = e.rmse();
+                    s.result.levels = e.maxLevels;
+                }
+            }
+        for (System& s : systems) {
+            describe(s, "noise");
+            const auto traffic = s.traffic();
+            s.result.bytes = static_cast<double>(traffic.first);
+            s.result.messages = static_cast<double>(traffic.second);
+            s.result.width = width;
+            s.result.height = height;
+            if (rank_ == 0)
+                noise_.push_back({s.result, s.output, s.isDefault});
+        }
+    }
+
+    void write() const
+    {
+        if (rank_ != 0)
+            return;
+        std::ostringstream table;
+        std::vector<Result> all;
+        for (const auto* rows : {&floats_, &bytes_, &noise_}) {
+            std::vector<Result> results;
+            for (const Row& s : *rows)
+                results.push_back(s.result);
+            all.insert(all.end(), results.begin(), results.end());
+            table << "\n| " << (rows == &noise_ ? "noise, " : "") << size_ << " ranks, "
+                  << (rows->empty() ? "" : rows->front().output)
+                  << " | ms | CPU ms | MB sent | max error | RMSE | levels off |\n|---|--:|--:|--:|--:|--:|--:|\n";
+            for (const Row& s : *rows)
+                table << line(s.result, results);
+            for (const Row& s : *rows)
+                if (s.isDefault && !isOnFront(s.result, results))
+                    table << "\nNot on the front, though a default: " << s.result.config << ".\n";
+            if (!o_.svg.empty() && !results.empty()) {
+                const std::string kind = rows == &floats_ ? "float" : rows == &bytes_ ? "8bit" : "noise";
+                bench::writeSvg(o_.svg + '.' + kind + ".svg",
+                                results.front().scene + ", " + std::to_string(results.front().width) + " x "
+                                    + std::to_string(results.front().height) + ", " + std::to_string(size_) + " ranks, "
+                                    + rows->front().output + " output; * on the Pareto front",
+                                results);
+            }
+        }
+        std::printf("%s", table.str().c_str());
+        if (!o_.json.empty())
+            bench::appendJson(o_.json, all);
+        if (!o_.table.empty())
+            std::ofstream(o_.table, std::ios::app) << table.str();
+    }
+
+private:
+    struct Row {
+        Result result;
+        std::string output;
+        bool isDefault;
+    };
+
+    void time(System& s, bool counts)
+    {
+        bench::meet(comm_);
+        const double start = bench::now(), cpuBefore = bench::processCpuSeconds();
+        s.frame();
+        const double end = bench::now(), cpu = bench::processCpuSeconds() - cpuBefore;
+        const double first = bench::reduce(comm_, start, MPI_MIN);
+        const double cpuOfAll = bench::reduce(comm_, cpu, MPI_SUM);
+        if (!counts)
+            return;
+        s.ms.push_back(1e3 * (end - first)); // on rank 0, when it has the image
+        s.cpuMs.push_back(1e3 * cpuOfAll);
+    }
+
+    void describe(System& s, const std::string& scene) const
+    {
+        Result& r = s.result;
+        r.bench = "bench_error_time";
+        r.system = s.name;
+        r.config = s.config + ", to " + s.output;
+        r.scene = scene;
+        r.ranks = size_;
+        r.width = o_.width;
+        r.height = o_.height;
+        r.ms = bench::figureOf(s.ms);
+        r.cpuMs = bench::figureOf(s.cpuMs);
+        r.commit = o_.commit;
+    }
+
+    static std::string line(const Result& r, const std::vector<Result>& all)
+    {
+        const bool front = isOnFront(r, all);
+        char text[512];
+        std::snprintf(text, sizeof text, "| %s%s: %s%s | %s | %s | %.2f | %.2g | %.2g | %d |\n", front ? "**" : "",
+                      r.system.c_str(), r.config.c_str(), front ? "**" : "", bench::text(r.ms).c_str(),
+                      bench::text(r.cpuMs).c_str(), r.bytes / 1e6, r.maxError, r.rmse, r.levels);
+        return text;
+    }
+
+    MPI_Comm comm_;
+    Options o_;
+    int rank_ = 0, size_ = 1;
+    std::vector<Row> floats_, bytes_, noise_; // on rank 0
+};
+
+// Ends the program after --help, or if it was called wrongly.
+Options optionsOf(int argc, char** argv)
+{
+    Options o;
+    const char* usage =
+        "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--svg PREFIX] "
+        "[--table FILE] [--commit ID]";
+    const auto fail = [usage](int code) {
+        std::printf("%s\n", usage);
+        std::exit(code);
+    };
+    for (int i = 1; i < argc; ++i) {
+        const std::string name = argv[i];
+        if (name == "--help")
+            fail(0);
+        if (i + 1 == argc)
+            fail(2);
+        const std::string value = argv[++i];
+        if (name == "--size") {
+            if (std::sscanf(value.c_str(), "%dx%d", &o.width, &o.height) != 2)
+                fail(2);
+        } else if (name == "--frames") {
+            o.frames = std::atoi(value.c_str());
+        } else if (name == "--json") {
+            o.json = value;
+        } else if (name == "--svg") {
+            o.svg = value;
+        } else if (name == "--table") {
+            o.table = value;
+        } else if (name == "--commit") {
+            o.commit = value;
+        } else {
+            fail(2);
+        }
+    }
+    if (o.width < 16 || o.height < 16 || o.frames < 1)
+        fail(2);
+    return o;
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    const Options options = optionsOf(argc, argv);
+    int level = 0;
+    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
+    bench::shortenNaps();
+    {
+        Bench bench(MPI_COMM_WORLD, options);
+        bench.bricks();
+        bench.noise();
+        bench.write();
+    }
+    MPI_Finalize();
+}

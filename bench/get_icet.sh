@@ -1,0 +1,43 @@
+#!/bin/sh
+# sh bench/get_icet.sh [DIR]
+# Puts IceT's headers and library into DIR/include and DIR/lib (default: build/peers/icet, where the build looks for
+# them), for benchmarks to compare with. They come out of Debian's packages of ParaView, which are downloaded (70 MB)
+# and unpacked, but not installed. Does nothing if IceT is there already; exits with 3 if the packages cannot be had.
+set -eu
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+dir=${1:-$root/build/peers/icet}
+dir=${dir%/}
+
+give_up() {
+    echo "get_icet.sh: IceT cannot be had here: $*" >&2
+    exit 3
+}
+
+# DIR is renamed into place when it is complete.
+[ -e "$dir/include/IceT.h" ] && exit 0
+[ ! -e "$dir" ] || give_up "$dir is there, but has no include/IceT.h"
+for command in apt-get dpkg; do
+    command -v "$command" >/dev/null 2>&1 || give_up "there is no $command"
+done
+
+work=$(mktemp -d)
+trap 'rm -rf "$work" "$dir.new"' EXIT
+trap 'exit 1' HUP INT TERM
+
+(cd "$work" && apt-get -q download paraview-dev paraview >log 2>&1) ||
+    give_up "apt-get download paraview-dev paraview: $(grep '^E: ' "$work/log" | tail -n 1)"
+for package in "$work"/*.deb; do
+    dpkg -x "$package" "$work/files"
+done
+header=$(find "$work/files" -name IceT.h | head -n 1)
+library=$(find "$work/files" -name 'libvtkIceTCore*.so' | head -n 1)
+if [ -z "$header" ] || [ -z "$library" ]; then
+    give_up "no IceT in these packages: $(cd "$work" && echo *.deb)"
+fi
+
+mkdir -p "$dir.new/include" "$dir.new/lib"
+cp "$(dirname "$header")/IceT.h" "$(find "$work/files" -name IceTConfig.h | head -n 1)" "$dir.new/include"
+cp -P "$library"* "$dir.new/lib"
+mv "$dir.new" "$dir"
+echo "get_icet.sh: IceT is in $dir" >&2

@@ -1,0 +1,43 @@
+// DoubleDouble: the unevaluated sum of two doubles, for about 106 bits (Dekker 1971, Knuth 1969).
+#pragma once
+
+#include <dfb/version.hpp>
+
+#include <cmath>
+
+namespace dfb::detail {
+
+struct DoubleDouble {
+    double high = 0, low = 0;
+
+    static DoubleDouble sum(double a, double b) noexcept
+    {
+        const double s = a + b, part = s - a;
+        return {s, (a - (s - part)) + (b - part)};
+    }
+    static DoubleDouble product(double a, double b) noexcept
+    {
+        const double p = a * b;
+        return {p, std::fma(a, b, -p)};
+    }
+};
+
+inline DoubleDouble operator+(const DoubleDouble& a, const DoubleDouble& b) noexcept
+{
+    const DoubleDouble high = DoubleDouble::sum(a.high, b.high), low = DoubleDouble::sum(a.low, b.low);
+    const DoubleDouble first = DoubleDouble::sum(high.high, high.low + low.high);
+    return DoubleDouble::sum(first.high, first.low + low.low);
+}
+inline DoubleDouble operator*(const DoubleDouble& a, const DoubleDouble& b) noexcept
+{
+    const DoubleDouble p = DoubleDouble::product(a.high, b.high);
+    return DoubleDouble::sum(p.high, p.low + (a.high * b.low + a.low * b.high));
+}
+inline DoubleDouble operator/(const DoubleDouble& a, double b) noexcept
+{
+    const double q = a.high / b;
+    const DoubleDouble p = DoubleDouble::product(q, b);
+    return DoubleDouble::sum(q, ((a.high - p.high) - p.low + a.low) / b);
+}
+
+} // namespace dfb::detail

@@ -1,0 +1,189 @@
+// TileOpTest: runs a tile operation on the inputs of one tile, as the framebuffer does, and holds what it makes of them
+// against the reference. For the library's operations and for your own:
+//
+//   dfb::testing::TileInputs<MyOp::tileSize> in = dfb::testing::adversarial<MyOp::tileSize>(seed, layers, passes);
+//   const auto expected = dfb::testing::referenceOf(in, [&](const std::vector<Sample>& samples) { return ...; });
+//   const dfb::testing::ErrorReport report = dfb::testing::compare<MyOp>(in, expected);
+//   assert(report.ulpsBelow() <= 2 && report.wrongBytes == 0);
+#pragma once
+
+#include <dfb/detail/wire.hpp>
+#include <dfb/testing/error_report.hpp>
+#include <dfb/tile_op.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <random>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace dfb::testing {
+
+// One tile of an image, and the inputs that it gets.
+template <int Size>
+struct TileInputs {
+    using Tile = dfb::Tile<colorChannel | depthChannel, Size>;
+
+    TileLayout layout{Size, Size, Size};
+    int tile = 0;
+    int passes = 1;
+    Color background{};
+    std::vector<std::unique_ptr<Tile>> tiles;
+
+    Region region() const { return layout.region(tile); }
+
+    // An empty one.
+    Tile& add(int pass, std::uint32_t source, std::uint16_t part = 0, int generation = 1)
+    {
+        tiles.push_back(std::make_unique<Tile>());
+        Tile& t = *tiles.back();
+        static_cast<TileHeader&>(t) = {1, tile, region(), pass, generation, 0, source, part};
+        t.clear();
+        return t;
+    }
+
+    // 0, 1, 2, ...
+    std::vector<std::size_t> order() const
+    {
+        std::vector<std::size_t> all(tiles.size());
+        for (std::size_t i = 0; i < all.size(); ++i)
+            all[i] = i;
+        return all;
+    }
+};
+
+// How inputs travel, and what the operation is told of it.
+struct TileWire {
+    WirePrecision precision;
+    float minTransmittance = 0;
+    const Codec* codec = nullptr;
+};
+
+// A finished tile.
+struct TileOutput {
+    std::vector<std::byte> color;
+    std::vector<float> depth; // empty if the image has none
+    dfb::detail::InputFaults faults;
+    TileReport report;
+    std::size_t bytes = 0; // of the messages
+
+    bool operator==(const TileOutput& o) const
+    {
+        return color == o.color && depth.size() == o.depth.size()
+               && std::memcmp(depth.data(), o.depth.data(), depth.size() * sizeof(float)) == 0;
+    }
+    // Of OutputFormat::RGBA32F.
+    float value(std::size_t i) const
+    {
+        float v = 0;
+        std::memcpy(&v, color.data() + i * sizeof v, sizeof v);
+        return v;
+    }
+};
+
+// What the framebuffer does with a tile, with the inputs arriving in this order.
+template <class Op>
+TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order, OutputFormat format,
+                     bool withDepth = true, const TileWire& wire = {})
+{
+    namespace d = dfb::detail;
+    const auto pool = MemoryPool::create();
+    const Region region = in.region();
+    TileInfo info;
+    info.frame = 1;
+    info.tile = in.tile;
+    info.region = region;
+    info.passes = in.passes;
+    info.wanted = withDepth ? depthChannel : 0;
+    info.background = in.background;
+    info.minTransmittance = wire.minTransmittance;
+    info.depthIsRounded = wire.precision.depth != WireFormat::Float32;
+    const d::WireCoder coder(wire.precision);
+    const auto wanted = static_cast<ChannelMask>(d::NeededChannelsOf<Op>::value | (withDepth ? depthChannel : 0));
+    Op op;
+    TileOutput out;
+    // Twice: an op is used again from frame to frame.
+    for (int frame = 0; frame < 2; ++frame) {
+        op.newFrame(info);
+        out.faults = {};
+        out.bytes = 0;
+        for (const std::size_t i : order) {
+            Buffer message =
+                d::encodeFragment(*pool, *in.tiles[i], wanted, 0, wire.codec, coder, wire.precision.color, out.faults);
+            out.bytes += message.size();
+            op.add(d::decodeFragment(
+                *pool, std::move(message), in.layout, [&](int) { return in.passes; }, wire.codec, coder));
+        }
+        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+        const std::size_t stride = width * bytesPerPixel(format);
+        out.color.assign(stride * height, std::byte{0xcd});
+        out.depth.assign(withDepth ? width * height : 0, -7.0f);
+        d::Planes planes;
+        planes.at[d::Color] = out.color.data();
+        planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
+        FinishedTile finished(region, format, planes, width);
+        op.finish(finished);
+        if constexpr (d::HasReport<Op>::value)
+            op.report(out.report);
+    }
+    return out;
+}
+
+// Exact pixels: the mean over the passes of what `rule(samples)` makes of the inputs' samples, which are in the order
+// of in.tiles. A sample of an input that has nothing there is all 0.
+template <int Size, class Rule>
+std::vector<Pixel> referenceOf(const TileInputs<Size>& in, const Rule& rule)
+{
+    const Region region = in.region();
+    std::vector<Pixel> result;
+    for (int y = 0; y < region.height(); ++y)
+        for (int x = 0; x < region.width(); ++x) {
+            std::vector<std::vector<Sample>> samples(static_cast<std::size_t>(in.passes));
+            for (const auto& t : in.tiles) {
+                const float* p = t->pixel(x, y);
+                samples[static_cast<std::size_t>(t->pass)].push_back(
+                    {{p[0], p[1], p[2], p[3]}, t->depth[y * Size + x], t->source, t->part});
+            }
+            std::vector<Pixel> passes;
+            for (const std::vector<Sample>& pass : samples)
+                passes.push_back(rule(pass));
+            result.push_back(mean(passes));
+        }
+    return result;
+}
+
+// The same for AlphaBlend and ImageParallel.
+template <int Size>
+std::vector<Pixel> referenceOf(const TileInputs<Size>& in)
+{
+    return referenceOf(in, [&](const std::vector<Sample>& samples) { return composite(samples, in.background); });
+}
+
+// All formats and the depth against exact pixels; a wrong depth counts as 4 wrong bytes.
+template <class Op>
+ErrorReport compare(const TileInputs<Op::tileSize>& in, const std::vector<Pixel>& expected)
+{
+    const auto order = in.order();
+    const TileOutput floats = runTileOp<Op>(in, order, OutputFormat::RGBA32F);
+    const TileOutput linear = runTileOp<Op>(in, order, OutputFormat::RGBA8);
+    const TileOutput srgb = runTileOp<Op>(in, order, OutputFormat::SRGBA8);
+    ErrorReport result;
+    for (std::size_t i = 0; i < expected.size(); ++i) {
+        for (std::size_t c = 0; c < 4; ++c) {
+            const Exact exact = expected[i].rgba[c];
+            result.add(floats.value(4 * i + c), exact);
+            result.addByte(static_cast<std::uint8_t>(linear.color[4 * i + c]), toUnorm8(exact));
+            result.addByte(static_cast<std::uint8_t>(srgb.color[4 * i + c]), c == 3 ? toUnorm8(exact) : toSrgb8(exact));
+        }
+        if (!(floats.depth[i] == expected[i].depth && linear.depth[i] == expected[i].depth))
+            result.wrongBytes += 4;
+    }
+    return result;
+}
+
+} // namespace dfb::testing

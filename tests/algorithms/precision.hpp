@@ -1,0 +1,166 @@
+// Wire precision and early termination: errors within what was asked for and reported, the same on any ranks.
+#pragma once
+
+#include "everywhere.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <memory>
+#include <vector>
+
+namespace algorithms {
+
+// As renderBrick(), with colours that are within [0, alpha].
+template <class Tile>
+void renderInRange(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
+{
+    renderBrick(s, brick, tile);
+    tile.forEachPixel([](int, int, float* rgba, float&) {
+        for (int c = 0; c < 3; ++c)
+            rgba[c] = std::min(rgba[c], rgba[3]);
+    });
+}
+
+struct Precision {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto frame = [&](const dfb::WirePrecision& wire, float minTransmittance, int maxLayers,
+                               bool inRange) -> std::pair<std::vector<float>, dfb::FrameReport> {
+            auto config = configOf(s, 1);
+            config.wire = wire;
+            config.minTransmittance = minTransmittance;
+            dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(messenger, config);
+            auto params = paramsOf(s);
+            params.maxLayers = maxLayers;
+            const auto report = dfb::renderDataParallel(
+                fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
+                [&](const dfb::Brick& b, auto& tile) {
+                    if (inRange)
+                        renderInRange(s, b, tile);
+                    else
+                        renderBrick(s, b, tile);
+                },
+                params);
+            std::vector<float> values;
+            if (!fb.image().empty())
+                values.assign(fb.image().rgba32f(), fb.image().rgba32f() + 4 * fb.image().pixelCount());
+            return {values, report};
+        };
+        const auto exact = frame(dfb::WireFormat::Float32, 0, 0, true);
+        result.expect(exact.second.wireErrorBound == 0, "a bound for float32");
+        const auto check = [&](const std::string& name, const std::pair<std::vector<float>, dfb::FrameReport>& got,
+                               double promised) {
+            double worst = 0;
+            for (std::size_t i = 0; i < got.first.size(); ++i)
+                worst =
+                    std::max(worst, std::abs(static_cast<double>(got.first[i]) - static_cast<double>(exact.first[i])));
+            const double bound = got.second.wireErrorBound;
+            // Both images were rounded to float.
+            result.expect(worst <= bound + 0x1p-23,
+                          name + ": off by " + std::to_string(worst) + " of " + std::to_string(bound));
+            result.expect(bound <= promised, name + ": bound " + std::to_string(bound));
+            result.expect(promised > 1 || bound == 0 || worst > 0 || got.first.empty(), name + ": nothing was rounded");
+            result.hash = result.hash * 31 + dfb::testing::hashOf(got.first.data(), got.first.size() * sizeof(float));
+        };
+        const struct {
+            double budget;
+            dfb::WireFormat expected;
+        } budgets[] = {{4e-2, dfb::WireFormat::Unorm8},
+                       {1e-2, dfb::WireFormat::Unorm16},
+                       {5e-4, dfb::WireFormat::Unorm16},
+                       {1e-5, dfb::WireFormat::Float32}};
+        for (const auto& b : budgets) {
+            const auto got = frame(dfb::ErrorBudget{b.budget}, 0, 5, true);
+            check("budget " + std::to_string(b.budget), got, b.budget);
+            result.expect(got.second.wireColor == b.expected, "picked " + std::string(nameOf(got.second.wireColor)));
+        }
+        const auto unknown = frame(dfb::ErrorBudget{2e-3}, 0, 0, true);
+        check("layers not known", unknown, 2e-3);
+        result.expect(unknown.second.wireColor == dfb::WireFormat::Float16, "not known: not float16");
+        check("early termination", frame(dfb::WireFormat::Float32, 0.05f, 0, true), static_cast<double>(0.05f));
+        check("both", frame(dfb::ErrorBudget{0.06}, 0.05f, 5, true), 0.06);
+        // Emission is not in range: such tiles are exact, the bound of others knows what may shine through.
+        const auto emission = frame(dfb::WireFormat::Float32, 0, 0, false);
+        const auto lossy = frame(dfb::WireFormat::Unorm16, 0, 0, false);
+        double worst = 0;
+        for (std::size_t i = 0; i < lossy.first.size(); ++i)
+            worst =
+                std::max(worst, std::abs(static_cast<double>(lossy.first[i]) - static_cast<double>(emission.first[i])));
+        result.expect(worst <= lossy.second.wireErrorBound + 0x1p-23, "emission");
+        dfb::WirePrecision depth;
+        depth.depth = dfb::WireFormat::Unorm8;
+        depth.depthFar = 1000;
+        result.expect(frame(depth, 0, 0, true).second.orderUndefinedPixels > 0, "no depths became equal");
+        return result;
+    }
+};
+
+// What can not be is refused on all ranks.
+struct NoPrecision {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(2, 1);
+        const float nan = std::numeric_limits<float>::quiet_NaN();
+        const auto refuses = [&](const std::string& what, const auto& change) {
+            auto config = configOf(s, 1);
+            change(config);
+            const std::string outcome = scene::outcomeOf([&] {
+                dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator,
+                                                                                                    config);
+            });
+            result.expect(scene::has(outcome, "InvalidArgument") && scene::has(outcome, what), outcome);
+        };
+        refuses("error budget", [&](auto& c) { c.wire.budget = -1e-3; });
+        refuses("error budget", [&](auto& c) { c.wire.maxColor = nan; });
+        refuses("error budget", [&](auto& c) { c.wire.depthFar = c.wire.depthNear; });
+        refuses("least transmittance", [&](auto& c) { c.minTransmittance = nan; });
+        if (sizeOf(communicator) > 1)
+            refuses("configured differently", [&](auto& c) {
+                if (rankOf(communicator) == 1)
+                    c.wire.color = dfb::WireFormat::Float16;
+            });
+        return result;
+    }
+
+private:
+    static int sizeOf(const dfb::InprocCommunicator& c) { return c.size(); }
+    static int rankOf(const dfb::InprocCommunicator& c) { return c.rank(); }
+#if defined(MPI_VERSION)
+    static int sizeOf(MPI_Comm c)
+    {
+        int size = 0;
+        MPI_Comm_size(c, &size);
+        return size;
+    }
+    static int rankOf(MPI_Comm c)
+    {
+        int rank = 0;
+        MPI_Comm_rank(c, &rank);
+        return rank;
+    }
+#endif
+};
+
+// In precision.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<Precision>(int);
+extern template Result inProcess<NoPrecision>(int);
+
+} // namespace algorithms
+
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
+TEST_CASE("Lossy formats keep their bounds and budgets, the same on any ranks", "[precision]")
+{
+    everywhere<algorithms::Precision>();
+}
+
+TEST_CASE("A wire precision that can not be is refused on all ranks", "[precision]")
+{
+    everywhere<algorithms::NoPrecision>();
+}
+#endif

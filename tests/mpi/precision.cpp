@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/precision.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/precision.hpp"

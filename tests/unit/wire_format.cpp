@@ -1,0 +1,381 @@
+// Wire formats: conversions to the nearest, bounds that hold and are not far from what happens, the choice within a
+// budget, and what is compressed.
+#include "catch.hpp"
+
+#include <dfb/ops/image_parallel.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/testing/adversarial.hpp>
+
+#if defined(DFB_HAS_SNAPPY)
+#include <dfb/comm/snappy_codec.hpp>
+#endif
+
+#include <algorithm>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <string>
+#include <vector>
+
+namespace {
+
+using dfb::WireFormat;
+using dfb::detail::fromHalf;
+using dfb::detail::toHalf;
+using dfb::testing::Random;
+using dfb::testing::uniform;
+
+constexpr float infinity = std::numeric_limits<float>::infinity();
+constexpr WireFormat lossy[] = {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8};
+
+std::vector<float> through(WireFormat format, const dfb::detail::WireCoder& coder, const std::vector<float>& rgba)
+{
+    std::vector<std::byte> bytes(rgba.size() * 4);
+    std::vector<float> result(rgba.size());
+    coder.encodeColor(format, rgba.data(), static_cast<int>(rgba.size() / 4), bytes.data());
+    coder.decodeColor(format, bytes.data(), rgba.size() / 4, result.data());
+    return result;
+}
+
+std::vector<float> depthThrough(WireFormat format, const dfb::detail::WireCoder& coder, const std::vector<float>& depth)
+{
+    std::vector<std::byte> bytes(depth.size() * 4);
+    std::vector<float> result(depth.size());
+    coder.encodeDepth(format, depth.data(), static_cast<int>(depth.size()), bytes.data());
+    coder.decodeDepth(format, bytes.data(), depth.size(), result.data());
+    return result;
+}
+
+dfb::WirePrecision precisionOf(WireFormat format, float maxColor = 1)
+{
+    dfb::WirePrecision precision = format;
+    precision.maxColor = maxColor;
+    return precision;
+}
+
+// The nearest of the binary16 numbers next to a half, ties to even, in double.
+std::uint16_t nearestHalf(float value, std::uint16_t guess)
+{
+    std::uint16_t best = guess;
+    for (int step = -2; step <= 2; ++step) {
+        const int other = guess + step;
+        if (other < 0 || other > 0x7bff)
+            continue;
+        const double distance = std::abs(static_cast<double>(fromHalf(static_cast<std::uint16_t>(other)))
+                                         - static_cast<double>(value)),
+                     bestDistance = std::abs(static_cast<double>(fromHalf(best)) - static_cast<double>(value));
+        if (distance < bestDistance || (distance == bestDistance && other % 2 == 0))
+            best = static_cast<std::uint16_t>(other);
+    }
+    return best;
+}
+
+} // namespace
+
+TEST_CASE("Half precision: every number comes back, and floats become the nearest", "[wire_format]")
+{
+    std::size_t wrong = 0;
+    for (std::uint32_t h = 0; h < 0x10000; ++h) {
+        const auto half = static_cast<std::uint16_t>(h);
+        const float value = fromHalf(half);
+        const int exponent = half >> 10 & 31, mantissa = half & 1023;
+        if (exponent == 31) {
+            wrong += mantissa ? !std::isnan(value) || !std::isnan(fromHalf(toHalf(value)))
+                              : value != (half & 0x8000 ? -infinity : infinity) || toHalf(value) != half;
+            continue;
+        }
+        const double expected = std::ldexp(exponent ? 1024 + mantissa : mantissa, (exponent ? exponent : 1) - 25);
+        wrong += static_cast<double>(value) != (half & 0x8000 ? -expected : expected) || toHalf(value) != half;
+    }
+    CHECK(wrong == 0);
+    Random random(1);
+    for (int i = 0; i < 200000; ++i) {
+        const auto half = static_cast<std::uint16_t>(random() % 0x7bff);
+        const float low = fromHalf(half), high = fromHalf(static_cast<std::uint16_t>(half + 1));
+        // In between, in the middle, next to the middle.
+        const float middle = low + 0.5f * (high - low);
+        for (const float value : {low + uniform(random) * (high - low), middle, std::nextafter(middle, 0.0f),
+                                  std::nextafter(middle, infinity)})
+            wrong += toHalf(value) != nearestHalf(value, half) || toHalf(-value) != (nearestHalf(value, half) | 0x8000);
+    }
+    CHECK(wrong == 0);
+    CHECK(toHalf(65519.99f) == 0x7bff);
+    CHECK(toHalf(65520.0f) == 0x7c00);
+    CHECK(toHalf(1e38f) == 0x7c00);
+    CHECK(toHalf(0x1p-25f) == 0); // a tie, to even
+    CHECK(toHalf(std::nextafter(0x1p-25f, 1.0f)) == 1);
+}
+
+TEST_CASE("Colours become the nearest of their format", "[wire_format]")
+{
+    Random random(2);
+    for (const float maxColor : {1.0f, 0.3f, 7.0f, 1e-20f, 1e20f})
+        for (const WireFormat format : lossy) {
+            INFO(dfb::nameOf(format) << ", colours up to " << maxColor);
+            const dfb::detail::WireCoder coder(precisionOf(format, maxColor));
+            std::vector<float> rgba;
+            for (int i = 0; i < 20000; ++i) {
+                const float alpha = dfb::testing::anyAlpha(random);
+                for (int c = 0; c < 3; ++c)
+                    rgba.push_back(maxColor * alpha * uniform(random));
+                rgba.push_back(alpha);
+            }
+            REQUIRE(coder.inRange(rgba.data(), static_cast<int>(rgba.size() / 4)));
+            const std::vector<float> result = through(format, coder, rgba);
+            double worst = 0; // in units of what is allowed
+            for (std::size_t i = 0; i < rgba.size(); ++i) {
+                const auto value = static_cast<double>(rgba[i]);
+                const double largest = i % 4 == 3 ? 1.0 : static_cast<double>(maxColor);
+                const double allowed = format == WireFormat::Float16   ? 0x1p-11 * value + 0x1p-39 * largest
+                                       : format == WireFormat::Unorm16 ? largest * (0.5 / 65535 + 0x1p-22)
+                                                                       : largest * (0.5 / 255 + 0x1p-22);
+                worst = std::max(worst, std::abs(static_cast<double>(result[i]) - value) / allowed);
+            }
+            CHECK(worst <= 1);
+            CHECK(worst > 0.9); // it does happen
+        }
+    // 0 and 1 stay what they are, and numbers of 8 bits too.
+    const dfb::detail::WireCoder coder(precisionOf(WireFormat::Unorm8));
+    for (int level = 0; level <= 255; ++level) {
+        const float value = static_cast<float>(level) / 255;
+        CHECK(through(WireFormat::Unorm8, coder, {0, 1, value, 1})
+              == std::vector<float>{0, 1, static_cast<float>(level) * (1 / 255.0f), 1});
+    }
+}
+
+TEST_CASE("What is not in range is found out", "[wire_format]")
+{
+    const dfb::detail::WireCoder coder(precisionOf(WireFormat::Float16, 2));
+    const float nan = std::numeric_limits<float>::quiet_NaN();
+    for (const auto& pixel : std::vector<std::vector<float>>{{1.01f, 0, 0, 0.5f},
+                                                             {0, -1e-30f, 0, 1},
+                                                             {0, 0, nan, 1},
+                                                             {0, 0, 0, nan},
+                                                             {0, 0, 0, 1.0000001f},
+                                                             {0, 0, 0, -1e-30f},
+                                                             {1e-30f, 0, 0, 0},
+                                                             {infinity, 0, 0, 1}}) {
+        std::vector<float> row(4 * 37, 0.5f);
+        CHECK(coder.inRange(row.data(), 37));
+        std::copy(pixel.begin(), pixel.end(), row.begin() + 4 * 20);
+        CHECK_FALSE(coder.inRange(row.data(), 37));
+    }
+}
+
+TEST_CASE("The bound of a format holds for 2, 64 and 4096 layers, and is not far from the truth", "[wire_format]")
+{
+    for (const float maxColor : {1.0f, 6.0f})
+        for (const WireFormat format : lossy) {
+            const dfb::detail::WireCoder coder(precisionOf(format, maxColor));
+            for (const int layers : {2, 64, 4096}) {
+                double worst = 0;
+                Random random(static_cast<std::uint64_t>(layers));
+                for (int pixel = 0; pixel < (layers > 1000 ? 300 : 3000); ++pixel) {
+                    // Thin layers just beside a tie, all rounded the same way; or at the ends; or anything.
+                    const int kind = pixel % 6;
+                    const double step = format == WireFormat::Unorm8 ? 1.0 / 255 : 1.0 / 65535;
+                    const float thin = static_cast<float>((kind == 0 ? 0.499 : 0.501) * step);
+                    std::vector<float> rgba;
+                    for (int i = 0; i < layers; ++i) {
+                        const float alpha = kind < 2    ? thin
+                                            : kind < 4  ? (1.0f + 0x1p-11f * (kind == 2 ? 0.99f : 1.01f)) * 0x1p-6f
+                                            : kind == 4 ? dfb::testing::anyAlpha(random)
+                                                        : uniform(random) * 2 / static_cast<float>(layers);
+                        // In front black, behind bright: what is let through too much shows most.
+                        const float bright = i < layers / 2 ? static_cast<float>(pixel / 6 % 2) : 1.0f;
+                        for (int c = 0; c < 3; ++c)
+                            rgba.push_back(
+                                std::min(maxColor * alpha * (kind > 3 ? uniform(random) : bright), maxColor * alpha));
+                        rgba.push_back(std::min(alpha, 1.0f));
+                    }
+                    REQUIRE(coder.inRange(rgba.data(), layers));
+                    const std::vector<float> rounded = through(format, coder, rgba);
+                    const auto blend = [&](const std::vector<float>& from, int channel) {
+                        double sum = 0, transmittance = 1;
+                        for (std::size_t i = 0; i < from.size(); i += 4) {
+                            sum += transmittance * static_cast<double>(from[i + static_cast<std::size_t>(channel)]);
+                            transmittance *= 1 - static_cast<double>(from[i + 3]);
+                        }
+                        return sum + transmittance * 0.5; // the background
+                    };
+                    for (const int channel : {0, 3})
+                        worst = std::max(worst, std::abs(blend(rgba, channel) - blend(rounded, channel)));
+                }
+                const double bound = dfb::wireErrorBound(format, layers, static_cast<double>(maxColor), 0.5);
+                INFO(dfb::nameOf(format) << ", " << layers << " layers, colours up to " << maxColor << ": " << worst
+                                         << " of " << bound);
+                CHECK(worst <= bound);
+                if (layers == 2) // with more, what is in front hides what is behind
+                    CHECK(worst > 0.2 * bound);
+            }
+        }
+}
+
+TEST_CASE("A budget gets the cheapest format that keeps it", "[wire_format]")
+{
+    CHECK(dfb::cheapestWithin(1e-2, 2, 1, 0) == WireFormat::Unorm8);
+    CHECK(dfb::cheapestWithin(1e-2, 3, 1, 0) == WireFormat::Unorm16); // 2 bytes, and better than Float16 for so few
+    CHECK(dfb::cheapestWithin(2e-3, 4, 1, 0) == WireFormat::Unorm16);
+    CHECK(dfb::cheapestWithin(2e-3, 4096, 1, 0) == WireFormat::Float16);
+    CHECK(dfb::cheapestWithin(2e-3, 0, 1, 0) == WireFormat::Float16);
+    CHECK(dfb::cheapestWithin(5e-4, 8, 1, 0) == WireFormat::Unorm16);
+    CHECK(dfb::cheapestWithin(5e-4, 64, 1, 0) == WireFormat::Float32);
+    CHECK(dfb::cheapestWithin(1e-5, 2, 1, 0) == WireFormat::Float32);
+    CHECK(dfb::cheapestWithin(2e-3, 0, 8, 0) == WireFormat::Float32);
+    CHECK(dfb::cheapestWithin(2e-3, 0, 1, 8) == WireFormat::Float32); // a bright background shines through
+}
+
+TEST_CASE("Rounded depths keep their order", "[wire_format]")
+{
+    Random random(3);
+    dfb::WirePrecision precision;
+    precision.depthNear = -3;
+    precision.depthFar = 40;
+    const dfb::detail::WireCoder coder(precision);
+    std::vector<float> depth{-infinity, -1e38f, -3, -0.0f, 0, 1e-45f, 40, 41, 1e38f};
+    for (int i = 0; i < 5000; ++i)
+        depth.push_back(i % 3 ? 50 * uniform(random) - 5 : std::nextafter(depth.back(), infinity));
+    depth.push_back(infinity);
+    std::sort(depth.begin(), depth.end());
+    for (const WireFormat format : lossy) {
+        const std::vector<float> rounded = depthThrough(format, coder, depth);
+        CHECK(std::is_sorted(rounded.begin(), rounded.end()));
+        CHECK(rounded.back() == infinity);
+        if (format == WireFormat::Float16)
+            continue;
+        double worst = 0;
+        for (std::size_t i = 0; i < depth.size(); ++i)
+            if (depth[i] >= -3 && depth[i] <= 40)
+                worst = std::max(worst, std::abs(static_cast<double>(depth[i] - rounded[i])));
+        CHECK(worst <= 43 * (0.5001 / (format == WireFormat::Unorm8 ? 254 : 65534)) + 1e-5);
+        CHECK(rounded[rounded.size() - 2] == 40);
+    }
+}
+
+TEST_CASE("Tiles in lossy formats are within the bound, those out of range are exact", "[wire_format]")
+{
+    using Op = dfb::BasicAlphaBlend<16>;
+    for (std::uint64_t seed = 1; seed <= 24; ++seed)
+        for (const WireFormat format : lossy) {
+            const bool inRange = seed % 2 == 0;
+            const int layers = 1 + static_cast<int>(seed % 7);
+            const auto in = dfb::testing::adversarial<16>(seed, layers, 1 + static_cast<int>(seed % 3), false, inRange);
+            const auto exact = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F);
+            dfb::testing::TileWire wire;
+            wire.precision = format;
+            const auto out = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F, true, wire);
+            // A layer whose alpha became 0 no longer counts as the nearest.
+            CHECK(std::equal(out.depth.begin(), out.depth.end(), exact.depth.begin(),
+                             [](float rounded, float depth) { return rounded >= depth; }));
+            CHECK(out.report.orderUndefinedPixels == 0);
+            if (!inRange)
+                continue;
+            double worst = 0;
+            for (std::size_t i = 0; i < out.color.size() / 4; ++i)
+                worst =
+                    std::max(worst, std::abs(static_cast<double>(out.value(i)) - static_cast<double>(exact.value(i))));
+            INFO(dfb::nameOf(format) << ", seed " << seed);
+            CHECK(worst <= dfb::wireErrorBound(format, layers, 1, 1) + 0x1p-23);
+            CHECK(out.bytes <= exact.bytes);
+        }
+    // Emission has no alpha that its colour could be within.
+    dfb::testing::TileInputs<16> in;
+    auto& tile = in.add(0, 1);
+    for (int i = 0; i < 16 * 16; ++i)
+        tile.color[4 * i] = 0.1f * static_cast<float>(i);
+    dfb::testing::TileWire wire;
+    wire.precision = WireFormat::Unorm8;
+    CHECK(dfb::testing::runTileOp<Op>(in, {0}, dfb::OutputFormat::RGBA32F, true, wire)
+          == dfb::testing::runTileOp<Op>(in, {0}, dfb::OutputFormat::RGBA32F));
+}
+
+TEST_CASE("Pixels whose depths became equal are counted", "[wire_format]")
+{
+    dfb::testing::TileInputs<8> in;
+    for (std::uint32_t source = 0; source < 2; ++source) {
+        auto& tile = in.add(0, source);
+        for (int i = 0; i < 64; ++i) {
+            tile.color[4 * i + 3] = 0.5f;
+            tile.depth[i] = i < 40 ? 0.5f + 1e-4f * static_cast<float>(source) : 0.25f * static_cast<float>(source + 1);
+        }
+    }
+    dfb::testing::TileWire wire;
+    wire.precision.depth = WireFormat::Unorm8;
+    const auto run = [&](auto op) {
+        return dfb::testing::runTileOp<decltype(op)>(in, in.order(), dfb::OutputFormat::RGBA32F, true, wire)
+            .report.orderUndefinedPixels;
+    };
+    CHECK(run(dfb::BasicAlphaBlend<8>()) == 40);
+    CHECK(run(dfb::BasicDepthComposite<8>()) == 40);
+    wire.precision.depth = WireFormat::Unorm16;
+    CHECK(run(dfb::BasicAlphaBlend<8>()) == 0);
+}
+
+TEST_CASE("What is behind opaque layers is left out, and changes pixels by no more than the threshold", "[wire_format]")
+{
+    Random random(7);
+    dfb::testing::TileInputs<8> in;
+    in.background = {0.5f, 1, 0, 1};
+    for (std::uint32_t source = 0; source < 40; ++source) {
+        auto& tile = in.add(0, source);
+        for (int i = 0; i < 64; ++i) {
+            const float alpha = i < 8 ? 1.0f : 0.3f * uniform(random);
+            tile.color[4 * i] = alpha * uniform(random);
+            tile.color[4 * i + 1] = alpha;
+            tile.color[4 * i + 3] = alpha;
+            tile.depth[i] = uniform(random);
+        }
+    }
+    using Op = dfb::BasicAlphaBlend<8>;
+    const auto exact = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F);
+    for (const float threshold : {0.2f, 0.01f, 1e-6f}) {
+        dfb::testing::TileWire wire;
+        wire.minTransmittance = threshold;
+        const auto out = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F, true, wire);
+        CHECK(out.depth == exact.depth);
+        double worst = 0;
+        for (std::size_t i = 0; i < out.color.size() / 4; ++i)
+            worst = std::max(worst, std::abs(static_cast<double>(out.value(i)) - static_cast<double>(exact.value(i))));
+        INFO(threshold << ": " << worst);
+        CHECK(worst <= static_cast<double>(threshold));
+        CHECK((worst > 0.2 * static_cast<double>(threshold) || threshold < 1e-4f));
+    }
+}
+
+TEST_CASE("Planes that were split come back", "[wire_format]")
+{
+    Random random(9);
+    for (const std::size_t wordBytes : {1u, 2u, 4u})
+        for (const std::size_t words : {1u, 3u, 4u})
+            for (const std::size_t byteCount : {0u, 4u, 12u, 48u, 100u, 4096u}) {
+                std::vector<std::byte> in(byteCount), split(byteCount), out(byteCount);
+                for (std::byte& byte : in)
+                    byte = static_cast<std::byte>(random() % (random() % 2 ? 256 : 3));
+                dfb::detail::PlaneFilter::split(in.data(), byteCount, wordBytes, words, split.data());
+                dfb::detail::PlaneFilter::join(split.data(), byteCount, wordBytes, words, out.data());
+                CHECK(out == in);
+            }
+}
+
+#if defined(DFB_HAS_SNAPPY)
+TEST_CASE("Compression changes nothing, in any format", "[wire_format]")
+{
+    using Op = dfb::BasicAlphaBlend<16>;
+    const dfb::SnappyCodec codec;
+    for (std::uint64_t seed = 1; seed <= 12; ++seed)
+        for (const WireFormat format :
+             {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8})
+            for (const WireFormat depth : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8}) {
+                const auto in = dfb::testing::adversarial<16>(seed, 3, 1, false, seed % 2 == 0);
+                dfb::testing::TileWire wire;
+                wire.precision = format;
+                wire.precision.depth = depth;
+                const auto plain = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F, true, wire);
+                wire.codec = &codec;
+                const auto packed = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F, true, wire);
+                CHECK(packed == plain);
+                CHECK(packed.bytes <= plain.bytes);
+            }
+}
+#endif
