@@ -29,6 +29,7 @@ using Exact = std::vector<dfb::testing::Pixel>;
 struct Options {
     int width = 1024, height = 1024, frames = 21;
     std::string json, svg, table, commit;
+    std::string only; // the systems whose name and configuration have one of these, with | between
 };
 
 // Something that makes an image of what all ranks have, and what is known of it.
@@ -267,6 +268,10 @@ public:
 #ifdef DFB_BENCH_HAS_ICET
         addIceT(systems, comm_, scene, image);
 #endif
+        systems.erase(std::remove_if(
+                          systems.begin(), systems.end(),
+                          [this](const System& s) { return !isWanted(s.name + ": " + s.config + ", to " + s.output); }),
+                      systems.end());
         for (int frame = -1; frame < o_.frames; ++frame) // the first touches memory
             for (std::size_t i = 0; i < systems.size(); ++i)
                 time(systems[(i + static_cast<std::size_t>(frame + 1)) % systems.size()], frame >= 0);
@@ -446,6 +451,15 @@ private:
         bool isDefault;
     };
 
+    bool isWanted(const std::string& name) const
+    {
+        std::istringstream parts(o_.only);
+        bool any = o_.only.empty();
+        for (std::string part; std::getline(parts, part, '|');)
+            any = any || name.find(part) != std::string::npos;
+        return any;
+    }
+
     void time(System& s, bool counts)
     {
         bench::meet(comm_);
@@ -497,7 +511,7 @@ Options optionsOf(int argc, char** argv)
     Options o;
     const char* usage =
         "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--svg PREFIX] "
-        "[--table FILE] [--commit ID]";
+        "[--table FILE] [--commit ID] [--only TEXT]";
     const auto fail = [usage](int code) {
         std::printf("%s\n", usage);
         std::exit(code);
@@ -520,6 +534,8 @@ Options optionsOf(int argc, char** argv)
             o.svg = value;
         } else if (name == "--table") {
             o.table = value;
+        } else if (name == "--only") {
+            o.only = value;
         } else if (name == "--commit") {
             o.commit = value;
         } else {
@@ -542,7 +558,8 @@ int main(int argc, char** argv)
     {
         Bench bench(MPI_COMM_WORLD, options);
         bench.bricks();
-        bench.noise();
+        if (options.only.empty())
+            bench.noise();
         bench.write();
     }
     MPI_Finalize();

@@ -58,19 +58,31 @@ struct CompositeRow {
     std::vector<std::uint8_t> isUndefined; // width, or empty
     bool countTies = false;                // equal depths make a pixel undefined
     double minTransmittance = 0;           // what lets less through counts as opaque
+    bool wantsDepth = true;                // else `depth` is empty
 
-    // `wanted`: of the auxiliary channels. `exactly`: in twice the precision of double.
-    void reset(int width, ChannelMask wanted = 0, bool exactly = false)
+    // Sizes it for `width` pixels, of which nothing is known then. `wanted`: of the auxiliary channels. `exactly`: in
+    // twice the precision of double.
+    void resize(int width, ChannelMask wanted = 0, bool exactly = false)
     {
         const auto pixels = static_cast<std::size_t>(width);
-        rgba.assign(4 * pixels, 0.0);
-        transmittance.assign(pixels, 1.0);
+        rgba.resize(4 * pixels);
+        transmittance.resize(pixels);
         rgbaLow.assign(exactly ? 4 * pixels : 0, 0.0);
         transmittanceLow.assign(exactly ? pixels : 0, 0.0);
-        depth.assign(pixels, std::numeric_limits<float>::infinity());
+        depth.resize(wantsDepth ? pixels : 0);
         aux.reset(pixels, wanted);
         reach.assign(wanted & farChannel ? pixels : 0, -std::numeric_limits<float>::infinity());
         isUndefined.assign(wanted & farChannel || countTies ? pixels : 0, 0);
+    }
+
+    // Pixels [x, x + count): nothing yet.
+    void clear(int x, int count)
+    {
+        const auto first = static_cast<std::ptrdiff_t>(x);
+        std::fill_n(rgba.begin() + 4 * first, 4 * count, 0.0);
+        std::fill_n(transmittance.begin() + first, count, 1.0);
+        if (wantsDepth)
+            std::fill_n(depth.begin() + first, count, std::numeric_limits<float>::infinity());
     }
 };
 
@@ -87,6 +99,15 @@ struct Layer {
 };
 
 namespace detail {
+
+// The depths of a layer where its alpha counts, if they are nearer.
+inline void takeNearest(float* nearest, int count, const Layer& layer)
+{
+    for (int i = 0; i < count; ++i) {
+        const bool isNearer = layer.color[4 * i + 3] > 0.0f && layer.depth[i] < nearest[i];
+        nearest[i] = isNearer ? layer.depth[i] : nearest[i];
+    }
+}
 
 // Adds to a pixel of a row what is let through of `rgba`, in twice the precision, and darkens what is behind.
 inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
@@ -122,12 +143,8 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         acc[3] += t * static_cast<double>(c[3]);
         transmittance[i] = t * (1.0 - static_cast<double>(c[3]));
     }
-    if (layer.depth) {
-        float* nearest = row.depth.data() + x;
-        for (int i = 0; i < count; ++i)
-            if (layer.color[4 * i + 3] > 0.0f && layer.depth[i] < nearest[i])
-                nearest[i] = layer.depth[i];
-    }
+    if (layer.depth && row.wantsDepth)
+        detail::takeNearest(row.depth.data() + x, count, layer);
 }
 
 // Whether nothing of what is behind `count` pixels from x on can be seen. Makes those opaque that count as such.
@@ -196,6 +213,8 @@ inline void overBackground(CompositeRow& row, const float (&rgba)[4])
     const std::size_t width = row.transmittance.size();
     for (std::size_t x = 0; x < row.aux.weight.size(); ++x)
         row.aux.weight[x] = row.rgba[4 * x + 3];
+    if (rgba[0] == 0.0f && rgba[1] == 0.0f && rgba[2] == 0.0f && rgba[3] == 0.0f)
+        return;
     for (std::size_t x = 0; x < row.transmittanceLow.size(); ++x)
         detail::overExactly(row, x, rgba);
     for (std::size_t x = 0; x < width && row.rgbaLow.empty(); ++x)
@@ -228,34 +247,93 @@ inline int firstOutOfOrder(const float* front, const float* back, bool frontWins
     return end;
 }
 
+// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on: block by block, so that what
+// is accumulated stays where it is computed. Behind a block that nothing comes through there is nothing to do.
+inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                        const std::vector<int>& order)
+{
+    constexpr int block = 16;
+    for (int first = begin; first < end; first += block) {
+        const int count = std::min(block, end - first);
+        double* acc = row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + first);
+        double* t = row.transmittance.data() + x + first;
+        const float* front = layers[static_cast<std::size_t>(order[0])].from(first).color;
+        for (int i = 0; i < 4 * count; ++i)
+            acc[i] = 0.0 + static_cast<double>(front[i]); // -0 becomes 0
+        for (int i = 0; i < count; ++i)
+            t[i] = 1.0 - static_cast<double>(front[4 * i + 3]);
+        for (std::size_t k = 1; k < order.size() && !isClosed(row, x + first, count); ++k) {
+            const float* c = layers[static_cast<std::size_t>(order[k])].from(first).color;
+            for (int i = 0; i < count; ++i) {
+                const double through = t[i];
+                acc[4 * i] += through * static_cast<double>(c[4 * i]);
+                acc[4 * i + 1] += through * static_cast<double>(c[4 * i + 1]);
+                acc[4 * i + 2] += through * static_cast<double>(c[4 * i + 2]);
+                acc[4 * i + 3] += through * static_cast<double>(c[4 * i + 3]);
+                t[i] = through * (1.0 - static_cast<double>(c[4 * i + 3]));
+            }
+        }
+        isClosed(row, x + first, count); // for the background
+    }
+    if (!row.wantsDepth)
+        return;
+    float* nearest = row.depth.data() + x + begin;
+    std::fill_n(nearest, end - begin, std::numeric_limits<float>::infinity());
+    for (const int layer : order)
+        if (const Layer l = layers[static_cast<std::size_t>(layer)].from(begin); l.depth)
+            takeNearest(nearest, end - begin, l);
+}
+
+// The same with all that a row may have.
+inline void blendFully(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                       const std::vector<int>& order)
+{
+    row.clear(x + begin, end - begin);
+    for (const int layer : order) {
+        const Layer l = layers[static_cast<std::size_t>(layer)].from(begin);
+        if (l.aux)
+            overAux(row, x + begin, end - begin, l, l.aux->from(static_cast<std::size_t>(begin)));
+        over(row, x + begin, end - begin, l);
+        isClosed(row, x + begin, end - begin);
+    }
+}
+
+inline void blend(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                  const std::vector<int>& order)
+{
+    if (layers.front().aux || !row.rgbaLow.empty())
+        blendFully(row, x, begin, end, layers, order);
+    else
+        blendBlocks(row, x, begin, end, layers, order);
+}
+
 } // namespace detail
 
-// Sorts and blends: composites `count` pixels of several layers under `row` at [x, x + count), each pixel front to
+// Composites `count` pixels of layers into `row` at [x, x + count), in their order, whatever their depth. `order` is
+// scratch space. There is a layer at least, here and below.
+inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
+{
+    order.resize(layers.size());
+    for (std::size_t i = 0; i < order.size(); ++i)
+        order[i] = static_cast<int>(i);
+    detail::blend(row, x, 0, count, layers, order);
+}
+
+// Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to
 // back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
 // without depth makes all depths count as equal. `order` is scratch space.
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     const std::size_t n = layers.size();
-    auto blend = [&](int begin, int end) {
-        for (int layer : order) {
-            const Layer l = layers[static_cast<std::size_t>(layer)].from(begin);
-            if (l.aux)
-                overAux(row, x + begin, end - begin, l, l.aux->from(static_cast<std::size_t>(begin)));
-            over(row, x + begin, end - begin, l);
-            // Behind what is opaque there is nothing to blend; ids and the like may still come from there.
-            if (isClosed(row, x + begin, end - begin) && !l.aux)
-                break;
-        }
-    };
-    order.resize(n);
-    for (std::size_t i = 0; i < n; ++i)
-        order[i] = static_cast<int>(i);
     const bool sorted =
         n > 1 && std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
     if (!sorted) {
-        blend(0, count);
+        blendInOrder(row, x, count, layers, order);
         return;
     }
+    order.resize(n);
+    for (std::size_t i = 0; i < n; ++i)
+        order[i] = static_cast<int>(i);
     for (int begin = 0; begin < count;) {
         // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
         std::size_t movesLeft = 8 * n;
@@ -294,29 +372,16 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
                         && depth < std::numeric_limits<float>::infinity())
                         row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
                 }
-        blend(begin, end);
+        detail::blend(row, x, begin, end, layers, order);
         begin = end;
     }
 }
 
-// Composites `count` pixels of several layers under `row` at [x, x + count), in their order, whatever their depth.
-inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
-{
-    for (const Layer& layer : layers) {
-        if (layer.aux)
-            overAux(row, x, count, layer, *layer.aux);
-        over(row, x, count, layer);
-        // The nearest depth may be that of any.
-        if (isClosed(row, x, count) && !layer.aux && !layer.depth)
-            break;
-    }
-}
-
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there. Nothing may be in the row
-// yet.
+// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
+    row.clear(x, count);
     for (int i = 0; i < count; ++i) {
         const Layer* nearest = nullptr;
         bool isTie = false;
@@ -367,27 +432,37 @@ public:
                 cursor.next();
     }
 
-    // Composites the next row of all fragments under `row`, which has been reset to the region's width.
+    // Composites the next row of all fragments into `row`, which has been sized for the region's width.
     void nextRow(CompositeRow& row)
     {
-        active_.clear();
         edges_.clear();
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
+        active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
+        std::size_t rows = 0;
         for (FragmentCursor& cursor : cursors_) {
-            const FragmentRow r = cursor.next();
-            if (r.spanCount == 0)
+            FragmentRow& r = active_[rows];
+            if (!cursor.next(r))
                 continue;
-            active_.push_back(r);
+            ++rows;
+            if (wantsAux)
+                r.aux = cursor.aux();
+            cursor.advance(r);
             for (int i = 0; i < r.spanCount; ++i) {
                 edges_.push_back(r.spans[i].x);
                 edges_.push_back(r.spans[i].x + r.spans[i].count);
             }
         }
+        active_.resize(rows);
         // Between two neighbouring edges the set of layers is constant.
         std::sort(edges_.begin(), edges_.end());
         edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
+        const int width = static_cast<int>(row.transmittance.size());
+        if (edges_.empty())
+            row.clear(0, width);
+        else
+            row.clear(0, edges_.front()), row.clear(edges_.back(), width - edges_.back());
         for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
             const int x0 = edges_[e], x1 = edges_[e + 1];
             layers_.clear();
@@ -411,11 +486,13 @@ public:
                     }
                 }
             }
-            if (layers_.empty())
+            if (layers_.empty()) {
+                row.clear(x0, x1 - x0);
                 continue;
+            }
             switch (rule_) {
             case BlendRule::SortByDepth: sortAndBlend(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_); break;
+            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_, order_); break;
             case BlendRule::Nearest: keepNearest(row, x0, x1 - x0, layers_); break;
             }
         }

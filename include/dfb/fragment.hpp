@@ -103,23 +103,40 @@ public:
     // The active pixels of the next row of the region, starting with row 0; a row may have none.
     FragmentRow next()
     {
+        FragmentRow row;
+        if (next(row))
+            row.aux = aux_;
+        advance(row);
+        return row;
+    }
+
+    // The same without the channels beyond colour and depth, which are left as they are; false if the row has no pixels.
+    // To be followed by advance(row).
+    bool next(FragmentRow& result)
+    {
         const int row = row_++;
+        result.spanCount = 0;
         if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
-            return {};
-        if (parts_->encoding != FragmentEncoding::Sparse) {
-            const FragmentRow result{&parts_->fullRow, 1, color_, depth_, aux_};
-            if (parts_->encoding == FragmentEncoding::Dense)
-                advance(parts_->fullRow.count);
-            return result;
-        }
-        const int count = parts_->rowSpanCounts[row - parts_->rowBegin];
-        const FragmentRow result{span_, count, color_, depth_, aux_};
+            return false;
+        const bool isSparse = parts_->encoding == FragmentEncoding::Sparse;
+        result.spans = isSparse ? span_ : &parts_->fullRow;
+        result.spanCount = isSparse ? parts_->rowSpanCounts[row - parts_->rowBegin] : 1;
+        result.color = color_;
+        result.depth = depth_;
+        return result.spanCount > 0;
+    }
+    const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
+
+    void advance(const FragmentRow& row)
+    {
+        if (parts_->encoding == FragmentEncoding::Constant)
+            return;
         std::size_t pixels = 0;
-        for (int i = 0; i < count; ++i)
-            pixels += span_[i].count;
-        span_ += count;
+        for (int i = 0; i < row.spanCount; ++i)
+            pixels += row.spans[i].count;
+        if (parts_->encoding == FragmentEncoding::Sparse)
+            span_ += row.spanCount;
         advance(pixels);
-        return result;
     }
 
 private:

@@ -13,6 +13,11 @@
 #include <cstdint>
 #include <cstring>
 #include <string>
+#include <type_traits>
+
+#if defined(__SSE2__)
+#include <emmintrin.h>
+#endif
 
 namespace dfb {
 
@@ -56,13 +61,11 @@ namespace detail {
 // rounded to double first, which brings values that should be ties, such as a mean of 1/6, back to them.
 inline std::uint8_t toUnorm8(double value) noexcept
 {
-    if (!(value > 0.0))
-        return 0;
-    if (value >= 1.0)
-        return 255;
+    // No branches, so that it can be vectorized. The order of the comparisons makes NaN 0.
+    const double notBelow = value > 0.0 ? value : 0.0, clamped = notBelow < 1.0 ? notBelow : 1.0;
     // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
     const double shift = 4503599627370496.0;
-    return static_cast<std::uint8_t>((value * 255.0 + shift) - shift);
+    return static_cast<std::uint8_t>(static_cast<int>((clamped * 255.0 + shift) - shift));
 }
 
 // The same for a value that is known to about 100 bits. What is nearer to a tie than that is one.
@@ -109,36 +112,91 @@ inline std::uint8_t toSrgb8(double linear) noexcept
 
 } // namespace detail
 
-// Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
-// rounded to nearest.
-template <class Real>
-void convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
+namespace detail {
+
+// toUnorm8() of `count` values. Returns how far the farthest of 255 * value was from an integer, up to 1/2, which is a
+// tie. By hand, as compilers do not vectorize comparisons that could trap.
+inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexcept
 {
+    const double shift = 4503599627370496.0; // as above
+    double farthest = 0;
+    int i = 0;
+#if defined(__SSE2__)
+    const __m128d zero = _mm_setzero_pd(), one = _mm_set1_pd(1.0), scale = _mm_set1_pd(255.0);
+    const __m128d shifts = _mm_set1_pd(shift), noSign = _mm_castsi128_pd(_mm_set1_epi64x(0x7fffffffffffffff));
+    __m128d distance = zero;
+    const auto pair = [&](int at) {
+        // max and min give the second operand where the first is NaN.
+        const __m128d scaled = _mm_mul_pd(_mm_min_pd(_mm_max_pd(_mm_loadu_pd(values + at), zero), one), scale);
+        const __m128d shifted = _mm_add_pd(scaled, shifts);
+        distance = _mm_max_pd(distance, _mm_and_pd(_mm_sub_pd(scaled, _mm_sub_pd(shifted, shifts)), noSign));
+        return _mm_castpd_ps(shifted); // the integers are in the lower halves
+    };
+    const auto four = [&](int at) {
+        return _mm_castps_si128(_mm_shuffle_ps(pair(at), pair(at + 2), _MM_SHUFFLE(2, 0, 2, 0)));
+    };
+    for (; i + 8 <= count; i += 8) {
+        const __m128i words = _mm_packs_epi32(four(i), four(i + 4));
+        _mm_storel_epi64(reinterpret_cast<__m128i*>(out + i), _mm_packus_epi16(words, words));
+    }
+    farthest = std::max(_mm_cvtsd_f64(distance), _mm_cvtsd_f64(_mm_unpackhi_pd(distance, distance)));
+#endif
+    for (; i < count; ++i) {
+        out[i] = toUnorm8(values[i]);
+        const double scaled = 255.0 * (values[i] > 0.0 ? std::min(values[i], 1.0) : 0.0);
+        farthest = std::max(farthest, std::abs(scaled - ((scaled + shift) - shift)));
+    }
+    return farthest;
+}
+
+} // namespace detail
+
+// Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
+// rounded to nearest. Returns how far the farthest value was from an 8-bit level, up to 1/2, which is a tie between
+// two; of SRGBA8 that is of alpha alone.
+template <class Real>
+double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
+{
+    constexpr int block = 64;
+    auto* bytes = reinterpret_cast<std::uint8_t*>(out);
+    double farthest = 0;
     switch (format) {
-    case OutputFormat::None: return;
+    case OutputFormat::None: break;
     case OutputFormat::RGBA32F: {
-        for (int i = 0; i < 4 * count; ++i) {
-            const float value = static_cast<float>(rgba[i]);
-            std::memcpy(out + sizeof(float) * static_cast<std::size_t>(i), &value, sizeof value);
-        }
-        return;
-    }
-    case OutputFormat::RGBA8: {
-        auto* bytes = reinterpret_cast<std::uint8_t*>(out);
+        auto* floats = reinterpret_cast<float*>(out);
         for (int i = 0; i < 4 * count; ++i)
-            bytes[i] = detail::toUnorm8(rgba[i]);
-        return;
+            floats[i] = static_cast<float>(rgba[i]);
+        break;
     }
-    case OutputFormat::SRGBA8: {
-        auto* bytes = reinterpret_cast<std::uint8_t*>(out);
-        for (int i = 0; i < count; ++i) {
-            for (int c = 0; c < 3; ++c)
-                bytes[4 * i + c] = detail::toSrgb8(rgba[4 * i + c]);
-            bytes[4 * i + 3] = detail::toUnorm8(rgba[4 * i + 3]);
+    case OutputFormat::RGBA8:
+        for (int first = 0; first < 4 * count; first += block) {
+            const int size = std::min(block, 4 * count - first);
+            if constexpr (std::is_same_v<Real, double>) {
+                farthest = std::max(farthest, detail::toUnorm8(rgba + first, size, bytes + first));
+            } else {
+                double values[block];
+                std::copy_n(rgba + first, size, values);
+                farthest = std::max(farthest, detail::toUnorm8(values, size, bytes + first));
+            }
         }
-        return;
+        break;
+    case OutputFormat::SRGBA8:
+        for (int first = 0; first < count; first += block) {
+            const int size = std::min(block, count - first);
+            double alpha[block];
+            std::uint8_t levels[block];
+            for (int i = 0; i < size; ++i)
+                alpha[i] = rgba[4 * (first + i) + 3];
+            farthest = std::max(farthest, detail::toUnorm8(alpha, size, levels));
+            for (int i = 0; i < size; ++i) {
+                for (int c = 0; c < 3; ++c)
+                    bytes[4 * (first + i) + c] = detail::toSrgb8(rgba[4 * (first + i) + c]);
+                bytes[4 * (first + i) + 3] = levels[i];
+            }
+        }
+        break;
     }
-    }
+    return farthest;
 }
 
 // A whole image, row-major, row 0 on top, no padding. Empty on ranks other than the display rank and with

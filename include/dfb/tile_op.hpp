@@ -73,12 +73,14 @@ public:
     bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
     // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
-    // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once.
-    void setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
+    // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once. Returns what
+    // convertPixels() returns.
+    double setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
     {
         const std::size_t first = static_cast<std::size_t>(y) * stride_;
+        double farthest = 0;
         if (to_.at[detail::Color])
-            convertPixels(rgba, width(), format_, to_.at[detail::Color] + first * bytesPerPixel(format_));
+            farthest = convertPixels(rgba, width(), format_, to_.at[detail::Color] + first * bytesPerPixel(format_));
         const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
             if (!to_.at[channel])
                 return;
@@ -96,6 +98,7 @@ public:
         set(detail::Position, aux.position, 0.0f);
         set(detail::PrimitiveId, aux.primitiveId, noId);
         set(detail::InstanceId, aux.instanceId, noId);
+        return farthest;
     }
 
     // What setRow() has made of a row; null if the colour is not wanted.

@@ -66,6 +66,7 @@ public:
     {
         messenger_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
+        isEnding_ = true;
         changed_.wait(lock, [this] { return tasks_ == 0; });
     }
 
@@ -169,7 +170,8 @@ public:
             task();
             const std::lock_guard<std::mutex> lock(mutex_);
             --tasks_;
-            changed_.notify_all();
+            if (isEnding_) // others wait for what tasks do, and are told
+                changed_.notify_all();
         });
     }
 
@@ -378,6 +380,7 @@ private:
     std::condition_variable changed_;
     std::deque<Arrival> inbox_;
     int tasks_ = 0; // submitted and not yet done
+    bool isEnding_ = false;
 };
 
 } // namespace dfb::detail

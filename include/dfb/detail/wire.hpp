@@ -111,14 +111,17 @@ struct ActiveSpans {
         for (int y = 0; y < height; ++y) {
             const std::size_t before = spans.size();
             const float* row = tile.pixel(0, y);
-            const auto active = [row](int x) {
-                const float* p = row + 4 * x;
-                return p[0] != 0.0f || p[1] != 0.0f || p[2] != 0.0f || p[3] != 0.0f;
+            const auto active = [row](int x) { // all bits but the signs
+                std::uint64_t halves[2];
+                std::memcpy(halves, row + 4 * x, sizeof halves);
+                return ((halves[0] | halves[1]) & 0x7fffffff7fffffffu) != 0;
             };
             for (int x = 0; x < width;) {
                 while (x < width && !active(x))
                     ++x;
                 const int begin = x;
+                while (x + 4 <= width && active(x) & active(x + 1) & active(x + 2) & active(x + 3))
+                    x += 4;
                 while (x < width && active(x))
                     ++x;
                 if (x > begin) {
@@ -170,7 +173,8 @@ bool allInRange(const TileType& tile, const ActiveSpans& active, const WireCoder
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
 inline float canonicalDepth(float depth)
 {
-    return depth == depth ? depth + 0.0f : std::numeric_limits<float>::infinity();
+    const std::uint32_t bits = bitsOf(depth), some = bits == 0x80000000u ? 0u : bits;
+    return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
 }
 
 // What is wrong with the pixels of an input.
@@ -178,6 +182,32 @@ struct InputFaults {
     std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
     std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
 };
+
+// Whether countFaults() would count anything. No branches, so that it can be vectorized.
+inline bool hasFault(const float* rgba, const float* depth, int count)
+{
+    // As a number, the bits of a float without its sign grow with it: infinity has 0x7f800000, what is above is NaN.
+    std::uint32_t largest = 0, nanDepth = 0;
+    int alpha = 0;
+    for (int i = 0; i < 4 * count; ++i)
+        largest |= static_cast<std::uint32_t>((bitsOf(rgba[i]) & 0x7fffffffu) + 0x00800000u); // its top bit: not finite
+    for (int i = 0; i < count; ++i)
+        alpha |= static_cast<int>(!(rgba[4 * i + 3] >= 0.0f)) | static_cast<int>(!(rgba[4 * i + 3] <= 1.0f));
+    for (int i = 0; depth && i < count; ++i)
+        nanDepth |= static_cast<std::uint32_t>(depth[i] != depth[i]);
+    return (largest & 0x80000000u) != 0 || alpha != 0 || nanDepth != 0;
+}
+
+// `depth` may be null. Each pixel counts `repeats` times.
+inline void countFaults(const float* rgba, const float* depth, int count, std::uint64_t repeats, InputFaults& faults)
+{
+    for (int i = 0; i < count; ++i, rgba += 4) {
+        const bool finite = std::isfinite(rgba[0]) && std::isfinite(rgba[1]) && std::isfinite(rgba[2])
+                            && std::isfinite(rgba[3]) && !(depth && depth[i] != depth[i]);
+        faults.nonFinite += finite ? 0 : repeats;
+        faults.alphaOutside += finite && !(rgba[3] >= 0.0f && rgba[3] <= 1.0f) ? repeats : 0;
+    }
+}
 
 // Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
 // its range. Adds to `faults`. `codec` may be null.
@@ -253,22 +283,13 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         coder.encodeColor(h.colorFormat, from, count, to.at[Color]);
         to.at[Color] += 4 * bytesOf(h.colorFormat) * static_cast<std::size_t>(count);
         const float* fromDepth = planes.at[Depth] ? floatsOf(planes.at[Depth]) + first : nullptr;
-        float rounded[256];
-        float* depth = h.depthFormat == WireFormat::Float32 ? floatsOf(to.at[Depth]) : rounded;
-        for (int i = 0; i < count; ++i) {
-            bool finite = (from[4 * i] - from[4 * i]) + (from[4 * i + 1] - from[4 * i + 1])
-                              + (from[4 * i + 2] - from[4 * i + 2]) + (from[4 * i + 3] - from[4 * i + 3])
-                          == 0.0f;
-            if (fromDepth) {
-                const float d = fromDepth[i];
-                finite = finite && d == d;
-                depth[i] = canonicalDepth(d);
-            }
-            const bool alphaInside = from[4 * i + 3] >= 0.0f && from[4 * i + 3] <= 1.0f;
-            faults.nonFinite += finite ? 0 : repeats;
-            faults.alphaOutside += finite && !alphaInside ? repeats : 0;
-        }
+        if (hasFault(from, fromDepth, count))
+            countFaults(from, fromDepth, count, repeats, faults);
         if (fromDepth) {
+            float rounded[256];
+            float* depth = h.depthFormat == WireFormat::Float32 ? floatsOf(to.at[Depth]) : rounded;
+            for (int i = 0; i < count; ++i)
+                depth[i] = canonicalDepth(fromDepth[i]);
             if (depth == rounded)
                 coder.encodeDepth(h.depthFormat, rounded, count, to.at[Depth]);
             to.at[Depth] += bytesOf(h.depthFormat) * static_cast<std::size_t>(count);
@@ -479,9 +500,11 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     parts.aux = planes;
     if (parts.depth && h.encoding != FragmentEncoding::Empty) {
         const std::size_t count = h.encoding == FragmentEncoding::Constant ? static_cast<std::size_t>(width) : stored;
+        std::uint32_t isNan = 0;
         for (std::size_t i = 0; i < count; ++i)
-            if (parts.depth[i] != parts.depth[i])
-                failMalformed("a depth is NaN");
+            isNan |= static_cast<std::uint32_t>(parts.depth[i] != parts.depth[i]);
+        if (isNan != 0)
+            failMalformed("a depth is NaN");
     }
     return Fragment(header, std::move(message), parts);
 }

@@ -57,8 +57,8 @@ public:
 
     const double* rgba(std::size_t pixel) const noexcept { return rgba_.data() + 4 * pixel; }
 
-    // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y. Returns its colour.
-    const double* write(FinishedTile& out, int y, std::size_t first, std::int64_t count)
+    // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y. Returns what setRow() does.
+    double write(FinishedTile& out, int y, std::size_t first, std::int64_t count)
     {
         const auto width = static_cast<std::size_t>(out.width());
         row_.resize(4 * width);
@@ -89,8 +89,7 @@ public:
         aux.position = aux_.position.empty() ? nullptr : aux_.position.data() + 3 * first;
         aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
         aux.instanceId = ids(instanceId_, aux_.instanceId);
-        out.setRow(y, row_.data(), depth_.data() + first, aux);
-        return row_.data();
+        return out.setRow(y, row_.data(), depth_.data() + first, aux);
     }
 
 private:
@@ -150,12 +149,13 @@ public:
                                      info_.background[3]};
         const int width = info_.region.width();
         for (int y = 0; y < info_.region.height(); ++y) {
+            scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
             scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
             scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
             const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
             scratch.isUndefined.assign(tracksOrder ? static_cast<std::size_t>(width) : 0, 0);
             for (std::size_t pass = 0; pass < passes; ++pass) {
-                scratch.row.reset(width, tracked_);
+                scratch.row.resize(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
                 overBackground(scratch.row, background);
                 for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
@@ -175,8 +175,7 @@ public:
         const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
         compositePasses([&](int y, int pass, const CompositeRow& row) {
             if (direct) {
-                out.setRow(y, row.rgba.data(), row.depth.data());
-                roundExactly(out, y, row.rgba.data());
+                roundExactly(out, y, out.setRow(y, row.rgba.data(), row.depth.data()));
                 return;
             }
             if (pass == 0)
@@ -191,25 +190,16 @@ public:
     std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
 
 private:
-    // Where double does not tell which 8-bit level is nearer, finds out. `rgba`: the row, as it has been written.
-    void roundExactly(FinishedTile& out, int y, const double* rgba)
+    // Where double does not tell which 8-bit level is nearer, finds out. `farthest`: of setRow().
+    void roundExactly(FinishedTile& out, int y, double farthest)
     {
-        const int step = out.format() == OutputFormat::RGBA8 ? 1 : 4; // of SRGBA8 alpha alone
-        if (out.format() != OutputFormat::RGBA8 && out.format() != OutputFormat::SRGBA8)
-            return;
-        // Of 3 roundings for each layer and pass.
-        const double uncertain =
-            255 * 0x1p-53 * (4.0 * static_cast<double>(fragments_.size()) + 4.0 * info_.passes + 8);
-        bool isKnown = true;
-        for (int i = step - 1; i < 4 * out.width(); i += step) {
-            const double value = rgba[i] > 0 && rgba[i] < 1 ? rgba[i] : 0.0; // the others, and NaN, are no question
-            const double scaled = 255 * value, overTie = scaled - static_cast<double>(static_cast<int>(scaled)) - 0.5;
-            isKnown = isKnown && std::abs(overTie) > uncertain;
-        }
-        if (isKnown || fragments_.empty())
+        // 3 roundings for each layer and pass.
+        const double layers = static_cast<double>(fragments_.size()) + info_.passes;
+        if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
             return;
         const std::vector<DoubleDouble> exact = exactRow(y);
-        for (int i = step - 1; i < 4 * out.width(); i += step)
+        const bool alphaAlone = out.format() == OutputFormat::SRGBA8; // the curve's levels are no round numbers
+        for (int i = alphaAlone ? 3 : 0; i < 4 * out.width(); i += alphaAlone ? 4 : 1)
             out.setLevel(y, i, toUnorm8(exact[static_cast<std::size_t>(i)]));
     }
 
@@ -231,7 +221,7 @@ private:
                     pointers.push_back(&fragment);
             compositor.start(pointers.begin(), pointers.end());
             compositor.skipRows(y);
-            row.reset(width, 0, true);
+            row.resize(width, 0, true);
             compositor.nextRow(row);
             overBackground(row, background);
             for (std::size_t i = 0; i < mean.size(); ++i)
