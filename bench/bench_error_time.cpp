@@ -49,94 +49,135 @@ struct System {
 
 // ---- dfb: inputs that are ready are copied into tiles
 
-// Each rank has one brick, and knows where it is in the image.
-struct ViewportCamera {
-    const BrickImage* image;
-    dfb::Region project(const dfb::Box3&, int, int) const
+// The boxes of bricks are in pixels.
+struct PixelCamera {
+    dfb::Region project(const dfb::Box3& box, int, int) const
     {
-        const auto& v = image->viewport;
-        return {v[0], v[1], v[0] + v[2], v[1] + v[3]};
+        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
+                static_cast<int>(box.upper.y)};
     }
 };
 
-template <int TileSize>
-void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
-            const std::string& config, const dfb::WirePrecision& wire, std::shared_ptr<const dfb::Codec> codec,
-            float minTransmittance, bool isDefault = false)
+// Each rank has one brick.
+dfb::World worldOf(const BrickImage& image, int rank)
 {
-    using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<TileSize>>;
+    dfb::World world;
+    const auto& v = image.viewport;
+    if (v[2] > 0)
+        world.add({static_cast<std::uint32_t>(rank),
+                   {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
+                    {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
+    return world;
+}
+
+template <class TileOp>
+inline constexpr bool isOrdered = std::is_base_of_v<dfb::OrderedBlend, TileOp>;
+
+struct DfbSettings {
+    dfb::WirePrecision wire{};
+    std::shared_ptr<const dfb::Codec> codec{};
+    float minTransmittance = 0;
+    bool isDefault = false;
+};
+
+// `order`: the ranks front to back, for OrderedBlend.
+template <class TileOp>
+void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
+            const std::vector<int>& order, const std::string& config, const DfbSettings& settings)
+{
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
+    struct Renderer {
+        Renderer(const std::shared_ptr<Messenger>& sharedMessenger, const dfb::FrameBufferConfig& c,
+                 const BrickImage& brick)
+            : fb(sharedMessenger, c), world(worldOf(brick, fb.rank())), shared(fb, world)
+        {
+        }
+        FrameBuffer fb;
+        dfb::World world;
+        dfb::SharedWorld shared;
+        dfb::RoundRobinBricks owner;
+        dfb::FrameReport report;
+    };
     for (const bool toBytes : {false, true}) {
         dfb::FrameBufferConfig c;
         c.width = image.width;
         c.height = image.height;
         c.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
-        c.wire = wire;
-        c.codec = codec;
-        c.minTransmittance = minTransmittance;
+        c.wire = settings.wire;
+        c.codec = settings.codec;
+        c.minTransmittance = settings.minTransmittance;
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        const auto fb = std::make_shared<FrameBuffer>(messenger, c);
-        const auto report = std::make_shared<dfb::FrameReport>();
-        const BrickImage* from = &image;
+        const auto r = std::make_shared<Renderer>(messenger, c, image);
         System s;
         s.name = "dfb";
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
-        s.isDefault = isDefault;
-        s.frame = [fb, report, from] {
-            dfb::World world;
-            if (from->viewport[2] > 0)
-                world.add({static_cast<std::uint32_t>(fb->rank()), {}});
-            dfb::FrameParams params;
-            params.maxLayers = fb->size();
-            *report = dfb::renderDataParallel(
-                *fb, world, ViewportCamera{from},
-                [&](const dfb::Brick&, auto& tile) {
-                    const dfb::Region& r = tile.region;
-                    const auto width = static_cast<std::size_t>(r.width());
-                    for (int y = 0; y < r.height(); ++y) {
-                        const std::size_t first =
-                            static_cast<std::size_t>(r.y0 + y) * static_cast<std::size_t>(from->width)
-                            + static_cast<std::size_t>(r.x0);
-                        std::memcpy(tile.pixel(0, y), &from->rgba[4 * first], 4 * sizeof(float) * width);
-                        std::memcpy(tile.depth + y * TileSize, &from->depth[first], sizeof(float) * width);
-                    }
-                },
-                params);
+        s.isDefault = settings.isDefault;
+        s.frame = [r, from = &image, order] {
+            const auto renderBrick = [from](const dfb::Brick&, auto& tile) {
+                const dfb::Region& region = tile.region;
+                const auto width = static_cast<std::size_t>(region.width());
+                for (int y = 0; y < region.height(); ++y) {
+                    const std::size_t first =
+                        static_cast<std::size_t>(region.y0 + y) * static_cast<std::size_t>(from->width)
+                        + static_cast<std::size_t>(region.x0);
+                    std::memcpy(tile.pixel(0, y), &from->rgba[4 * first], 4 * sizeof(float) * width);
+                    if constexpr (!isOrdered<TileOp>)
+                        std::memcpy(tile.depth + y * TileOp::tileSize, &from->depth[first], sizeof(float) * width);
+                }
+            };
+            if constexpr (isOrdered<TileOp>) {
+                std::vector<int> places; // of bricks in the shared world, which has them by id
+                for (const int rank : order)
+                    for (std::size_t i = 0; i < r->shared.bricks().size(); ++i)
+                        if (r->shared.bricks()[i].brick.id == static_cast<std::uint32_t>(rank))
+                            places.push_back(static_cast<int>(i));
+                r->report = dfb::renderOrdered(r->fb, r->shared, PixelCamera(), places, r->owner, renderBrick);
+            } else {
+                dfb::FrameParams params;
+                params.maxLayers = r->fb.size();
+                r->report = dfb::renderDataParallel(r->fb, r->world, PixelCamera(), renderBrick, params);
+            }
         };
         if (toBytes)
-            s.bytes = [fb] { return fb->image().rgba8(); };
+            s.bytes = [r] { return r->fb.image().rgba8(); };
         else
-            s.floats = [fb] { return fb->image().rgba32f(); };
-        s.traffic = [report] { return std::make_pair(report->bytesSent, report->messagesSent); };
+            s.floats = [r] { return r->fb.image().rgba32f(); };
+        s.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
         s.trafficIsOfAll = true;
-        s.peakMemory = [report] { return static_cast<double>(report->peakMemoryBytes); };
+        s.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
         systems.push_back(std::move(s));
     }
 }
 
-void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image)
+void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
+               const std::vector<int>& order)
 {
     using dfb::WireFormat;
-    const auto add = [&](const std::string& config, const dfb::WirePrecision& wire,
-                         const std::shared_ptr<const dfb::Codec>& codec = {}, float minTransmittance = 0,
-                         bool isDefault = false) {
-        addDfb<64>(systems, messenger, image, config, wire, codec, minTransmittance, isDefault);
+    const auto add = [&](const std::string& config, const DfbSettings& settings) {
+        addDfb<dfb::AlphaBlend>(systems, messenger, image, order, config, settings);
     };
-    add("float32", WireFormat::Float32, {}, 0, true);
-    for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8})
-        add(nameOf(format), format);
+    const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
+        addDfb<dfb::OrderedBlend>(systems, messenger, image, order, config, settings);
+    };
+    add("float32", {WireFormat::Float32, {}, 0, true});
+    addOrdered("in order, float32", {WireFormat::Float32, {}, 0, true});
+    for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8}) {
+        add(nameOf(format), {format});
+        addOrdered(std::string("in order, ") + nameOf(format), {format});
+    }
     for (const double budget : {1e-2, 2e-3, 5e-4, 1e-5}) {
         std::ostringstream name;
         name << "budget " << budget;
-        add(name.str(), dfb::ErrorBudget{budget});
+        add(name.str(), {dfb::ErrorBudget{budget}});
     }
-    add("float32, transmittance 1e-3", WireFormat::Float32, {}, 1e-3f);
-    addDfb<32>(systems, messenger, image, "float32, tiles of 32", WireFormat::Float32, {}, 0);
-    addDfb<128>(systems, messenger, image, "float32, tiles of 128", WireFormat::Float32, {}, 0);
+    add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
+    addDfb<dfb::BasicAlphaBlend<32>>(systems, messenger, image, order, "float32, tiles of 32", {});
+    addDfb<dfb::BasicAlphaBlend<128>>(systems, messenger, image, order, "float32, tiles of 128", {});
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
     for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})
-        add(std::string(nameOf(format)) + ", snappy", format, snappy);
+        add(std::string(nameOf(format)) + ", snappy", {format, snappy});
 #endif
 }
 
@@ -261,9 +302,9 @@ public:
         if (rank_ == 0)
             exact = scene.exact();
         bench::meet(comm_);
-        const auto messenger = std::make_shared<Messenger>(comm_);
+        const auto messenger = std::make_shared<Messenger>(comm_, dfb::MessengerOptions{getenv("CALLER") ? dfb::Progress::Caller : dfb::Progress::Thread, false});
         std::vector<System> systems;
-        addAllDfb(systems, messenger, image);
+        addAllDfb(systems, messenger, image, scene.order());
         addPlain(systems, comm_, scene, image, viewports);
 #ifdef DFB_BENCH_HAS_ICET
         addIceT(systems, comm_, scene, image);

@@ -18,6 +18,8 @@
 //                                                then expected and counted
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
 //                                                in a frame, and the image keeps its pixels
+//   static constexpr bool emptyIsBackground = true;   out of inputs without any pixel it makes the background: then it
+//                                                need not be asked, and nothing travels
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
@@ -196,6 +198,13 @@ struct HasFinish : std::false_type {
 };
 template <class T>
 struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> : std::true_type {
+};
+
+template <class T, class = void>
+struct EmptyIsBackground : std::false_type {
+};
+template <class T>
+struct EmptyIsBackground<T, std::void_t<decltype(T::emptyIsBackground)>> : std::bool_constant<T::emptyIsBackground> {
 };
 
 template <class T, class = void>

@@ -108,6 +108,16 @@ inline float fromHalf(std::uint16_t half) noexcept
     return floatOf(sign | bits);
 }
 
+// The same for numbers from 0 to 65504, in a form that can be vectorized.
+inline std::uint16_t positiveToHalf(float value) noexcept
+{
+    const auto bits = static_cast<std::int32_t>(bitsOf(value));
+    const auto small = static_cast<std::int32_t>(bitsOf(value + 0.5f) - 0x3f000000u);
+    const std::int32_t normal = (bits - 0x37fff001 + (bits >> 13 & 1)) >> 13;
+    return static_cast<std::uint16_t>(bits < 0x38800000 ? small : normal);
+}
+inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
+
 // To the nearest integer, ties to even, of a value within [0, 65535].
 inline std::uint32_t nearestInteger(float value) noexcept
 {
@@ -145,15 +155,15 @@ public:
         switch (format) {
         case WireFormat::Float32: std::memcpy(out, rgba, 4 * sizeof(float) * static_cast<std::size_t>(count)); return;
         case WireFormat::Float16:
-            encode<std::uint16_t>(rgba, count, out, scale_, 0x1p15f, [](float v) { return toHalf(v); });
+            encode<std::uint16_t>(rgba, count, out, scale_, 0x1p15f, [](float v) { return positiveToHalf(v); });
             return;
         case WireFormat::Unorm16:
             encode<std::uint16_t>(rgba, count, out, 65535.0f / maxColor_, 65535.0f,
-                                  [](float v) { return nearestInteger(std::min(v, 65535.0f)); });
+                                  [](float v) { return nearestInteger(v); });
             return;
         case WireFormat::Unorm8:
             encode<std::uint8_t>(rgba, count, out, 255.0f / maxColor_, 255.0f,
-                                 [](float v) { return nearestInteger(std::min(v, 255.0f)); });
+                                 [](float v) { return nearestInteger(v); });
             return;
         }
     }
@@ -162,7 +172,8 @@ public:
         switch (format) {
         case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); return;
         case WireFormat::Float16:
-            decode<std::uint16_t>(in, count, rgba, 1 / scale_, 0x1p-15f, [](std::uint16_t v) { return fromHalf(v); });
+            decode<std::uint16_t>(in, count, rgba, 1 / scale_, 0x1p-15f,
+                                  [](std::uint16_t v) { return positiveFromHalf(v); });
             return;
         case WireFormat::Unorm16:
             decode<std::uint16_t>(in, count, rgba, maxColor_ / 65535.0f, 1 / 65535.0f,
@@ -227,24 +238,40 @@ private:
         return code;
     }
 
+    // Four values at a time, colour and alpha with their own scales; `toCode` is for one value, `Unorm` formats have a
+    // faster way with the same results.
     template <class Code, class ToCode>
     static void encode(const float* rgba, int count, std::byte* out, float colorScale, float alphaScale,
                        const ToCode& toCode)
     {
         const float scales[4] = {colorScale, colorScale, colorScale, alphaScale};
-        for (int i = 0; i < count; ++i)
-            for (int c = 0; c < 4; ++c)
-                put(out, 4 * i + c, static_cast<Code>(toCode(rgba[4 * i + c] * scales[c])));
+        Code codes[4 * block]; // bytes could alias what they are made of
+        for (int first = 0; first < count; first += block) {
+            const int size = std::min(block, count - first);
+            const float* from = rgba + 4 * first;
+            for (int i = 0; i < size; ++i)
+                for (int c = 0; c < 4; ++c)
+                    codes[4 * i + c] = static_cast<Code>(toCode(from[4 * i + c] * scales[c]));
+            std::memcpy(out + 4 * sizeof(Code) * static_cast<std::size_t>(first), codes,
+                        4 * sizeof(Code) * static_cast<std::size_t>(size));
+        }
     }
     template <class Code, class FromCode>
     static void decode(const std::byte* in, std::size_t count, float* rgba, float colorScale, float alphaScale,
                        const FromCode& fromCode)
     {
         const float scales[4] = {colorScale, colorScale, colorScale, alphaScale};
-        for (std::size_t i = 0; i < count; ++i)
-            for (std::size_t c = 0; c < 4; ++c)
-                rgba[4 * i + c] = fromCode(get<Code>(in, 4 * i + c)) * scales[c];
+        Code codes[4 * block];
+        for (std::size_t first = 0; first < count; first += block) {
+            const std::size_t size = std::min<std::size_t>(block, count - first);
+            std::memcpy(codes, in + 4 * sizeof(Code) * first, 4 * sizeof(Code) * size);
+            float* to = rgba + 4 * first;
+            for (std::size_t i = 0; i < size; ++i)
+                for (std::size_t c = 0; c < 4; ++c)
+                    to[4 * i + c] = fromCode(codes[4 * i + c]) * scales[c];
+        }
     }
+    static constexpr int block = 64; // pixels
 
     // 0 to `most`; infinity is most + 1.
     std::uint32_t depthCode(float depth, float most) const noexcept

@@ -86,7 +86,8 @@ TEST_CASE("Half precision: every number comes back, and floats become the neares
             continue;
         }
         const double expected = std::ldexp(exponent ? 1024 + mantissa : mantissa, (exponent ? exponent : 1) - 25);
-        wrong += static_cast<double>(value) != (half & 0x8000 ? -expected : expected) || toHalf(value) != half;
+        wrong += static_cast<double>(value) != (half & 0x8000 ? -expected : expected) || toHalf(value) != half
+                 || static_cast<double>(dfb::detail::positiveFromHalf(half)) != expected;
     }
     CHECK(wrong == 0);
     Random random(1);
@@ -97,7 +98,9 @@ TEST_CASE("Half precision: every number comes back, and floats become the neares
         const float middle = low + 0.5f * (high - low);
         for (const float value : {low + uniform(random) * (high - low), middle, std::nextafter(middle, 0.0f),
                                   std::nextafter(middle, infinity)})
-            wrong += toHalf(value) != nearestHalf(value, half) || toHalf(-value) != (nearestHalf(value, half) | 0x8000);
+            wrong += dfb::detail::positiveToHalf(value) != nearestHalf(value, half)
+                     || toHalf(value) != nearestHalf(value, half)
+                     || toHalf(-value) != (nearestHalf(value, half) | 0x8000);
     }
     CHECK(wrong == 0);
     CHECK(toHalf(65519.99f) == 0x7bff);

@@ -21,6 +21,7 @@
 #include <cstdint>
 #include <cstring>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -115,6 +116,8 @@ public:
         MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found);
         lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
 
+        findCrowding();
+
         peers_.resize(static_cast<std::size_t>(size_));
         packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
         packets_ = pool_->acquire(detail::packetBytes * postedPackets);
@@ -150,7 +153,8 @@ public:
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
     bool wakesOnArrival() const noexcept { return false; }
-    void nap(std::chrono::nanoseconds limit) { signal_.nap(limit); }
+    // Longer where ranks share cores: waking up takes the core from one that computes.
+    void nap(std::chrono::nanoseconds limit) { signal_.nap(limit * crowding_ / 4); }
     void interrupt() { signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
@@ -191,6 +195,23 @@ public:
     }
 
 private:
+    // How many ranks of this communicator there are to a core of this machine, in quarters: 4 to 16.
+    void findCrowding()
+    {
+        char name[MPI_MAX_PROCESSOR_NAME + 1] = {};
+        int length = 0;
+        MPI_Get_processor_name(name, &length);
+        const std::uint64_t mine = std::hash<std::string>()(std::string(name, static_cast<std::size_t>(length)));
+        std::vector<std::uint64_t> all(static_cast<std::size_t>(size_));
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Iallgather(&mine, 1, MPI_UINT64_T, all.data(), 1, MPI_UINT64_T, comm_, &request), "MPI_Iallgather");
+        for (detail::Patience patience; !completed(request);)
+            patience.nap();
+        const auto here = std::count(all.begin(), all.end(), mine);
+        const auto cores = static_cast<std::ptrdiff_t>(std::max(1u, std::thread::hardware_concurrency()));
+        crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(4 * here / cores, 4, 16));
+    }
+
     using Record = detail::PacketRecord;
 
     // Bytes that MPI has in hand. What is longer than a chunk goes on when the chunk has gone.
@@ -665,6 +686,7 @@ private:
     TransportHandler* handler_ = nullptr;
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1, lastTag_ = 1;
+    int crowding_ = 4;
     std::thread::id onlyThread_; // that may call MPI; none if all may
 
     NapSignal signal_;

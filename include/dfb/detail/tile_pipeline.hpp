@@ -81,7 +81,8 @@ public:
         info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
         table_.newFrame(info, plan, tileData);
         background_ = info.background;
-        losses_.newFrame(config_.wire.maxColor, largestBackground(), config_.minTransmittance);
+        losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.wire.maxColor, largestBackground(),
+                         config_.minTransmittance);
         setLayers(maxLayers);
         if constexpr (HasPixelNewFrame<PixelOp>::value)
             pixelOp_.newFrame(pixelData);
@@ -148,6 +149,9 @@ public:
     // Runs both operations on a complete tile and hands it on.
     void finish(int tile)
     {
+        // The display rank knows how the background looks.
+        if (EmptyIsBackground<TileOp>::value && IsPointwise<PixelOp>::value && !table_.hasPixels(tile))
+            return;
         const FloatEnvironment floatEnvironment;
         const Region region = table_.layout().region(tile);
         if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {

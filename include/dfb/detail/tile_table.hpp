@@ -109,6 +109,7 @@ public:
         slot.touched = true;
         if (slot.ready)
             return false; // the op had enough
+        slot.hasPixels = slot.hasPixels || !fragment.empty();
         slot.op.add(std::move(fragment));
         bool enough = false;
         if constexpr (HasIsComplete<TileOp>::value)
@@ -144,6 +145,9 @@ public:
                 ready(owned_[i]);
         }
     }
+
+    // Whether any input had a pixel. The tile must be complete.
+    bool hasPixels(int tile) { return slotFor(tile).hasPixels; }
 
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
@@ -219,7 +223,7 @@ public:
 private:
     struct Slot {
         std::int64_t frame = -1;
-        bool ready = false, touched = false, declared = false;
+        bool ready = false, touched = false, declared = false, hasPixels = false;
         std::vector<DependencyTracker> trees; // one per pass
         TileOp op;
     };
@@ -233,7 +237,7 @@ private:
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             slot->frame = info_.frame;
-            slot->ready = slot->touched = slot->declared = false;
+            slot->ready = slot->touched = slot->declared = slot->hasPixels = false;
             slot->trees.resize(static_cast<std::size_t>(samples(tile).count));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();

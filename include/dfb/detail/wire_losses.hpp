@@ -11,7 +11,7 @@
 #include <cstdint>
 #include <limits>
 #include <mutex>
-#include <unordered_map>
+#include <vector>
 
 namespace dfb::detail {
 
@@ -19,12 +19,12 @@ namespace dfb::detail {
 class WireLosses {
 public:
     // `minTransmittance`: of TileInfo. `background`: the largest of its channels.
-    void newFrame(float maxColor, double background, float minTransmittance)
+    void newFrame(int tileCount, float maxColor, double background, float minTransmittance)
     {
         maxColor_ = static_cast<double>(maxColor);
         background_ = background;
         minTransmittance_ = static_cast<double>(minTransmittance);
-        tiles_.clear();
+        tiles_.assign(static_cast<std::size_t>(tileCount), {});
     }
 
     void add(const Fragment& fragment, const WireCoder& coder)
@@ -37,7 +37,7 @@ public:
             && !coder.inRange(fragment.color(), static_cast<int>(fragment.storedPixels())))
             beyond = largestOf(fragment);
         const std::lock_guard<std::mutex> lock(mutex_);
-        Tile& tile = tiles_[fragment.header().tile];
+        Tile& tile = tiles_[static_cast<std::size_t>(fragment.header().tile)];
         ++tile.layers[static_cast<std::size_t>(format)];
         tile.beyond += beyond;
     }
@@ -48,7 +48,7 @@ public:
         Tile tile;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            tile = tiles_[index];
+            tile = tiles_[static_cast<std::size_t>(index)];
         }
         const double behind = std::max(maxColor_, background_) + tile.beyond;
         double bound = minTransmittance_ * std::max(behind, 1.0);
@@ -85,7 +85,7 @@ private:
 
     double maxColor_ = 1, background_ = 0, minTransmittance_ = 0;
     std::mutex mutex_;
-    std::unordered_map<int, Tile> tiles_; // under mutex_
+    std::vector<Tile> tiles_; // under mutex_
 };
 
 } // namespace dfb::detail

@@ -252,6 +252,7 @@ public:
     static constexpr int tileSize = TileSize;
     static constexpr ChannelMask channels = Channels;
     static constexpr BlendRule rule = Rule;
+    static constexpr bool emptyIsBackground = true;
 
     void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
     void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
