@@ -71,7 +71,7 @@ dfb::World worldOf(const BrickImage& image, int rank)
 }
 
 template <class TileOp>
-inline constexpr bool isOrdered = std::is_base_of_v<dfb::OrderedBlend, TileOp>;
+inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
 struct DfbSettings {
     dfb::WirePrecision wire{};
@@ -174,6 +174,9 @@ void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& m
     add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
     addDfb<dfb::BasicAlphaBlend<32>>(systems, messenger, image, order, "float32, tiles of 32", {});
     addDfb<dfb::BasicAlphaBlend<128>>(systems, messenger, image, order, "float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, image, order, "in order, float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, image, order, "in order, unorm16, tiles of 128",
+                                        {WireFormat::Unorm16});
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
     for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})

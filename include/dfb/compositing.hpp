@@ -9,6 +9,7 @@
 // again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
 #pragma once
 
+#include <dfb/cpu.hpp>
 #include <dfb/double_double.hpp>
 #include <dfb/fragment.hpp>
 
@@ -249,8 +250,8 @@ inline int firstOutOfOrder(const float* front, const float* back, bool frontWins
 
 // Composites pixels [begin, end) of layers, in this order, into the row from x + begin on: block by block, so that what
 // is accumulated stays where it is computed. Behind a block that nothing comes through there is nothing to do.
-inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                        const std::vector<int>& order)
+DFB_INLINE void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                            const std::vector<int>& order)
 {
     constexpr int block = 16;
     for (int first = begin; first < end; first += block) {
@@ -275,6 +276,20 @@ inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std:
         }
         isClosed(row, x + first, count); // for the background
     }
+}
+DFB_AVX2 inline void blendColorsAvx2(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                                     const std::vector<int>& order)
+{
+    blendColors(row, x, begin, end, layers, order);
+}
+
+inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                        const std::vector<int>& order)
+{
+    if (cpuHasAvx2())
+        blendColorsAvx2(row, x, begin, end, layers, order);
+    else
+        blendColors(row, x, begin, end, layers, order);
     if (!row.wantsDepth)
         return;
     float* nearest = row.depth.data() + x + begin;

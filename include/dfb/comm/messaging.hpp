@@ -47,7 +47,7 @@ public:
               std::size_t poolBytes, MessageHandler& handler)
         : messenger_(std::move(messenger)), executor_(std::move(executor)), handler_(handler),
           flow_(messenger_->size(), poolBytes,
-                {[this](int to, Buffer&& message) { send(to, std::move(message)); },
+                {[this](int to, Buffer&& message) { messenger_->send(to, std::move(message)); },
                  [this](int to, const FlowControl::Request& request) {
                      sendStruct(to, MessageKind::CreditRequest, request);
                  },
@@ -92,8 +92,7 @@ public:
             enqueue(destination, loadAs<MessageHeader>(message.data()), std::move(message));
             return;
         }
-        bytesSent_ += static_cast<std::int64_t>(message.size());
-        ++messagesSent_;
+        countSent(message);
         messenger_->send(destination, std::move(message));
     }
 
@@ -109,10 +108,12 @@ public:
     // Messages that carry pixels need credit of their receiver, and are kept until they have it. Never blocks.
     void sendWithCredit(int destination, Buffer&& message)
     {
-        if (destination == rank())
+        if (destination == rank()) {
             send(destination, std::move(message));
-        else
-            flow_.send(destination, std::move(message));
+            return;
+        }
+        countSent(message); // now, so that a frame's figures have it
+        flow_.send(destination, std::move(message));
     }
     static bool needsCredit(MessageKind kind)
     {
@@ -282,6 +283,12 @@ public:
     }
 
 private:
+    void countSent(const Buffer& message)
+    {
+        bytesSent_ += static_cast<std::int64_t>(message.size());
+        ++messagesSent_;
+    }
+
     struct Arrival {
         int source;
         MessageHeader header;
