@@ -198,10 +198,10 @@ private:
     // How many ranks of this communicator there are to a core of this machine, in quarters: 4 to 16.
     void findCrowding()
     {
-        char name[MPI_MAX_PROCESSOR_NAME + 1] = {};
+        char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
         int length = 0;
-        MPI_Get_processor_name(name, &length);
-        const std::uint64_t mine = std::hash<std::string>()(std::string(name, static_cast<std::size_t>(length)));
+        MPI_Get_processor_name(host, &length);
+        const std::uint64_t mine = std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length)));
         std::vector<std::uint64_t> all(static_cast<std::size_t>(size_));
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Iallgather(&mine, 1, MPI_UINT64_T, all.data(), 1, MPI_UINT64_T, comm_, &request), "MPI_Iallgather");

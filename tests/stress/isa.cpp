@@ -1,0 +1,64 @@
+// Composites adversarial tiles and writes all values to a file; or says by how much two such files differ. It is built
+// for several instruction sets.
+//   isa write FILE        isa compare FILE FILE MOST_ULPS
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/testing/adversarial.hpp>
+
+#include <algorithm>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <fstream>
+#include <string>
+#include <vector>
+
+namespace {
+
+int write(const char* path)
+{
+    std::ofstream file(path, std::ios::binary);
+    for (std::uint64_t seed = 1; seed <= 80; ++seed) {
+        using Op = dfb::BasicAlphaBlend<16>;
+        const auto in =
+            dfb::testing::adversarial<16>(seed, 2 + static_cast<int>(seed % 60), 1 + static_cast<int>(seed % 2));
+        const auto out = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA32F);
+        file.write(reinterpret_cast<const char*>(out.color.data()), static_cast<std::streamsize>(out.color.size()));
+    }
+    return file.flush() ? 0 : 1;
+}
+
+std::vector<float> read(const char* path)
+{
+    std::ifstream file(path, std::ios::binary | std::ios::ate);
+    std::vector<float> values(static_cast<std::size_t>(std::max<std::streamoff>(0, file.tellg())) / sizeof(float));
+    file.seekg(0);
+    file.read(reinterpret_cast<char*>(values.data()), static_cast<std::streamsize>(values.size() * sizeof(float)));
+    return values;
+}
+
+int compare(const char* a, const char* b, std::int64_t most)
+{
+    const std::vector<float> x = read(a), y = read(b);
+    std::int64_t worst = 0, different = 0;
+    for (std::size_t i = 0; i < std::min(x.size(), y.size()); ++i) {
+        const std::int64_t ulps = dfb::testing::ulpsBetween(x[i], y[i]);
+        different += ulps != 0;
+        worst = std::max(worst, ulps);
+    }
+    std::printf("%lld of %zu values differ, by up to %lld ulp\n", static_cast<long long>(different), x.size(),
+                static_cast<long long>(worst));
+    return x.empty() || x.size() != y.size() || worst > most ? 1 : 0;
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    const std::string what = argc > 1 ? argv[1] : "";
+    if (what == "write" && argc == 3)
+        return write(argv[2]);
+    if (what == "compare" && argc == 5)
+        return compare(argv[2], argv[3], std::atoll(argv[4]));
+    std::fprintf(stderr, "usage: isa write FILE | isa compare FILE FILE MOST_ULPS\n");
+    return 2;
+}
