@@ -305,7 +305,7 @@ public:
         if (rank_ == 0)
             exact = scene.exact();
         bench::meet(comm_);
-        const auto messenger = std::make_shared<Messenger>(comm_, dfb::MessengerOptions{getenv("CALLER") ? dfb::Progress::Caller : dfb::Progress::Thread, false});
+        const auto messenger = std::make_shared<Messenger>(comm_);
         std::vector<System> systems;
         addAllDfb(systems, messenger, image, scene.order());
         addPlain(systems, comm_, scene, image, viewports);
@@ -457,35 +457,44 @@ public:
     {
         if (rank_ != 0)
             return;
-        std::ostringstream table;
-        std::vector<Result> all;
+        std::ostringstream all, chosen;
+        std::vector<Result> results;
         for (const auto* rows : {&floats_, &bytes_, &noise_}) {
-            std::vector<Result> results;
-            for (const Row& s : *rows)
-                results.push_back(s.result);
-            all.insert(all.end(), results.begin(), results.end());
-            table << "\n| " << (rows == &noise_ ? "noise, " : "") << size_ << " ranks, "
-                  << (rows->empty() ? "" : rows->front().output)
-                  << " | ms | CPU ms | MB sent | max error | RMSE | levels off |\n|---|--:|--:|--:|--:|--:|--:|\n";
-            for (const Row& s : *rows)
-                table << line(s.result, results);
-            for (const Row& s : *rows)
-                if (s.isDefault && !isOnFront(s.result, results))
-                    table << "\nNot on the front, though a default: " << s.result.config << ".\n";
-            if (!o_.svg.empty() && !results.empty()) {
+            if (rows->empty())
+                continue;
+            std::vector<Result> these;
+            for (const Row& r : *rows)
+                these.push_back(r.result);
+            results.insert(results.end(), these.begin(), these.end());
+            const std::string head = "\n| " + these.front().scene + ", " + std::to_string(size_) + " ranks, to "
+                                     + rows->front().output
+                                     + " | ms | CPU ms | MB sent | max error | RMSE | levels off |\n"
+                                       "|---|--:|--:|--:|--:|--:|--:|\n";
+            all << head;
+            chosen << head;
+            for (const Row& r : *rows) {
+                all << line(r.result, these);
+                if (r.isDefault || isOnFront(r.result, these) || isBestOfKind(r.result, these) || rows == &noise_)
+                    chosen << line(r.result, these);
+            }
+            for (const Row& r : *rows)
+                if (r.isDefault && !isOnFront(r.result, these))
+                    all << "\nNot on the front, though a default: " << r.result.config << ".\n",
+                        chosen << "\nNot on the front, though a default: " << r.result.config << ".\n";
+            if (!o_.svg.empty()) {
                 const std::string kind = rows == &floats_ ? "float" : rows == &bytes_ ? "8bit" : "noise";
                 bench::writeSvg(o_.svg + '.' + kind + ".svg",
-                                results.front().scene + ", " + std::to_string(results.front().width) + " x "
-                                    + std::to_string(results.front().height) + ", " + std::to_string(size_) + " ranks, "
-                                    + rows->front().output + " output; * on the Pareto front",
-                                results);
+                                these.front().scene + ", " + std::to_string(these.front().width) + " x "
+                                    + std::to_string(these.front().height) + ", " + std::to_string(size_)
+                                    + " ranks, to " + rows->front().output + "; * on the Pareto front",
+                                these);
             }
         }
-        std::printf("%s", table.str().c_str());
+        std::printf("%s", all.str().c_str());
         if (!o_.json.empty())
-            bench::appendJson(o_.json, all);
+            bench::appendJson(o_.json, results);
         if (!o_.table.empty())
-            std::ofstream(o_.table, std::ios::app) << table.str();
+            std::ofstream(o_.table, std::ios::app) << chosen.str();
     }
 
 private:
@@ -494,6 +503,15 @@ private:
         std::string output;
         bool isDefault;
     };
+
+    // The fastest of a peer's strategies with this kind of pixels.
+    static bool isBestOfKind(const Result& r, const std::vector<Result>& all)
+    {
+        const auto kindOf = [](const Result& x) { return x.system + x.config.substr(0, x.config.find(',')); };
+        return r.system != "dfb" && std::none_of(all.begin(), all.end(), [&](const Result& o) {
+                   return kindOf(o) == kindOf(r) && o.ms.median < r.ms.median;
+               });
+    }
 
     bool isWanted(const std::string& name) const
     {

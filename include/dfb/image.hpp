@@ -111,6 +111,43 @@ inline std::uint8_t toSrgb8(double linear) noexcept
     return static_cast<std::uint8_t>(std::upper_bound(t.begin(), t.end(), linear) - t.begin());
 }
 
+// Whether a value with an error of 2^-35 of itself could have another level than toSrgb8() gave.
+inline bool isNearSrgbThreshold(double linear, std::uint8_t level) noexcept
+{
+    const auto& t = srgbThresholds();
+    return (level > 0 && linear - t[level - std::size_t{1}] <= 0x1p-35 * linear)
+           || (level < 255 && t[level] - linear <= 0x1p-35 * t[level]);
+}
+
+// Where level k ends and the next begins, to about 100 bits.
+inline DoubleDouble srgbBoundary(int k) noexcept
+{
+    const DoubleDouble s = DoubleDouble{2.0 * k + 1, 0} / 510;
+    if (s.high < 0.04045)
+        return s * DoubleDouble{100, 0} / 1292;
+    const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
+    const DoubleDouble base3 = base * base * base, base12 = base3 * base3 * base3 * base3;
+    // t^5 = base^12: one step of Newton's from a double doubles the digits.
+    const DoubleDouble t{std::pow(base.high, 2.4), 0}, t2 = t * t, t4 = t2 * t2, t5 = t4 * t;
+    const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
+    return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
+}
+
+// The same for a value that is known to about 100 bits.
+inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept
+{
+    int level = toSrgb8(linear.high);
+    const auto isAbove = [&](int k) { // the boundary after level k
+        const DoubleDouble boundary = srgbBoundary(k);
+        return (linear + DoubleDouble{-boundary.high, -boundary.low}).high >= 0;
+    };
+    if (level > 0 && !isAbove(level - 1))
+        --level;
+    else if (level < 255 && isAbove(level))
+        ++level;
+    return static_cast<std::uint8_t>(level);
+}
+
 } // namespace detail
 
 namespace detail {
@@ -207,7 +244,7 @@ DFB_AVX2 inline void toFloatsAvx2(const Real* values, int count, float* out) noe
 
 // Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
 // rounded to nearest. Returns how far the farthest value was from an 8-bit level, up to 1/2, which is a tie between
-// two; of SRGBA8 that is of alpha alone.
+// two; an sRGB colour next to where another level begins counts as one.
 template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
 {
@@ -245,8 +282,12 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
                 alpha[i] = rgba[4 * (first + i) + 3];
             farthest = std::max(farthest, detail::toUnorm8(alpha, size, levels));
             for (int i = 0; i < size; ++i) {
-                for (int c = 0; c < 3; ++c)
-                    bytes[4 * (first + i) + c] = detail::toSrgb8(rgba[4 * (first + i) + c]);
+                for (int c = 0; c < 3; ++c) {
+                    const double value = rgba[4 * (first + i) + c];
+                    const std::uint8_t level = detail::toSrgb8(value);
+                    bytes[4 * (first + i) + c] = level;
+                    farthest = detail::isNearSrgbThreshold(value, level) ? 0.5 : farthest;
+                }
                 bytes[4 * (first + i) + 3] = levels[i];
             }
         }

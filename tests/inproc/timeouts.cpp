@@ -118,6 +118,7 @@ void send(FrameBuffer::Frame& frame, int index, int generation, std::uint32_t so
     tile->source = source;
     tile->part = part;
     tile->children = children;
+    tile->pixel(0, 0)[3] = 0.5f; // tiles without anything do not travel to the display rank
     frame.setTile(*tile);
 }
 

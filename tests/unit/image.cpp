@@ -154,3 +154,21 @@ TEST_CASE("An image shows what it has and says what it has not", "[image]")
     CHECK(floats.depth() != nullptr);
     CHECK_THROWS_AS(floats.rgba8(), dfb::InvalidArgument);
 }
+
+TEST_CASE("sRGB levels of values that a double can not tell from a boundary", "[image]")
+{
+    using dfb::detail::DoubleDouble;
+    int wrong = 0;
+    for (int k = 0; k < 255; ++k) {
+        const DoubleDouble boundary = dfb::detail::srgbBoundary(k);
+        for (const double off : {-1e-25, 1e-25, -1e-19, 1e-19, -1e-12, 1e-12}) {
+            const DoubleDouble value = boundary * DoubleDouble::sum(1.0, off);
+            const auto exact =
+                static_cast<dfb::testing::Exact>(value.high) + static_cast<dfb::testing::Exact>(value.low);
+            wrong += dfb::detail::toSrgb8(value) != dfb::testing::toSrgb8(exact);
+            wrong += std::abs(off) < 1e-15
+                     && !dfb::detail::isNearSrgbThreshold(value.high, dfb::detail::toSrgb8(value.high));
+        }
+    }
+    CHECK(wrong == 0);
+}

@@ -198,9 +198,10 @@ private:
         if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
             return;
         const std::vector<DoubleDouble> exact = exactRow(y);
-        const bool alphaAlone = out.format() == OutputFormat::SRGBA8; // the curve's levels are no round numbers
-        for (int i = alphaAlone ? 3 : 0; i < 4 * out.width(); i += alphaAlone ? 4 : 1)
-            out.setLevel(y, i, toUnorm8(exact[static_cast<std::size_t>(i)]));
+        for (int i = 0; i < 4 * out.width(); ++i) {
+            const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
+            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
+        }
     }
 
     // Row y in twice the precision, the mean of the passes.
