@@ -195,7 +195,8 @@ public:
     }
 
 private:
-    // How many ranks of this communicator there are to a core of this machine, in quarters: 4 to 16.
+    // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
+    // each wakes up so often, and takes the core from all others that often.
     void findCrowding()
     {
         char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
@@ -209,7 +210,8 @@ private:
             patience.nap();
         const auto here = std::count(all.begin(), all.end(), mine);
         const auto cores = static_cast<std::ptrdiff_t>(std::max(1u, std::thread::hardware_concurrency()));
-        crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(4 * here / cores, 4, 16));
+        const std::ptrdiff_t ranksPerCore = 4 * here / cores; // in quarters
+        crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
     using Record = detail::PacketRecord;
