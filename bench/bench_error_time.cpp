@@ -453,6 +453,53 @@ public:
         }
     }
 
+    // What exactness costs: layers in known order, in rows of tiles that stay in the cache, to bytes; in double with
+    // exact rounding, as the library does it, and in plain float. On rank 0.
+    void kernels()
+    {
+        if (rank_ != 0)
+            return;
+        constexpr int width = 64, rounds = 2000;
+        for (const int layers : {1, 4, 16}) {
+            std::vector<std::vector<float>> pixels;
+            std::vector<dfb::Layer> stack;
+            std::vector<int> order;
+            for (int k = 0; k < layers; ++k) {
+                pixels.emplace_back();
+                for (int i = 0; i < 4 * width; ++i)
+                    pixels.back().push_back(0.001f * static_cast<float>((i * 37 + k * 11) % 200));
+            }
+            for (int k = 0; k < layers; ++k) {
+                stack.push_back({pixels[static_cast<std::size_t>(k)].data(), nullptr, nullptr});
+                order.push_back(k);
+            }
+            dfb::CompositeRow row;
+            row.wantsDepth = false;
+            row.resize(width);
+            std::vector<std::byte> bytes(4 * width);
+            std::vector<float> sum(4 * width);
+            std::vector<double> exact, plain;
+            for (int sample = 0; sample < 41; ++sample) {
+                double start = bench::now();
+                for (int i = 0; i < rounds; ++i) {
+                    dfb::detail::blendBlocks(row, 0, 0, width, stack, order);
+                    dfb::convertPixels(row.rgba.data(), width, dfb::OutputFormat::RGBA8, bytes.data());
+                }
+                exact.push_back(1e9 * (bench::now() - start) / rounds / width);
+                start = bench::now();
+                for (int i = 0; i < rounds; ++i) {
+                    bench::DirectSend::blendRow(nullptr, sum.data(), width);
+                    for (const auto& p : pixels)
+                        bench::DirectSend::blendRow(p.data(), sum.data(), width);
+                    bench::DirectSend::convertToBytes(sum.data(), sum.size(),
+                                                      reinterpret_cast<std::uint8_t*>(bytes.data()));
+                }
+                plain.push_back(1e9 * (bench::now() - start) / rounds / width);
+            }
+            kernels_.push_back({layers, bench::figureOf(exact), bench::figureOf(plain)});
+        }
+    }
+
     void write() const
     {
         if (rank_ != 0)
@@ -490,6 +537,16 @@ public:
                                 these);
             }
         }
+        for (std::ostringstream* table : {&all, &chosen}) {
+            if (kernels_.empty())
+                continue;
+            *table << "\n| compositing to 8 bit alone, ns a pixel | double, rounded exactly | plain float | ratio |\n"
+                      "|---|--:|--:|--:|\n";
+            for (const Kernel& k : kernels_)
+                *table << "| " << k.layers << (k.layers == 1 ? " layer | " : " layers | ") << bench::text(k.exact)
+                       << " | " << bench::text(k.plain) << " | " << bench::text(k.exact.median / k.plain.median)
+                       << " |\n";
+        }
         std::printf("%s", all.str().c_str());
         if (!o_.json.empty())
             bench::appendJson(o_.json, results);
@@ -521,6 +578,11 @@ private:
             any = any || name.find(part) != std::string::npos;
         return any;
     }
+
+    struct Kernel {
+        int layers;
+        bench::Figure exact, plain;
+    };
 
     void time(System& s, bool counts)
     {
@@ -565,6 +627,7 @@ private:
     Options o_;
     int rank_ = 0, size_ = 1;
     std::vector<Row> floats_, bytes_, noise_; // on rank 0
+    std::vector<Kernel> kernels_;
 };
 
 // Ends the program after --help, or if it was called wrongly.
@@ -620,8 +683,10 @@ int main(int argc, char** argv)
     {
         Bench bench(MPI_COMM_WORLD, options);
         bench.bricks();
-        if (options.only.empty())
+        if (options.only.empty()) {
             bench.noise();
+            bench.kernels();
+        }
         bench.write();
     }
     MPI_Finalize();

@@ -74,6 +74,25 @@ public:
     std::int64_t bytesSent() const { return sent_; }
     std::int64_t messagesSent() const { return messages_; }
 
+    // Blends a layer behind a row; null: begins a row.
+    static void blendRow(const float* layer, float* acc, int count)
+    {
+        if (!layer) {
+            std::fill_n(acc, 4 * count, 0.0f);
+            return;
+        }
+        for (int x = 0; x < count; ++x, acc += 4, layer += 4) {
+            const float t = 1 - acc[3];
+            for (int k = 0; k < 4; ++k)
+                acc[k] += t * layer[k];
+        }
+    }
+    static void convertToBytes(const float* from, std::size_t count, std::uint8_t* to)
+    {
+        for (std::size_t i = 0; i < count; ++i)
+            to[i] = static_cast<std::uint8_t>(std::min(std::max(from[i], 0.0f), 1.0f) * 255 + 0.5f);
+    }
+
 private:
     // First row, and the one after the last.
     std::array<int, 2> slice(int rank) const
@@ -116,11 +135,8 @@ private:
                 + 4
                       * (static_cast<std::size_t>(part[1] + y - slice(rank_)[0]) * static_cast<std::size_t>(width_)
                          + static_cast<std::size_t>(part[0]));
-            for (int x = 0; x < part[2]; ++x, acc += 4, c += 4) {
-                const float t = 1 - acc[3];
-                for (int k = 0; k < 4; ++k)
-                    acc[k] += t * c[k];
-            }
+            blendRow(c, acc, part[2]);
+            c += 4 * static_cast<std::ptrdiff_t>(part[2]);
         }
     }
 
@@ -129,8 +145,7 @@ private:
         const std::size_t pixelBytes = toBytes_ ? 4 : 16;
         const std::byte* mine = reinterpret_cast<const std::byte*>(sum_.data());
         if (toBytes_) {
-            for (std::size_t i = 0; i < sum_.size(); ++i)
-                bytes_[i] = static_cast<std::uint8_t>(std::min(std::max(sum_[i], 0.0f), 1.0f) * 255 + 0.5f);
+            convertToBytes(sum_.data(), sum_.size(), bytes_.data());
             mine = reinterpret_cast<const std::byte*>(bytes_.data());
         }
         const auto placeOf = [&](int rank) {

@@ -65,7 +65,7 @@ inline void writeSvg(const std::string& path, const std::string& title, std::vec
         return;
     std::sort(results.begin(), results.end(),
               [](const Result& a, const Result& b) { return a.ms.median < b.ms.median; });
-    constexpr double left = 80, top = 50, plotWidth = 700, plotHeight = 460, least = 1e-9;
+    constexpr double left = 80, top = 130, plotWidth = 700, plotHeight = 460, least = 1e-9;
     double slowest = 0, fastest = 1e300, worst = 1e-6;
     for (const Result& r : results) {
         slowest = std::max(slowest, r.ms.median);
@@ -78,8 +78,8 @@ inline void writeSvg(const std::string& path, const std::string& title, std::vec
         return top + plotHeight * (1 - std::log(std::max(error, least) / least) / std::log(worst / least));
     };
     std::ofstream svg(path);
-    svg << R"(<svg xmlns="http://www.w3.org/2000/svg" width="1000" height="580" font-family="sans-serif" font-size="12">)"
-        << "\n<rect width=\"1000\" height=\"580\" fill=\"white\"/>\n<text x=\"" << left
+    svg << R"(<svg xmlns="http://www.w3.org/2000/svg" width="1000" height="660" font-family="sans-serif" font-size="12">)"
+        << "\n<rect width=\"1000\" height=\"660\" fill=\"white\"/>\n<text x=\"" << left
         << "\" y=\"28\" font-size=\"16\">" << title << "</text>\n";
     const auto line = [&](double x0, double y0, double x1, double y1, const char* style) {
         svg << "<line x1=\"" << x0 << "\" y1=\"" << y0 << "\" x2=\"" << x1 << "\" y2=\"" << y1 << "\" " << style
@@ -102,7 +102,7 @@ inline void writeSvg(const std::string& path, const std::string& title, std::vec
                 label(x(ms), top + plotHeight + 18, text, "text-anchor=\"middle\"");
             }
     label(left + plotWidth / 2, top + plotHeight + 42, "time of a frame [ms], median", "text-anchor=\"middle\"");
-    label(20, top - 8, "largest error of a pixel", "");
+    label(20, top - 8, "largest error", "");
     double lastX = -1, lastY = -1;
     for (const Result& r : results) {
         const bool front = isOnFront(r, results);
@@ -116,8 +116,8 @@ inline void writeSvg(const std::string& path, const std::string& title, std::vec
              "stroke=\"#999\"");
         svg << "<circle cx=\"" << px << "\" cy=\"" << py << "\" r=\"" << (front ? 5 : 3.5) << "\" fill=\"" << colour
             << "\"/>\n<text transform=\"translate(" << px + 7 << "," << py - 3
-            << ") rotate(-18)\" font-size=\"10\" fill=\"" << colour << "\">" << r.system << ' ' << r.config
-            << (front ? " *" : "") << "</text>\n";
+            << ") rotate(-42)\" font-size=\"10\" fill=\"" << colour << "\">" << r.system << ' '
+            << r.config.substr(0, r.config.rfind(", to ")) << (front ? " *" : "") << "</text>\n";
     }
     svg << "</svg>\n";
     if (!svg.flush())
