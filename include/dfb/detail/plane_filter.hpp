@@ -6,6 +6,7 @@
 
 #include <dfb/version.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -62,7 +63,7 @@ private:
                 before = word;
             }
         }
-        std::memcpy(out + count * size, in + count * size, byteCount - count * size);
+        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
     }
 
     template <class Word>
@@ -84,7 +85,7 @@ private:
                 std::memcpy(out + (i * words + w) * size, &before, size);
             }
         }
-        std::memcpy(out + count * size, in + count * size, byteCount - count * size);
+        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
     }
 };
 
