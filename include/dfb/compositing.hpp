@@ -148,8 +148,9 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         detail::takeNearest(row.depth.data() + x, count, layer);
 }
 
-// Whether nothing of what is behind `count` pixels from x on can be seen. Makes those opaque that count as such.
-inline bool isClosed(CompositeRow& row, int x, int count)
+// Makes those of `count` pixels from x on opaque that count as such. True if nothing of what is behind any of them can
+// be seen.
+inline bool closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
     if (row.minTransmittance > 0)
@@ -263,7 +264,7 @@ DFB_INLINE void blendColors(CompositeRow& row, int x, int begin, int end, const 
             acc[i] = 0.0 + static_cast<double>(front[i]); // -0 becomes 0
         for (int i = 0; i < count; ++i)
             t[i] = 1.0 - static_cast<double>(front[4 * i + 3]);
-        for (std::size_t k = 1; k < order.size() && !isClosed(row, x + first, count); ++k) {
+        for (std::size_t k = 1; k < order.size() && !closeOpaque(row, x + first, count); ++k) {
             const float* c = layers[static_cast<std::size_t>(order[k])].from(first).color;
             for (int i = 0; i < count; ++i) {
                 const double through = t[i];
@@ -274,7 +275,7 @@ DFB_INLINE void blendColors(CompositeRow& row, int x, int begin, int end, const 
                 t[i] = through * (1.0 - static_cast<double>(c[4 * i + 3]));
             }
         }
-        isClosed(row, x + first, count); // for the background
+        closeOpaque(row, x + first, count); // for the background
     }
 }
 DFB_AVX2 inline void blendColorsAvx2(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
@@ -309,7 +310,7 @@ inline void blendFully(CompositeRow& row, int x, int begin, int end, const std::
         if (l.aux)
             overAux(row, x + begin, end - begin, l, l.aux->from(static_cast<std::size_t>(begin)));
         over(row, x + begin, end - begin, l);
-        isClosed(row, x + begin, end - begin);
+        closeOpaque(row, x + begin, end - begin);
     }
 }
 

@@ -238,8 +238,7 @@ private:
         return code;
     }
 
-    // Four values at a time, colour and alpha with their own scales; `toCode` is for one value, `Unorm` formats have a
-    // faster way with the same results.
+    // Colour and alpha have scales of their own.
     template <class Code, class ToCode>
     static void encode(const float* rgba, int count, std::byte* out, float colorScale, float alphaScale,
                        const ToCode& toCode)

@@ -105,6 +105,10 @@ struct NoPrecision {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
+        const auto [rank, size] = [&] {
+            const dfb::Messenger<Transport> messenger(communicator);
+            return std::make_pair(messenger.rank(), messenger.size());
+        }();
         const scene::Scene s = scene::makeScene(2, 1);
         const float nan = std::numeric_limits<float>::quiet_NaN();
         const auto refuses = [&](const std::string& what, const auto& change) {
@@ -120,31 +124,13 @@ struct NoPrecision {
         refuses("error budget", [&](auto& c) { c.wire.maxColor = nan; });
         refuses("error budget", [&](auto& c) { c.wire.depthFar = c.wire.depthNear; });
         refuses("least transmittance", [&](auto& c) { c.minTransmittance = nan; });
-        if (sizeOf(communicator) > 1)
-            refuses("configured differently", [&](auto& c) {
-                if (rankOf(communicator) == 1)
+        if (size > 1)
+            refuses("configured differently", [&, rank = rank](auto& c) {
+                if (rank == 1)
                     c.wire.color = dfb::WireFormat::Float16;
             });
         return result;
     }
-
-private:
-    static int sizeOf(const dfb::InprocCommunicator& c) { return c.size(); }
-    static int rankOf(const dfb::InprocCommunicator& c) { return c.rank(); }
-#if defined(MPI_VERSION)
-    static int sizeOf(MPI_Comm c)
-    {
-        int size = 0;
-        MPI_Comm_size(c, &size);
-        return size;
-    }
-    static int rankOf(MPI_Comm c)
-    {
-        int rank = 0;
-        MPI_Comm_rank(c, &rank);
-        return rank;
-    }
-#endif
 };
 
 // In precision.cpp, so that the tests over MPI need not compile them again.

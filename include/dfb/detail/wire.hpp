@@ -51,11 +51,15 @@ static_assert(fragmentPrefix % 16 == 0, "pixels are read in place");
 
 inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
 
+inline WireFormat formatOf(const FragmentHeader& h, std::size_t channel)
+{
+    return channel == Color ? h.colorFormat : channel == Depth ? h.depthFormat : WireFormat::Float32;
+}
+
 // What a plane of so many pixels takes up in a message.
 inline std::size_t planeBytes(const FragmentHeader& h, std::size_t channel, std::size_t pixels)
 {
-    const WireFormat format = channel == Color ? h.colorFormat : channel == Depth ? h.depthFormat : WireFormat::Float32;
-    return (bytesOf(format) * static_cast<std::size_t>(channelWords[channel]) * pixels + 3) / 4 * 4;
+    return (bytesOf(formatOf(h, channel)) * static_cast<std::size_t>(channelWords[channel]) * pixels + 3) / 4 * 4;
 }
 inline std::size_t planesBytes(const FragmentHeader& h, std::size_t pixels)
 {
@@ -76,8 +80,7 @@ void transformPlanes(const FragmentHeader& h, std::size_t tableBytes, std::size_
     for (std::size_t c = 0; c < channelCount; ++c)
         if (hasChannel(h.channels, c)) {
             const std::size_t bytes = planeBytes(h, c, pixels);
-            const WireFormat format = c == Color ? h.colorFormat : c == Depth ? h.depthFormat : WireFormat::Float32;
-            transform(in + at, bytes, bytesOf(format), static_cast<std::size_t>(channelWords[c]), out + at);
+            transform(in + at, bytes, bytesOf(formatOf(h, c)), static_cast<std::size_t>(channelWords[c]), out + at);
             at += bytes;
         }
 }
