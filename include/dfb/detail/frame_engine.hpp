@@ -388,14 +388,18 @@ private:
     void undecodable(int source, const ErrorInfo& error) override
     {
         const std::exception_ptr reason = std::make_exception_ptr(Error(error));
-        if (gate_.enterAny()) {
-            const bool inTime = failWith(reason, messageFrom(source));
-            gate_.leave();
-            if (inTime)
+        {
+            const std::lock_guard<std::mutex> lock(strayMutex_); // begin() opens the gate and then looks at stray_
+            if (!gate_.enterAny()) {
+                stray_ = errorInfoOf(reason, messageFrom(source));
                 return;
+            }
         }
-        const std::lock_guard<std::mutex> lock(strayMutex_);
-        stray_ = errorInfoOf(reason, messageFrom(source));
+        if (!failWith(reason, messageFrom(source))) {
+            const std::lock_guard<std::mutex> lock(strayMutex_);
+            stray_ = errorInfoOf(reason, messageFrom(source));
+        }
+        gate_.leave(); // not before: the next begin() waits for it
     }
 
     static ErrorInfo messageFrom(int source)
