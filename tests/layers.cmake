@@ -6,7 +6,7 @@ cmake_minimum_required(VERSION 3.21)
 set(level_0 version.hpp fwd.hpp testing/reference.hpp)
 set(level_1 channels.hpp moments.hpp wire_format.hpp error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
-set(level_2 comm/byte_io.hpp comm/message.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
+set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
             comm/transport.hpp tbb_executor.hpp)
 set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)

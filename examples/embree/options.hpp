@@ -43,6 +43,7 @@ struct Options {
     int inFlight = 1; // frames that may be open at once
     int threads = 0;  // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
+    bool sharedMemory = true;
     OwnerMap ownerMap = OwnerMap::Lattice;
 
     int width = 1024, height = 1024;
@@ -237,6 +238,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                    "Threads per rank; default 0: the hardware threads of the machine, divided among its ranks")
         ->check(detail::number(0, 4096))
         ->option_text("N")
+        ->group(how);
+    bool noSharedMemory = false;
+    app.add_flag("--no-shared-memory", noSharedMemory,
+                 "Send all messages through MPI, also those between ranks of one node")
         ->group(how);
     app.add_option("--compression", options.compression, "Of messages between ranks; default none")
         ->transform(detail::choice({"none", "snappy"}))
@@ -438,6 +443,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     try {
         app.parse(argc, argv);
         options.fit = !noFit;
+        options.sharedMemory = !noSharedMemory;
         if (app.count("--size") > 0)
             detail::parseSize("--size", size, 65536, options.width, options.height);
         if (app.count("--wall") > 0)

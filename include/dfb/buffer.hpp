@@ -1,28 +1,43 @@
-// Buffer: a block of pooled, 64-byte aligned memory with one owner. MemoryPool: where blocks come from, with
-// the high-water mark of all it ever held.
+// Buffer: a block of 64-byte aligned memory with one owner. MemoryPool: where blocks come from, with the high-water
+// mark of all it ever held.
 #pragma once
 
 #include <dfb/version.hpp>
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <memory>
 #include <mutex>
 #include <new>
+#include <optional>
 #include <utility>
 #include <vector>
 
 namespace dfb {
 
-class MemoryPool;
+// Where a block goes when its Buffer ends. From any thread.
+class BlockOwner {
+public:
+    virtual void giveBack(std::byte* block, int sizeClass) noexcept = 0;
 
-// Move-only handle of a block. Its destructor gives the block back to its pool, from any thread.
+protected:
+    ~BlockOwner() = default;
+};
+
+// Move-only handle of a block. Its destructor gives the block back to its owner, from any thread.
 class Buffer {
 public:
     Buffer() = default;
+    // `sizeClass` is the owner's own affair.
+    Buffer(std::shared_ptr<BlockOwner> owner, std::byte* data, std::size_t size, int sizeClass) noexcept
+        : owner_(std::move(owner)), data_(data), size_(size), sizeClass_(sizeClass)
+    {
+    }
     Buffer(Buffer&& other) noexcept
-        : pool_(std::move(other.pool_)), data_(std::exchange(other.data_, nullptr)),
+        : owner_(std::move(other.owner_)), data_(std::exchange(other.data_, nullptr)),
           size_(std::exchange(other.size_, 0)), sizeClass_(other.sizeClass_)
     {
     }
@@ -34,11 +49,15 @@ public:
     }
     Buffer(const Buffer&) = delete;
     Buffer& operator=(const Buffer&) = delete;
-    inline ~Buffer();
+    ~Buffer()
+    {
+        if (data_)
+            owner_->giveBack(data_, sizeClass_);
+    }
 
     void swap(Buffer& other) noexcept
     {
-        std::swap(pool_, other.pool_);
+        std::swap(owner_, other.owner_);
         std::swap(data_, other.data_);
         std::swap(size_, other.size_);
         std::swap(sizeClass_, other.sizeClass_);
@@ -54,47 +73,66 @@ public:
 
 private:
     friend class MemoryPool;
-    Buffer(std::shared_ptr<MemoryPool> pool, std::byte* data, std::size_t size, int sizeClass)
-        : pool_(std::move(pool)), data_(data), size_(size), sizeClass_(sizeClass)
-    {
-    }
-
-    std::shared_ptr<MemoryPool> pool_;
+    std::shared_ptr<BlockOwner> owner_;
     std::byte* data_ = nullptr;
     std::size_t size_ = 0;
     int sizeClass_ = 0;
 };
 
+// Memory that other processes see as well, in which a pool may have its blocks; comm/node_memory.hpp is such. All
+// members may be called from any thread.
+class SharedMemory {
+public:
+    // A block that is never given back, 64-byte aligned; null if there is no more.
+    virtual std::byte* take(std::size_t byteCount) noexcept = 0;
+    virtual bool holds(const std::byte* block) const noexcept = 0;
+    // Of a block that it holds: who has it lends it to another process, and whether that one has not yet given it back.
+    virtual void lend(std::byte* block) noexcept = 0;
+    virtual bool isLent(const std::byte* block) const noexcept = 0;
+
+protected:
+    ~SharedMemory() = default;
+};
+
 // Free lists in size classes of 2^k and 3*2^(k-1) bytes. Blocks are kept until the last Buffer and the last
 // handle of the pool are gone. All members may be called from any thread.
-class MemoryPool : public std::enable_shared_from_this<MemoryPool> {
+class MemoryPool final : public BlockOwner, public std::enable_shared_from_this<MemoryPool> {
 public:
-    static std::shared_ptr<MemoryPool> create() { return std::shared_ptr<MemoryPool>(new MemoryPool); }
+    // `mayBeShared`: a transport may put its blocks into memory that other processes see.
+    static std::shared_ptr<MemoryPool> create(bool mayBeShared = true)
+    {
+        return std::shared_ptr<MemoryPool>(new MemoryPool(mayBeShared));
+    }
     MemoryPool(const MemoryPool&) = delete;
     MemoryPool& operator=(const MemoryPool&) = delete;
     ~MemoryPool()
     {
-        for (int c = 0; c < classCount; ++c)
-            for (std::byte* block : free_[static_cast<std::size_t>(c)])
-                ::operator delete (block, std::align_val_t{alignment});
+        for (SizeClass& sizeClass : classes_)
+            for (std::byte* block : sizeClass.free)
+                if (!shared_ || !shared_->holds(block))
+                    ::operator delete (block, std::align_val_t{alignment});
     }
 
     // A block of at least `byteCount` bytes, not cleared. Throws std::bad_alloc.
     Buffer acquire(std::size_t byteCount)
     {
         const int c = classOf(byteCount);
+        SizeClass& sizeClass = classes_[static_cast<std::size_t>(c)];
+        SharedMemory* shared = nullptr;
         std::byte* block = nullptr;
         {
             std::lock_guard<std::mutex> lock(mutex_);
-            auto& list = free_[static_cast<std::size_t>(c)];
-            if (!list.empty()) {
-                block = list.back();
-                list.pop_back();
-            } else {
-                list.reserve(++blockCount_[static_cast<std::size_t>(c)]); // so that giving back never throws
+            if (!sizeClass.free.empty()) {
+                block = sizeClass.free.back();
+                sizeClass.free.pop_back();
+            } else if (!(block = returned(sizeClass))) {
+                sizeClass.free.reserve(++sizeClass.blocks); // so that giving back never throws
                 heldBytes_ += bytesOf(c);
+                shared = bytesOf(c) >= smallestShared ? shared_.get() : nullptr;
             }
         }
+        if (!block && shared)
+            block = shared->take(bytesOf(c));
         if (!block)
             block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
         return Buffer(shared_from_this(), block, byteCount, c);
@@ -107,13 +145,46 @@ public:
         return heldBytes_;
     }
 
+    bool mayBeShared() const noexcept { return mayBeShared_; }
+
+    // From now on larger blocks are in `memory`, as far as it has room. Once.
+    void share(std::shared_ptr<SharedMemory> memory)
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        shared_ = std::move(memory);
+    }
+    std::shared_ptr<SharedMemory> shared() const
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        return shared_;
+    }
+
+    // Takes the block out of `buffer`, until another process, which is to be told where it is, has given it back. Null,
+    // and nothing happens, if it is not in shared memory.
+    std::byte* lend(Buffer& buffer)
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        if (buffer.owner_.get() != this || !shared_ || !shared_->holds(buffer.data_))
+            return nullptr;
+        classes_[static_cast<std::size_t>(buffer.sizeClass_)].lent.push_back(buffer.data_);
+        shared_->lend(buffer.data_);
+        buffer.size_ = 0;
+        return std::exchange(buffer.data_, nullptr);
+    }
+
 private:
-    friend class Buffer;
     static constexpr std::size_t alignment = 64;
     static constexpr std::size_t smallest = 256;
+    static constexpr std::size_t smallestShared = 2048;
     static constexpr int classCount = 2 * 48;
 
-    MemoryPool() = default;
+    struct SizeClass {
+        std::vector<std::byte*> free;
+        std::deque<std::byte*> lent; // the longest ago first
+        std::size_t blocks = 0;
+    };
+
+    explicit MemoryPool(bool mayBeShared) : mayBeShared_(mayBeShared) {}
 
     static std::size_t bytesOf(int c)
     {
@@ -129,22 +200,32 @@ private:
             throw std::bad_alloc();
         return c;
     }
-    void giveBack(std::byte* block, int c) noexcept
+
+    // A block that was lent and is back, or null. Does not look for it for long.
+    std::byte* returned(SizeClass& sizeClass)
     {
-        std::lock_guard<std::mutex> lock(mutex_);
-        free_[static_cast<std::size_t>(c)].push_back(block);
+        std::deque<std::byte*>& lent = sizeClass.lent;
+        for (std::size_t tries = std::min<std::size_t>(lent.size(), 8); tries > 0; --tries) {
+            std::byte* block = lent.front();
+            lent.pop_front();
+            if (!shared_->isLent(block))
+                return block;
+            lent.push_back(block);
+        }
+        return nullptr;
     }
 
+    void giveBack(std::byte* block, int c) noexcept override
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        classes_[static_cast<std::size_t>(c)].free.push_back(block);
+    }
+
+    const bool mayBeShared_;
     mutable std::mutex mutex_;
-    std::array<std::vector<std::byte*>, classCount> free_;
-    std::array<std::size_t, classCount> blockCount_{};
+    std::array<SizeClass, classCount> classes_;
+    std::shared_ptr<SharedMemory> shared_;
     std::uint64_t heldBytes_ = 0;
 };
-
-inline Buffer::~Buffer()
-{
-    if (data_)
-        pool_->giveBack(data_, sizeClass_);
-}
 
 } // namespace dfb

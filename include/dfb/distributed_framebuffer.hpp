@@ -116,7 +116,8 @@ public:
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(
-            std::make_shared<Messenger<Transport>>(communicator, MessengerOptions{config.progress, config.checksums}),
+            std::make_shared<Messenger<Transport>>(
+                communicator, MessengerOptions{config.progress, config.checksums, config.sharedMemory}),
             std::move(config), std::move(pixelOp))
     {
     }

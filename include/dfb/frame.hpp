@@ -46,6 +46,7 @@ struct FrameBufferConfig {
     // Of the messenger; a framebuffer that is given one goes by that one's.
     Progress progress = Progress::Thread;
     bool checksums = false; // a CRC-32C in each message: whoever does not trust the network pays for it
+    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.

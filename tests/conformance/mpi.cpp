@@ -4,10 +4,14 @@
 #include <dfb/testing/fault_transport.hpp>
 #include <dfb/testing/transport_conformance.hpp>
 
+#include <algorithm>
 #include <chrono>
 #include <cstddef>
+#include <cstring>
 #include <memory>
 #include <string>
+#include <utility>
+#include <vector>
 
 using namespace dfb;
 using testing::ConformanceOptions;
@@ -31,6 +35,14 @@ std::string check(const typename Transport::Communicator& communicator, const Co
     return testing::describeFailures(testing::checkTransport<Transport>(communicator, options));
 }
 
+// All messages go through MPI.
+struct Unshared : MpiTransport {
+    Unshared(const Communicator& communicator, std::shared_ptr<MemoryPool>, Progress progress)
+        : MpiTransport(communicator, MemoryPool::create(false), progress)
+    {
+    }
+};
+
 bool contains(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
 int rankCount()
@@ -49,6 +61,49 @@ TEST_CASE("MpiTransport keeps the contract")
     if (rankCount() > 3) // for the time it takes
         options.largestMessage = std::size_t{1} << 22;
     CHECK(check<MpiTransport>(MPI_COMM_WORLD, options) == "");
+    CHECK(check<Unshared>(MPI_COMM_WORLD, options) == "");
+}
+
+TEST_CASE("On one node blocks are lent, unless the pool may not be shared")
+{
+    struct Inbox : TransportHandler {
+        void receive(int source, Buffer&& message) override
+        {
+            sources.push_back(source);
+            messages.push_back(std::move(message));
+        }
+        void fail(const ErrorInfo&) override { isFailed = true; }
+        bool failed() const override { return isFailed; }
+        std::vector<int> sources;
+        std::vector<Buffer> messages;
+        bool isFailed = false;
+    };
+    int rank = 0;
+    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+    const int size = rankCount(), next = (rank + 1) % size;
+    constexpr std::size_t byteCount = 100000;
+    for (const bool mayBeShared : {true, false}) {
+        Inbox inbox;
+        const auto pool = MemoryPool::create(mayBeShared);
+        MpiTransport transport(MPI_COMM_WORLD, pool, Progress::Caller);
+        CHECK(transport.lendsTo(next) == (mayBeShared && size > 1)); // the tests' ranks are on one node
+        transport.start(inbox);
+        for (int i = 0; i < 3 && size > 1; ++i) {
+            Buffer message = pool->acquire(byteCount);
+            std::memset(message.data(), 10 * rank + i, byteCount);
+            transport.send(next, std::move(message));
+        }
+        transport.stop(true);
+        CHECK_FALSE(inbox.isFailed);
+        CHECK(inbox.messages.size() == (size > 1 ? 3u : 0u));
+        for (std::size_t i = 0; i < inbox.messages.size(); ++i) {
+            const Buffer& message = inbox.messages[i]; // of any of the 3: order is not promised
+            CHECK(inbox.sources[i] == (rank + size - 1) % size);
+            REQUIRE(message.size() == byteCount);
+            CHECK(std::to_integer<int>(message.data()[0]) / 10 == inbox.sources[i]);
+            CHECK(std::count(message.data(), message.data() + byteCount, message.data()[0]) == byteCount);
+        }
+    }
 }
 
 TEST_CASE("Messages that are late and out of order keep the contract")

@@ -112,6 +112,7 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
     for (const flood::NamedExecutor& e : executors())
         for (const From from : {From::Loop, From::Thread}) {
             auto config = floodConfig(256, e.make());
+            config.sharedMemory = from == From::Loop;
             config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
             config.displayRank = ranks - 1;
             AddingFrameBuffer fb(MPI_COMM_WORLD, config);
@@ -145,6 +146,7 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
                 auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
                 config.gather = gather;
                 config.progress = progress;
+                config.sharedMemory = gather == dfb::GatherMode::Batches;
                 AddingFrameBuffer fb(MPI_COMM_WORLD, config);
                 const auto report = floodFrame(fb, 2, From::Loop, longMs);
                 INFO(e.name);
@@ -154,13 +156,14 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
             }
 }
 
-TEST_CASE("Gathering at the end gives the same image bit for bit", "[messaging]")
+TEST_CASE("Gathering at the end, or all through MPI, gives the same image bit for bit", "[messaging]")
 {
     const Scene s = sceneFor(7, 3);
     std::vector<std::uint64_t> hashes;
-    for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd}) {
+    for (const bool shared : {true, false}) {
         auto config = configOf(s);
-        config.gather = gather;
+        config.gather = shared ? dfb::GatherMode::Batches : dfb::GatherMode::AtEnd;
+        config.sharedMemory = shared;
         dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config);
         for (int i = 0; i < 2; ++i) {
             const auto report = scene::renderLoop(fb, s, Loop::Declared);

@@ -56,6 +56,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.bricks == 0);
     CHECK(o.threads == 0);
     CHECK(o.compression == Compression::None);
+    CHECK(o.sharedMemory);
     CHECK(o.ownerMap == OwnerMap::Lattice);
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
@@ -116,10 +117,12 @@ TEST_CASE("Every option arrives", "[options]")
                                "--stats",
                                "s.json",
                                "--no-fit",
+                               "--no-shared-memory",
                                "c.obj",
                                "d.xyz"});
     CHECK(o.scene == std::vector<std::string>{"a.ply", "b_2x2x2_uint8.raw", "c.obj", "d.xyz"});
     CHECK_FALSE(o.fit);
+    CHECK_FALSE(o.sharedMemory);
     CHECK(o.mode == Mode::Image);
     CHECK(o.ranks == 7);
     CHECK(o.bricks == 9);
@@ -217,7 +220,7 @@ TEST_CASE("The help says it all", "[options]")
         CHECK(parsed.exitCode == 0);
         for (const std::string word :
              {"--mode",    "--ranks",  "--size",    "--frames", "--spp",         "--bricks",    "--seed",
-              "--threads", "--output", "--stats",   "--no-fit", "--compression", "--owner-map", "--early-termination",
+              "--threads", "--output", "--stats",   "--no-fit", "--compression", "--owner-map", "--early-termination", "--no-shared-memory",
               "--opacity", "--help",   "synthetic", "demo",     ".raw",          "_XxYxZ_",     "uint8",
               "uint16",    "float32",  ".ply",      ".obj",     ".xyz",          ".png",        ".pfm",
               "data",      "image",    "65536",     "mpiexec"}) {

@@ -30,6 +30,8 @@ namespace dfb {
 struct MessengerOptions {
     Progress progress = Progress::Thread;
     bool checksums = false; // each message carries a CRC-32C; must be the same on all ranks
+    // Ranks that see each other's memory hand messages over there.
+    bool sharedMemory = true;
 };
 
 namespace detail {
@@ -85,7 +87,7 @@ class Messenger final : private TransportHandler {
 public:
     // Collective, like the destructor. Throws TransportError.
     explicit Messenger(const typename Transport::Communicator& communicator, MessengerOptions options = {})
-        : options_(options), pool_(MemoryPool::create()), transport_(communicator, pool_, options.progress)
+        : options_(options), pool_(MemoryPool::create(options.sharedMemory)), transport_(communicator, pool_, options.progress)
     {
         transport_.start(*this);
         if (transport_.needsPolling() && options_.progress == Progress::Thread)

@@ -5,11 +5,13 @@
 // finalises MPI.
 //
 // Small messages to one rank travel together, in packets (comm/packet.hpp) of at most 8 KiB, which the libraries send
-// without asking the receiver first. A larger message is announced in a packet, and then sent on its own under the tag
-// that the announcement names, so that it goes straight into the block that the handler gets. Receives of packets are
-// posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
+// without asking the receiver first. A larger message is announced in a packet. To a rank of the same node the packet
+// says where it lies in memory that both see (comm/node_memory.hpp), and nothing is copied. Otherwise it is sent on its
+// own under the tag that the announcement names, so that it goes straight into the block that the handler gets.
+// Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
 #pragma once
 
+#include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 
@@ -116,9 +118,9 @@ public:
         MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found);
         lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
 
-        findCrowding();
-
         peers_.resize(static_cast<std::size_t>(size_));
+        meetNode();
+
         packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
         packets_ = pool_->acquire(detail::packetBytes * postedPackets);
         try {
@@ -146,6 +148,8 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
+    // Whether messages to that rank stay where they are, in memory that it sees.
+    bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
     bool needsPolling() const noexcept { return true; }
     // At MPI_THREAD_FUNNELED only the thread that initialised MPI, above that any.
     bool mayPoll() const noexcept
@@ -195,22 +199,68 @@ public:
     }
 
 private:
-    // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
-    // each wakes up so often, and takes the core from all others that often.
-    void findCrowding()
+    // What a rank tells all others at the beginning.
+    struct Card {
+        std::uint64_t host;
+        detail::NodeMemory::Address memory;
+    };
+
+    // Finds the ranks of this node, and shares memory with those that it can be shared with.
+    void meetNode()
     {
         char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
         int length = 0;
         MPI_Get_processor_name(host, &length);
-        const std::uint64_t mine = std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length)));
-        std::vector<std::uint64_t> all(static_cast<std::size_t>(size_));
+        const auto memory = memoryToShare();
+        const Card mine{std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
+                        memory ? memory->address() : detail::NodeMemory::Address()};
+        std::vector<Card> all(static_cast<std::size_t>(size_));
         MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Iallgather(&mine, 1, MPI_UINT64_T, all.data(), 1, MPI_UINT64_T, comm_, &request), "MPI_Iallgather");
+        check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
+              "MPI_Iallgather");
         for (detail::Patience patience; !completed(request);)
             patience.nap();
-        const auto here = std::count(all.begin(), all.end(), mine);
+        const auto isHere = [&](const Card& card) { return card.host == mine.host; };
+        findCrowding(std::count_if(all.begin(), all.end(), isHere));
+
+        // Each tells the others whose memory it sees.
+        std::vector<std::uint8_t> sees(all.size()), seen(all.size());
+        std::vector<MPI_Request> requests;
+        for (int other = 0; other < size_; ++other) {
+            const auto i = static_cast<std::size_t>(other);
+            if (other == rank_ || !isHere(all[i]) || !memory || all[i].memory.process == 0)
+                continue;
+            peers_[i].itsMemory = detail::NodeMemory::open(all[i].memory);
+            sees[i] = peers_[i].itsMemory != nullptr;
+            requests.resize(requests.size() + 2, MPI_REQUEST_NULL);
+            check(MPI_Irecv(&seen[i], 1, MPI_BYTE, other, lastTag_ + 1, comm_, &*(requests.end() - 2)), "MPI_Irecv");
+            check(MPI_Isend(&sees[i], 1, MPI_BYTE, other, lastTag_ + 1, comm_, &requests.back()), "MPI_Isend");
+        }
+        for (detail::Patience patience; !completed(requests);)
+            patience.nap();
+        for (std::size_t i = 0; i < all.size(); ++i)
+            peers_[i].seesMine = seen[i] != 0;
+        if (std::count(seen.begin(), seen.end(), 1) > 0) {
+            memory_ = memory;
+            pool_->share(memory);
+        }
+    }
+
+    std::shared_ptr<detail::NodeMemory> memoryToShare() const
+    {
+        if (size_ == 1 || !pool_->mayBeShared())
+            return nullptr;
+        if (const auto has = std::dynamic_pointer_cast<detail::NodeMemory>(pool_->shared()))
+            return has; // of another transport with this pool
+        return detail::NodeMemory::create();
+    }
+
+    // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
+    // each wakes up so often, and takes the core from all others that often.
+    void findCrowding(std::ptrdiff_t ranksHere)
+    {
         const auto cores = static_cast<std::ptrdiff_t>(std::max(1u, std::thread::hardware_concurrency()));
-        const std::ptrdiff_t ranksPerCore = 4 * here / cores; // in quarters
+        const std::ptrdiff_t ranksPerCore = 4 * ranksHere / cores; // in quarters
         crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
@@ -264,10 +314,13 @@ private:
         int inFlight = 0; // sends to it that have not completed
         int tag = 0;      // the last one used
         bool listed = false, addressed = false;
+        std::shared_ptr<detail::NodeMemory> itsMemory; // if it is on this node
+        bool seesMine = false;                         // my memory
     };
 
     // More would not be faster, but every poll() looks at each.
     static constexpr int sendsPerPeer = 32;
+    static constexpr std::size_t smallestLent = 2048; // to copy less is quicker
     static constexpr std::size_t bodiesAtOnce = 64;
 
     void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
@@ -341,6 +394,14 @@ private:
         return done != 0;
     }
 
+    bool completed(std::vector<MPI_Request>& requests) const
+    {
+        int done = 0;
+        check(MPI_Testall(static_cast<int>(requests.size()), requests.data(), &done, MPI_STATUSES_IGNORE),
+              "MPI_Testall");
+        return done != 0;
+    }
+
     bool move()
     {
         const bool started = !leaving_ && startSends();
@@ -391,16 +452,25 @@ private:
             return false;
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
-            const bool isSmall = detail::PacketWriter::canHold(message.size());
-            const std::size_t payloadBytes = isSmall ? message.size() : 0;
+            const std::size_t byteCount = message.size();
+            if (peer.seesMine && byteCount >= smallestLent) {
+                if (const std::byte* lent = pool_->lend(message)) {
+                    if (!packet_.hasRoom(0))
+                        sendPacket(destination);
+                    packet_.add({byteCount, memory_->placeOf(lent), Record::Lent}, nullptr, 0);
+                    continue;
+                }
+            }
+            const bool isSmall = detail::PacketWriter::canHold(byteCount);
+            const std::size_t payloadBytes = isSmall ? byteCount : 0;
             if (!packet_.hasRoom(payloadBytes))
                 sendPacket(destination);
             if (isSmall) {
-                packet_.add({message.size(), 0, Record::Message}, message.data(), payloadBytes);
+                packet_.add({byteCount, 0, Record::Message}, message.data(), payloadBytes);
                 continue;
             }
             peer.tag = peer.tag % lastTag_ + 1;
-            packet_.add({message.size(), peer.tag, Record::Announcement}, nullptr, 0);
+            packet_.add({byteCount, peer.tag, Record::Announcement}, nullptr, 0);
             bodies_.push_back({std::move(message), 0, destination, peer.tag});
             ++peer.inFlight;
         }
@@ -484,6 +554,14 @@ private:
                 const auto payloadBytes = static_cast<std::size_t>(record.byteCount);
                 if (record.kind == Record::Announcement) {
                     announced_.push({source, record.tag, record.byteCount});
+                } else if (record.kind == Record::Lent) {
+                    Peer& peer = peers_[static_cast<std::size_t>(source)];
+                    Buffer message = peer.itsMemory ? peer.itsMemory->borrow(record.tag, record.byteCount) : Buffer();
+                    if (message.empty())
+                        throw TransportError("rank " + std::to_string(source)
+                                                 + " has lent a block that is not in the memory of this node",
+                                             rank_);
+                    deliver(source, std::move(message));
                 } else if (record.kind == Record::Failure) {
                     failAsTold(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
                 } else {
@@ -628,13 +706,7 @@ private:
             goodbyes.push_back(MPI_REQUEST_NULL);
             check(MPI_Issend(nullptr, 0, MPI_BYTE, peer, 0, comm_, &goodbyes.back()), "MPI_Issend");
         }
-        const auto said = [&] {
-            int done = 0;
-            check(MPI_Testall(static_cast<int>(goodbyes.size()), goodbyes.data(), &done, MPI_STATUSES_IGNORE),
-                  "MPI_Testall");
-            return done != 0;
-        };
-        if (!moveUntil(said) || !barrier())
+        if (!moveUntil([&] { return completed(goodbyes); }) || !barrier())
             return false;
         // A receive that can not be cancelled any more has a packet.
         cancelPackets([this](int slot, std::size_t byteCount) {
@@ -685,6 +757,7 @@ private:
     }
 
     std::shared_ptr<MemoryPool> pool_;
+    std::shared_ptr<detail::NodeMemory> memory_; // of the pool, if another rank sees it
     TransportHandler* handler_ = nullptr;
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1, lastTag_ = 1;

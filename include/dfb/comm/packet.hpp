@@ -1,5 +1,6 @@
 // Packets: several small messages to one rank as one message of the network. Each stands behind a record; a large
-// message, which travels by itself, leaves its record alone as an announcement.
+// message leaves its record alone: as an announcement, if it travels by itself, or with the place where it lies, if the
+// receiver sees that.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -13,9 +14,9 @@
 namespace dfb::detail {
 
 struct PacketRecord {
-    enum Kind : std::uint32_t { Message, Announcement, Failure };
+    enum Kind : std::uint32_t { Message, Announcement, Lent, Failure };
     std::uint64_t byteCount;
-    std::int32_t tag; // of an announced message
+    std::int32_t tag; // of an announced message; of a lent one, where it lies
     Kind kind;
 };
 static_assert(sizeof(PacketRecord) == 16);
@@ -64,7 +65,7 @@ private:
     std::size_t used_ = 0;
 };
 
-// Calls `visit(record, payload)` for each record; an announcement has no payload. False if the bytes, which need not be
+// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the bytes, which need not be
 // trusted, are no packet: then what came before has been visited. An empty packet is one.
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
@@ -79,7 +80,7 @@ bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
         left -= step;
         if (record.kind > PacketRecord::Failure)
             return false;
-        if (record.kind == PacketRecord::Announcement) {
+        if (record.kind == PacketRecord::Announcement || record.kind == PacketRecord::Lent) {
             if (record.tag < 1 || record.byteCount == 0)
                 return false;
             visit(record, static_cast<const std::byte*>(nullptr));

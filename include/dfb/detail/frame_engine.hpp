@@ -44,6 +44,7 @@ public:
     {
         config_.progress = messenger->options().progress;
         config_.checksums = messenger->options().checksums;
+        config_.sharedMemory = messenger->options().sharedMemory;
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
         MessageHandler& self = *this;
         messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,

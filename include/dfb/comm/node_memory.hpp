@@ -1,0 +1,195 @@
+// NodeMemory: memory that the processes of one node all see, so that messages between them are not copied: the sender
+// tells where a block lies, and the receiver reads it there and gives it back.
+//
+// It has no name in the file system that could be left behind: others reach it through the process that made it, and it
+// is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at another, there
+// is none.
+#pragma once
+
+#include <dfb/buffer.hpp>
+
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <mutex>
+#include <random>
+#include <string>
+#include <utility>
+
+#if defined(__linux__)
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+#endif
+
+namespace dfb::detail {
+
+class NodeMemory final : public SharedMemory, public BlockOwner, public std::enable_shared_from_this<NodeMemory> {
+public:
+    // How another process of the node finds it. All 0: not at all.
+    struct Address {
+        std::int64_t process = 0, file = 0;
+        std::uint64_t secret[2] = {}; // to know that it is this one
+    };
+
+    // What one process has at most; only what is used takes memory.
+    static constexpr std::size_t capacity = std::size_t{1} << 30;
+    static constexpr std::size_t alignment = 64;
+
+    // Null if the system has none.
+    static std::shared_ptr<NodeMemory> create()
+    {
+#if defined(MFD_CLOEXEC)
+        const int file = sizeof(void*) < 8 ? -1 : memfd_create("dfb", MFD_CLOEXEC);
+        if (file < 0)
+            return nullptr;
+        std::byte* base = ftruncate(file, static_cast<off_t>(capacity)) == 0 ? map(file) : nullptr;
+        if (!base || !allocate(file, 0, step)) {
+            unmap(base);
+            close(file);
+            return nullptr;
+        }
+        std::shared_ptr<NodeMemory> memory(new NodeMemory(base, file));
+        std::random_device random;
+        for (std::uint64_t& word : memory->address_.secret)
+            word = (std::uint64_t{random()} << 32 | random()) | 1;
+        memory->address_.process = getpid();
+        memory->address_.file = file;
+        std::memcpy(base, memory->address_.secret, sizeof memory->address_.secret);
+        return memory;
+#else
+        return nullptr;
+#endif
+    }
+
+    // That of another process, or of this one, in which blocks are only given back; null if it can not be reached.
+    static std::shared_ptr<NodeMemory> open(const Address& address)
+    {
+#if defined(MFD_CLOEXEC)
+        if (address.process == 0)
+            return nullptr;
+        const std::string path = "/proc/" + std::to_string(address.process) + "/fd/" + std::to_string(address.file);
+        const int file = ::open(path.c_str(), O_RDWR | O_CLOEXEC);
+        if (file < 0)
+            return nullptr;
+        struct stat status;
+        const bool fits = fstat(file, &status) == 0 && status.st_size == static_cast<off_t>(capacity);
+        std::byte* base = fits ? map(file) : nullptr;
+        close(file);
+        if (base && std::memcmp(base, address.secret, sizeof address.secret) != 0) {
+            unmap(base);
+            base = nullptr;
+        }
+        return base ? std::shared_ptr<NodeMemory>(new NodeMemory(base, -1)) : nullptr;
+#else
+        (void)address;
+        return nullptr;
+#endif
+    }
+
+    NodeMemory(const NodeMemory&) = delete;
+    NodeMemory& operator=(const NodeMemory&) = delete;
+    ~NodeMemory()
+    {
+        unmap(base_);
+#if defined(MFD_CLOEXEC)
+        if (file_ >= 0)
+            close(file_);
+#endif
+    }
+
+    const Address& address() const noexcept { return address_; }
+
+    std::byte* take(std::size_t byteCount) noexcept override
+    {
+        const std::size_t bytes = (sizeof(State) + byteCount + alignment - 1) / alignment * alignment;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (file_ < 0 || byteCount > capacity || used_ + bytes > capacity)
+            return nullptr;
+        if (used_ + bytes > allocated_) {
+            // Asked for beforehand: without, to find none when it is first written to would end the process.
+            const std::size_t more = (used_ + bytes - allocated_ + step - 1) / step * step;
+            if (allocated_ + more > capacity || !allocate(file_, allocated_, more))
+                return nullptr;
+            allocated_ += more;
+        }
+        std::byte* block = base_ + used_ + sizeof(State);
+        used_ += bytes;
+        new (block - sizeof(State)) State;
+        return block;
+    }
+
+    bool holds(const std::byte* block) const noexcept override { return block >= base_ && block < base_ + capacity; }
+    void lend(std::byte* block) noexcept override { stateOf(block).isLent.store(1, std::memory_order_relaxed); }
+    bool isLent(const std::byte* block) const noexcept override
+    {
+        return stateOf(block).isLent.load(std::memory_order_acquire) != 0;
+    }
+
+    // Where a block lies, in units of `alignment`, for others; and what another process has lent of its memory: the
+    // first `byteCount` bytes of the block there, to be given back by the Buffer's end. Empty if there can be none.
+    std::int32_t placeOf(const std::byte* block) const noexcept
+    {
+        return static_cast<std::int32_t>(static_cast<std::size_t>(block - base_) / alignment);
+    }
+    Buffer borrow(std::int32_t place, std::uint64_t byteCount)
+    {
+        const std::size_t offset = place < 2 ? capacity : static_cast<std::size_t>(place) * alignment;
+        if (offset > capacity || byteCount > capacity - offset || !isLent(base_ + offset))
+            return Buffer();
+        return Buffer(shared_from_this(), base_ + offset, static_cast<std::size_t>(byteCount), 0);
+    }
+
+private:
+    // In front of each block.
+    struct alignas(alignment) State {
+        std::atomic<std::uint32_t> isLent{0};
+    };
+    static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(State) == alignment);
+    static_assert(capacity / alignment <= std::size_t{1} << 31);
+    static constexpr std::size_t step = std::size_t{1} << 20; // by which it grows
+
+    NodeMemory(std::byte* base, int file) : base_(base), file_(file), allocated_(file < 0 ? 0 : step) {}
+
+    State& stateOf(const std::byte* block) const noexcept
+    {
+        const std::size_t offset = static_cast<std::size_t>(block - base_) - sizeof(State);
+        return *reinterpret_cast<State*>(base_ + offset);
+    }
+
+    void giveBack(std::byte* block, int) noexcept override
+    {
+        stateOf(block).isLent.store(0, std::memory_order_release);
+    }
+
+#if defined(MFD_CLOEXEC)
+    static std::byte* map(int file)
+    {
+        void* base = mmap(nullptr, capacity, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_NORESERVE, file, 0);
+        return base == MAP_FAILED ? nullptr : static_cast<std::byte*>(base);
+    }
+    static bool allocate(int file, std::size_t offset, std::size_t byteCount)
+    {
+        return posix_fallocate(file, static_cast<off_t>(offset), static_cast<off_t>(byteCount)) == 0;
+    }
+    static void unmap(std::byte* base)
+    {
+        if (base)
+            munmap(base, capacity);
+    }
+#else
+    static bool allocate(int, std::size_t, std::size_t) { return false; }
+    static void unmap(std::byte*) {}
+#endif
+
+    std::byte* const base_;
+    const int file_; // -1: of another process
+    Address address_;
+    std::mutex mutex_;
+    std::size_t used_ = alignment, allocated_; // the first bytes are the secret; under mutex_
+};
+
+} // namespace dfb::detail

@@ -1,0 +1,143 @@
+// NodeMemory: blocks are seen by other processes, come back when those let go of them, and no more is believed of an
+// address or a place than is true.
+#include "catch.hpp"
+
+#include <dfb/comm/node_memory.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <set>
+#include <utility>
+#include <vector>
+
+#if defined(__linux__)
+#include <sys/wait.h>
+#include <unistd.h>
+
+using dfb::Buffer;
+using dfb::MemoryPool;
+using dfb::detail::NodeMemory;
+
+namespace {
+
+struct SharedPool {
+    SharedPool() { pool->share(memory); }
+    std::shared_ptr<NodeMemory> memory = NodeMemory::create();
+    std::shared_ptr<MemoryPool> pool = MemoryPool::create();
+    std::shared_ptr<NodeMemory> seen = NodeMemory::open(memory->address());
+};
+
+} // namespace
+
+TEST_CASE("What one process writes another reads in the same place, and gives back", "[memory]")
+{
+    SharedPool s;
+    Buffer buffer = s.pool->acquire(100000);
+    std::memset(buffer.data(), 7, buffer.size());
+    const std::byte* block = s.pool->lend(buffer);
+    REQUIRE(block);
+    CHECK(buffer.empty());
+    const std::int32_t place = s.memory->placeOf(block);
+    CHECK(s.memory->isLent(block));
+    const pid_t child = fork();
+    if (child == 0) { // no assertions here: they would be the parent's
+        const auto memory = NodeMemory::open(s.memory->address());
+        int code = 1;
+        if (memory) {
+            const Buffer borrowed = memory->borrow(place, 100000);
+            std::size_t right = 0;
+            for (std::size_t i = 0; i < borrowed.size(); ++i)
+                right += borrowed.data()[i] == std::byte{7};
+            code = right == 100000 ? 0 : 2;
+        }
+        _exit(code);
+    }
+    int status = -1;
+    REQUIRE(waitpid(child, &status, 0) == child);
+    CHECK(WIFEXITED(status));
+    CHECK(WEXITSTATUS(status) == 0);
+    CHECK_FALSE(s.memory->isLent(block));
+    CHECK(s.pool->acquire(100000).data() == block); // used again
+}
+
+TEST_CASE("A block is not used again before it is back, whoever lets go of it", "[memory]")
+{
+    SharedPool s;
+    REQUIRE(s.seen);
+    std::vector<Buffer> borrowed;
+    std::set<const std::byte*> lent;
+    for (int i = 0; i < 20; ++i) {
+        Buffer buffer = s.pool->acquire(5000);
+        std::memset(buffer.data(), i, buffer.size());
+        const std::byte* block = s.pool->lend(buffer);
+        REQUIRE(block);
+        CHECK(lent.insert(block).second);
+        borrowed.push_back(s.seen->borrow(s.memory->placeOf(block), 5000));
+        REQUIRE(borrowed.back().size() == 5000);
+        CHECK(borrowed.back().data() != block); // mapped once more
+    }
+    for (int i = 0; i < 20; ++i)
+        CHECK(borrowed[static_cast<std::size_t>(i)].data()[4999] == static_cast<std::byte>(i));
+    const std::uint64_t peak = s.pool->peakBytes();
+    borrowed.erase(borrowed.begin(), borrowed.begin() + 10);
+    std::vector<Buffer> again;
+    for (int i = 0; i < 10; ++i) {
+        again.push_back(s.pool->acquire(5000));
+        CHECK(lent.count(again.back().data()) == 1);
+    }
+    CHECK(s.pool->peakBytes() == peak);
+    CHECK(lent.count(s.pool->acquire(5000).data()) == 0);
+    for (const Buffer& b : borrowed)
+        CHECK(b.data()[0] >= std::byte{10});
+
+    // What is borrowed outlives the lender's pool and mapping.
+    s.pool.reset();
+    s.memory.reset();
+    again.clear();
+    s.seen.reset();
+    CHECK(borrowed.back().data()[4999] == std::byte{19});
+}
+
+TEST_CASE("Blocks that nobody else sees are not lent", "[memory]")
+{
+    const auto plain = MemoryPool::create();
+    Buffer buffer = plain->acquire(100000);
+    CHECK(plain->lend(buffer) == nullptr);
+    CHECK(buffer.size() == 100000);
+    SharedPool s;
+    CHECK(s.pool->lend(buffer) == nullptr); // of another pool
+    Buffer small = s.pool->acquire(100);
+    CHECK(s.pool->lend(small) == nullptr);
+    CHECK(small.size() == 100);
+    Buffer huge = s.pool->acquire(NodeMemory::capacity); // there is not so much of it, so the pool takes other memory
+    CHECK(s.pool->lend(huge) == nullptr);
+    CHECK(s.memory->take(NodeMemory::capacity) == nullptr);
+    CHECK(s.memory->take(~std::size_t{0}) == nullptr);
+}
+
+TEST_CASE("A wrong address or place is not believed", "[memory]")
+{
+    SharedPool s;
+    NodeMemory::Address address = s.memory->address();
+    CHECK_FALSE(NodeMemory::open({}));
+    address.secret[1] ^= 1;
+    CHECK_FALSE(NodeMemory::open(address));
+    address = s.memory->address();
+    address.file = 100000;
+    CHECK_FALSE(NodeMemory::open(address));
+    address.file = 0; // another file of this process
+    CHECK_FALSE(NodeMemory::open(address));
+
+    Buffer buffer = s.pool->acquire(4096);
+    const std::int32_t place = s.memory->placeOf(buffer.data());
+    CHECK(s.seen->borrow(place, 4096).empty()); // not lent
+    CHECK(s.pool->lend(buffer));
+    for (const std::int32_t wrong : {-1, 0, 1, 1 << 24, (1 << 24) - 1, 2147483647})
+        CHECK(s.seen->borrow(wrong, 4096).empty());
+    CHECK(s.seen->borrow(place, NodeMemory::capacity).empty());
+    CHECK(s.seen->borrow(place, ~std::uint64_t{0}).empty());
+    CHECK(s.seen->borrow(place, 4096).size() == 4096);
+}
+#endif
