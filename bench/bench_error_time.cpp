@@ -47,7 +47,7 @@ struct System {
     Result result{};
 };
 
-// ---- dfb: inputs that are ready are copied into tiles
+// ---- dfb: inputs that are ready are read where they are
 
 // The boxes of bricks are in pixels.
 struct PixelCamera {
@@ -114,18 +114,13 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& mess
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
         s.frame = [r, from = &image, order] {
-            const auto renderBrick = [from](const dfb::Brick&, auto& tile) {
-                const dfb::Region& region = tile.region;
-                const auto width = static_cast<std::size_t>(region.width());
-                for (int y = 0; y < region.height(); ++y) {
-                    const std::size_t first =
-                        static_cast<std::size_t>(region.y0 + y) * static_cast<std::size_t>(from->width)
-                        + static_cast<std::size_t>(region.x0);
-                    std::memcpy(tile.pixel(0, y), &from->rgba[4 * first], 4 * sizeof(float) * width);
-                    if constexpr (!isOrdered<TileOp>)
-                        std::memcpy(tile.depth + y * TileOp::tileSize, &from->depth[first], sizeof(float) * width);
-                }
-            };
+            const auto renderBrick = dfb::inPlace([from](const dfb::Brick&, auto& view) {
+                view.stride = static_cast<std::size_t>(from->width);
+                const std::size_t first = static_cast<std::size_t>(view.region.y0) * view.stride
+                                          + static_cast<std::size_t>(view.region.x0);
+                view.color = &from->rgba[4 * first];
+                view.depth = &from->depth[first];
+            });
             if constexpr (isOrdered<TileOp>) {
                 std::vector<int> places; // of bricks in the shared world, which has them by id
                 for (const int rank : order)

@@ -14,10 +14,10 @@ set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
             testing/transport_conformance.hpp image.hpp render/world.hpp)
 set(level_5 tile.hpp render/footprint.hpp)
 set(level_6 deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
-set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/wire.hpp detail/wire_losses.hpp render/visibility.hpp)
-set(level_8 pixel_op.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
-            detail/final_gather.hpp detail/tile_table.hpp testing/tile_op_test.hpp detail/verdict.hpp)
-set(level_9 ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
+set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
+set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
+            detail/tile_table.hpp detail/verdict.hpp)
+set(level_9 detail/final_gather.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
             testing/adversarial.hpp testing/verified.hpp detail/frame_figures.hpp detail/outcome.hpp)
 set(level_10 detail/tile_pipeline.hpp)
 set(level_11 detail/frame_engine.hpp)

@@ -32,6 +32,7 @@ public:
     using Config = FrameBufferConfig;
     using Communicator = typename Transport::Communicator;
     using Tile = typename Engine::Tile;
+    using TileView = typename Engine::TileView;
     using TileFrameData = typename Engine::TileFrameData;
     using PixelFrameData = typename Engine::PixelFrameData;
 
@@ -51,6 +52,8 @@ public:
         // Makes `tile` this frame's tile of that index and pass: all pixels cleared, generation 0, no children, source
         // this rank, part 0. Throws InvalidArgument for an index or a pass that the frame does not have.
         void start(Tile& tile, int tileIndex, int pass = 0) const { engine_->start(tile, tileIndex, pass); }
+        // The same for a view, of nothing yet.
+        void start(TileView& tile, int tileIndex, int pass = 0) const { engine_->start(tile, tileIndex, pass); }
 
         // Hands over a rendered tile; the active pixels leave for the owner at once, and `tile` can be used again.
         // From any thread. Waits only while this rank has more under way than messagePoolBytes, and meanwhile runs
@@ -59,6 +62,9 @@ public:
         // not have, a negative generation or number of children. What is wrong with it as an input comes out of end().
         // In a frame that has failed: does nothing.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
+        // The same for pixels that lie elsewhere, and are not looked at any more when it returns. Throws
+        // InvalidArgument, too, if a channel that has to travel is null.
+        void setTile(const TileView& tile) { engine_->setTile(tile); }
 
         // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
         // children that these announce need no declaration; it may say so after it sent some. A rank without any calls

@@ -186,6 +186,36 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
 
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
+    static constexpr std::size_t rowStride() noexcept { return Size; }
+};
+
+// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself: they are read there, and are
+// as those of a Tile. All pointers are to the first pixel of the region; what is not read may be null: channels that
+// neither the operation nor the image needs. Without colour there is nothing in the tile.
+template <ChannelMask Channels, int Size>
+struct TileView : TileHeader {
+    static constexpr int size = Size;
+    static constexpr ChannelMask channels = Channels;
+
+    std::size_t stride = 0; // from a row to the next, in pixels
+    const float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
+    const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
+    const float* farDepth = nullptr;
+
+    detail::ConstPlanes planes() const noexcept
+    {
+        const void* const all[detail::channelCount] = {color,    depth,       normal,     albedo,
+                                                       position, primitiveId, instanceId, farDepth};
+        detail::ConstPlanes p;
+        for (std::size_t c = 0; c < detail::channelCount; ++c)
+            p.at[c] = static_cast<const std::byte*>(all[c]);
+        return p;
+    }
+    const float* pixel(int x, int y) const noexcept
+    {
+        return color + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
+    }
+    std::size_t rowStride() const noexcept { return stride; }
 };
 
 } // namespace dfb

@@ -33,6 +33,7 @@ class FrameEngine final : private MessageHandler {
 public:
     using Pipeline = TilePipeline<TileOp, PixelOp>;
     using Tile = typename Pipeline::Tile;
+    using TileView = typename Pipeline::TileView;
     using TileFrameData = typename FrameDataOf<TileOp>::type;
     using PixelFrameData = typename FrameDataOf<PixelOp>::type;
     using Bytes = ReductionTable::Bytes;
@@ -170,10 +171,16 @@ public:
             applyDeclarations();
     }
 
-    void start(Tile& tile, int index, int pass) const { pipeline_->start(tile, index, pass); }
-
-    void setTile(const Tile& tile)
+    template <class AnyTile>
+    void start(AnyTile& tile, int index, int pass) const
     {
+        pipeline_->start(tile, index, pass);
+    }
+
+    template <class AnyTile>
+    void setTile(const AnyTile& tile)
+    {
+        pipeline_->checkPlanes(tile);
         checkTile(tile, layout(), pipeline_->table().frameInfo(),
                   [this](int index) { return pipeline_->table().samples(index).count; });
         if (outcome_->failed())

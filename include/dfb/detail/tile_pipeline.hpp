@@ -32,6 +32,7 @@ template <class TileOp, class PixelOp>
 class TilePipeline {
 public:
     using Tile = dfb::Tile<TileOp::channels, TileSizeOf<TileOp>::value>;
+    using TileView = dfb::TileView<TileOp::channels, TileSizeOf<TileOp>::value>;
 
     // Throws InvalidArgument for a configuration that can not be.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, PixelOp pixelOp, int rank,
@@ -93,6 +94,28 @@ public:
     // Makes `tile` a cleared tile of this frame. Throws InvalidArgument.
     void start(Tile& tile, int index, int pass) const
     {
+        static_cast<TileHeader&>(tile) = headerOf(index, pass);
+        tile.clear(travelling(config_));
+    }
+    void start(TileView& tile, int index, int pass) const
+    {
+        tile = TileView();
+        static_cast<TileHeader&>(tile) = headerOf(index, pass);
+    }
+
+    // Throws InvalidArgument if there is a colour but not what else has to travel.
+    void checkPlanes(const Tile&) const {}
+    void checkPlanes(const TileView& tile) const
+    {
+        const ConstPlanes planes = tile.planes();
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (tile.color && !planes.at[c] && hasChannel(travelling(config_), c))
+                throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without channel "
+                                      + std::to_string(c) + ", which is needed");
+    }
+
+    TileHeader headerOf(int index, int pass) const
+    {
         const TileInfo& frame = table_.frameInfo();
         if (index < 0 || index >= table_.layout().tileCount())
             throw InvalidArgument("tile " + std::to_string(index) + " of an image of "
@@ -107,12 +130,12 @@ public:
         header.pass = pass;
         header.sample = samples.first + pass;
         header.source = static_cast<std::uint32_t>(frame.rank);
-        static_cast<TileHeader&>(tile) = header;
-        tile.clear(travelling(config_));
+        return header;
     }
 
     // The message for a tile that has been checked; compressed only if it travels.
-    Buffer encode(const Tile& tile)
+    template <class AnyTile>
+    Buffer encode(const AnyTile& tile)
     {
         const FloatEnvironment floatEnvironment;
         InputFaults faults;

@@ -11,6 +11,7 @@
 
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/message.hpp>
+#include <dfb/detail/active_pixels.hpp>
 #include <dfb/detail/plane_filter.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/tile_layout.hpp>
@@ -95,84 +96,6 @@ inline std::size_t largestFragment(int tileSize, ChannelMask channels)
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * side) + pixels * perPixel;
 }
 
-// The active pixels of a tile: those with any colour channel that is not 0. A pixel of colour 0 and alpha 0
-// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does.
-struct ActiveSpans {
-    std::vector<std::uint16_t> rowCounts; // of rows [rowBegin, rowEnd)
-    std::vector<Span> spans;
-    int rowBegin = 0, rowEnd = 0;
-    std::uint32_t pixels = 0;
-
-    template <class TileType>
-    void find(const TileType& tile)
-    {
-        rowCounts.clear();
-        spans.clear();
-        rowBegin = rowEnd = 0;
-        pixels = 0;
-        const int width = tile.region.width(), height = tile.region.height();
-        for (int y = 0; y < height; ++y) {
-            const std::size_t before = spans.size();
-            const float* row = tile.pixel(0, y);
-            const auto active = [row](int x) { // all bits but the signs
-                std::uint64_t halves[2];
-                std::memcpy(halves, row + 4 * x, sizeof halves);
-                return ((halves[0] | halves[1]) & 0x7fffffff7fffffffu) != 0;
-            };
-            for (int x = 0; x < width;) {
-                while (x < width && !active(x))
-                    ++x;
-                const int begin = x;
-                while (x + 4 <= width && active(x) & active(x + 1) & active(x + 2) & active(x + 3))
-                    x += 4;
-                while (x < width && active(x))
-                    ++x;
-                if (x > begin) {
-                    spans.push_back({static_cast<std::uint16_t>(begin), static_cast<std::uint16_t>(x - begin)});
-                    pixels += static_cast<std::uint32_t>(x - begin);
-                }
-            }
-            const auto count = static_cast<std::uint16_t>(spans.size() - before);
-            if (count > 0 && rowEnd == 0)
-                rowBegin = y;
-            if (count > 0)
-                rowEnd = y + 1;
-            if (rowEnd > 0)
-                rowCounts.push_back(count);
-        }
-        rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin));
-    }
-};
-
-// `planes`: of a tile of this type, those that travel.
-template <class TileType>
-bool isConstant(const TileType& tile, const ConstPlanes& planes)
-{
-    const auto size = static_cast<std::size_t>(TileType::size);
-    for (int y = 0; y < tile.region.height(); ++y)
-        for (std::size_t c = 0; c < channelCount; ++c) {
-            if (!planes.at[c])
-                continue;
-            const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-            const std::byte* row = planes.at[c] + static_cast<std::size_t>(y) * size * bytes;
-            for (int x = 0; x < tile.region.width(); ++x)
-                if (std::memcmp(row + static_cast<std::size_t>(x) * bytes, planes.at[c], bytes) != 0)
-                    return false;
-        }
-    return true;
-}
-
-template <class TileType>
-bool allInRange(const TileType& tile, const ActiveSpans& active, const WireCoder& coder)
-{
-    const Span* span = active.spans.data();
-    for (int y = active.rowBegin; y < active.rowEnd; ++y)
-        for (int i = 0; i < active.rowCounts[static_cast<std::size_t>(y - active.rowBegin)]; ++i, ++span)
-            if (!coder.inRange(tile.pixel(span->x, y), span->count))
-                return false;
-    return true;
-}
-
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
 inline float canonicalDepth(float depth)
 {
@@ -218,13 +141,9 @@ template <class TileType>
 Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t receiver,
                       const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
 {
-    static thread_local ActiveSpans active;
-    active.find(tile);
+    static thread_local ActivePixels active;
     const auto channels = static_cast<ChannelMask>((wanted & TileType::channels) | colorChannel);
-    ConstPlanes planes = tile.planes();
-    for (std::size_t c = 0; c < channelCount; ++c)
-        if (!hasChannel(channels, c))
-            planes.at[c] = nullptr;
+    active.gather(tile, channels);
     const int width = tile.region.width(), height = tile.region.height();
 
     FragmentHeader h;
@@ -242,7 +161,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     if (active.pixels == 0) {
         h.encoding = FragmentEncoding::Empty;
     } else if (active.pixels == static_cast<std::uint32_t>(width * height)) {
-        h.encoding = isConstant(tile, planes) ? FragmentEncoding::Constant : FragmentEncoding::Dense;
+        h.encoding = active.isConstant() ? FragmentEncoding::Constant : FragmentEncoding::Dense;
         if (h.encoding == FragmentEncoding::Constant)
             stored = 1;
     } else {
@@ -250,8 +169,10 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         h.spanCount = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
         tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
     }
-    const bool fits = color != WireFormat::Float32 && allInRange(tile, active, coder);
-    h.colorFormat = fits ? color : WireFormat::Float32;
+    const auto count = static_cast<int>(stored);
+    const float* rgba = floatsOf(active.plane(Color));
+    const float* depth = floatsOf(active.plane(Depth));
+    h.colorFormat = color != WireFormat::Float32 && coder.inRange(rgba, count) ? color : WireFormat::Float32;
     h.depthFormat = coder.depth();
     const std::size_t payload = tableBytes + planesBytes(h, stored);
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
@@ -269,54 +190,27 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         std::memcpy(out + countBytes, active.spans.data(), spanBytes);
         std::memset(out + countBytes + spanBytes, 0, tableBytes - countBytes - spanBytes);
     }
-    Planes to;
-    std::byte* section = out + tableBytes;
-    for (std::size_t c = 0; c < channelCount; ++c)
-        if (planes.at[c]) {
-            to.at[c] = section;
-            section += planeBytes(h, c, stored);
-            if (stored > 0)
-                std::memset(section - 4, 0, 4); // what fills it up
-        }
-    const bool hasMore = (channels & ~(colorChannel | depthChannel)) != 0;
-    const std::uint64_t repeats = h.encoding == FragmentEncoding::Constant ? active.pixels : 1;
-    const auto copyPixels = [&](int x, int y, int count) {
-        const float* from = tile.pixel(x, y);
-        const std::size_t first = static_cast<std::size_t>(y) * TileType::size + static_cast<std::size_t>(x);
-        coder.encodeColor(h.colorFormat, from, count, to.at[Color]);
-        to.at[Color] += 4 * bytesOf(h.colorFormat) * static_cast<std::size_t>(count);
-        const float* fromDepth = planes.at[Depth] ? floatsOf(planes.at[Depth]) + first : nullptr;
-        if (hasFault(from, fromDepth, count))
-            countFaults(from, fromDepth, count, repeats, faults);
-        if (fromDepth) {
-            float rounded[256];
-            float* depth = h.depthFormat == WireFormat::Float32 ? floatsOf(to.at[Depth]) : rounded;
+    std::byte* to = out + tableBytes;
+    for (std::size_t c = 0; c < channelCount && stored > 0; ++c) {
+        if (!hasChannel(channels, c))
+            continue;
+        const std::size_t bytes = planeBytes(h, c, stored);
+        std::memset(to + bytes - 4, 0, 4); // what fills it up
+        if (c == Color) {
+            coder.encodeColor(h.colorFormat, rgba, count, to);
+        } else if (c == Depth) {
+            float* canonical = h.depthFormat == WireFormat::Float32 ? floatsOf(to) : active.scratch(stored);
             for (int i = 0; i < count; ++i)
-                depth[i] = canonicalDepth(fromDepth[i]);
-            if (depth == rounded)
-                coder.encodeDepth(h.depthFormat, rounded, count, to.at[Depth]);
-            to.at[Depth] += bytesOf(h.depthFormat) * static_cast<std::size_t>(count);
+                canonical[i] = canonicalDepth(depth[i]);
+            if (h.depthFormat != WireFormat::Float32)
+                coder.encodeDepth(h.depthFormat, canonical, count, to);
+        } else {
+            std::memcpy(to, active.plane(c), bytes);
         }
-        if (!hasMore)
-            return;
-        for (std::size_t c = Normal; c < channelCount; ++c)
-            if (planes.at[c]) {
-                const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-                std::memcpy(to.at[c], planes.at[c] + first * bytes, bytes * static_cast<std::size_t>(count));
-                to.at[c] += bytes * static_cast<std::size_t>(count);
-            }
-    };
-    if (h.encoding == FragmentEncoding::Sparse) {
-        const Span* span = active.spans.data();
-        for (int y = active.rowBegin; y < active.rowEnd; ++y)
-            for (int i = 0; i < active.rowCounts[static_cast<std::size_t>(y - active.rowBegin)]; ++i, ++span)
-                copyPixels(span->x, y, span->count);
-    } else if (h.encoding == FragmentEncoding::Dense) {
-        for (int y = 0; y < height; ++y)
-            copyPixels(0, y, width);
-    } else if (h.encoding == FragmentEncoding::Constant) {
-        copyPixels(0, 0, 1);
+        to += bytes;
     }
+    if (hasFault(rgba, depth, count))
+        countFaults(rgba, depth, count, h.encoding == FragmentEncoding::Constant ? active.pixels : 1, faults);
 
     if (codec && payload > 0) {
         static thread_local std::vector<std::byte> split;

@@ -29,7 +29,7 @@ template <class FrameBuffer, class Camera, class RenderBrick>
     if (frame.wantsDeclaration())
         frame.declare(inputsOf(world, pairs));
     const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
-    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
         const auto job = jobs.at(static_cast<std::int64_t>(i));
         const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];

@@ -35,7 +35,7 @@ template <class FrameBuffer, class RenderTile>
     params.maxLayers = 1;
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(assigned.size(), [&](std::size_t i) { return frame.samples(assigned[i]).count; });
-    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    detail::TileLoop<FrameBuffer, RenderTile> loop(fb, frame);
     loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
         const auto job = jobs.at(static_cast<std::int64_t>(i));
         frame.start(tile, assigned[job.item], job.pass);
@@ -61,7 +61,7 @@ template <class FrameBuffer, class RenderTile>
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(static_cast<std::size_t>(fb.layout().tileCount()),
                                 [&](std::size_t tile) { return frame.samples(static_cast<int>(tile)).count; });
-    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    detail::TileLoop<FrameBuffer, RenderTile> loop(fb, frame);
     const auto render = [&](std::int64_t job, auto& tile) {
         const auto at = jobs.at(job);
         frame.start(tile, static_cast<int>(at.item), at.pass);

@@ -232,7 +232,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.guard([&] {
         const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
         frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
@@ -282,7 +282,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     params.declared = false;
     params.declarationKey = 0;
     auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer> loop(fb, frame);
+    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.guard([&] {
         std::vector<int> place(world.bricks().size(), -1);
         for (std::size_t i = 0; i < order.size(); ++i)

@@ -1,5 +1,5 @@
 // TileLoop: what the rendering loops have in common: tiles to render into, a job per tile and pass on all
-// workers, and a frame in which a renderer may throw.
+// workers, and a frame in which a renderer may throw. inPlace(): for renderers that have their pixels already.
 #pragma once
 
 #include <algorithm>
@@ -11,7 +11,40 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+namespace dfb {
+
+// See inPlace().
+template <class Find>
+struct InPlace {
+    Find find;
+
+    template <class... Arguments>
+    decltype(auto) operator()(Arguments&&... arguments) const
+    {
+        return find(std::forward<Arguments>(arguments)...);
+    }
+};
+
+// For any loop in place of what renders, where the pixels are there already, as in an image that a rank has made by
+// itself: `find` gets a TileView in place of a Tile, and says where the pixels of view.region are. Nothing is copied into a
+// tile.
+template <class Find>
+InPlace<Find> inPlace(Find find)
+{
+    return {std::move(find)};
+}
+
+namespace detail {
+
+// What a loop hands to a renderer.
+template <class FrameBuffer, class Render>
+struct TileOf {
+    using Type = typename FrameBuffer::Tile;
+};
+template <class FrameBuffer, class Find>
+struct TileOf<FrameBuffer, InPlace<Find>> {
+    using Type = typename FrameBuffer::TileView;
+};
 
 // A job for each pass of each of some items, numbered item by item.
 class PassJobs {
@@ -43,9 +76,9 @@ private:
 
 // An exception of a job makes the frame fail on all ranks; then no further job is begun. Lives as long as the frame is
 // rendered, on the thread that began it.
-template <class FrameBuffer>
+template <class FrameBuffer, class Render>
 class TileLoop {
-    using Tile = typename FrameBuffer::Tile;
+    using Tile = typename TileOf<FrameBuffer, Render>::Type;
 
 public:
     TileLoop(FrameBuffer& fb, typename FrameBuffer::Frame& frame) : fb_(fb), frame_(frame) {}
@@ -98,4 +131,6 @@ private:
     std::vector<std::unique_ptr<Tile>> spare_; // under mutex_
 };
 
-} // namespace dfb::detail
+} // namespace detail
+
+} // namespace dfb
