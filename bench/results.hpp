@@ -1,7 +1,7 @@
 // Results: what a benchmark has found, as JSON lines, as a table, and as a picture of error over time.
 #pragma once
 
-#include "baselines.hpp"
+#include "figures.hpp"
 
 #include <algorithm>
 #include <cmath>

@@ -1,8 +1,8 @@
 #!/bin/sh
-# sh cmake/install_packages.sh [clang]
+# sh cmake/install_packages.sh [clang|bench]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when nothing is
-# missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that: on Debian and Ubuntu with apt-get; elsewhere says
+# what is missing and exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -30,6 +30,7 @@ tools() {
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev
     libtinyobjloader-dev"
+[ "$with" != bench ] || libraries="$libraries libbenchmark-dev"
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {
@@ -50,6 +51,7 @@ nlohmann-json nlohmann/json.hpp
 xxHash xxhash.h
 libpng png.h
 tinyobjloader tiny_obj_loader.h
+$([ "$with" != bench ] || echo GoogleBenchmark benchmark/benchmark.h)
 END
 }
 

@@ -1,0 +1,121 @@
+// What the benchmarks measure and report with; nothing of MPI.
+#pragma once
+
+#include <algorithm>
+#include <chrono>
+#include <cmath>
+#include <cstddef>
+#include <cstdio>
+#include <ctime>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace bench {
+
+// ---- time
+
+using Clock = std::chrono::steady_clock;
+
+// On Linux the same for all processes of a node.
+inline double now() { return std::chrono::duration<double>(Clock::now().time_since_epoch()).count(); }
+
+inline double cpuSeconds(clockid_t clock)
+{
+    timespec t{};
+    clock_gettime(clock, &t);
+    return static_cast<double>(t.tv_sec) + 1e-9 * static_cast<double>(t.tv_nsec);
+}
+inline double processCpuSeconds() { return cpuSeconds(CLOCK_PROCESS_CPUTIME_ID); }
+inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
+
+// ---- figures and tables
+
+// The median absolute deviation says how far from the median half of the samples are at most.
+struct Figure {
+    double median = 0, deviation = 0;
+    std::size_t count = 0;
+};
+
+inline double medianOf(std::vector<double>& samples)
+{
+    if (samples.empty())
+        return 0;
+    const auto middle = samples.begin() + static_cast<std::ptrdiff_t>(samples.size() / 2);
+    std::nth_element(samples.begin(), middle, samples.end());
+    if (samples.size() % 2 == 1)
+        return *middle;
+    return (*middle + *std::max_element(samples.begin(), middle)) / 2;
+}
+
+inline Figure figureOf(std::vector<double> samples)
+{
+    Figure figure;
+    figure.count = samples.size();
+    figure.median = medianOf(samples);
+    for (double& sample : samples)
+        sample = std::abs(sample - figure.median);
+    figure.deviation = medianOf(samples);
+    return figure;
+}
+
+// Three digits of it.
+inline std::string text(double value)
+{
+    char out[32];
+    const double size = std::abs(value);
+    std::snprintf(out, sizeof out, "%.*f", size >= 99.95 || size == 0 ? 0 : size >= 9.995 ? 1 : 2, value);
+    return out;
+}
+
+inline std::string text(const Figure& figure)
+{
+    return figure.count == 0 ? "-" : text(figure.median) + " ±" + text(figure.deviation);
+}
+
+inline std::string byteText(std::size_t byteCount)
+{
+    return byteCount >= (1u << 20) && byteCount % (1u << 20) == 0   ? std::to_string(byteCount >> 20) + " MiB"
+           : byteCount >= (1u << 10) && byteCount % (1u << 10) == 0 ? std::to_string(byteCount >> 10) + " KiB"
+                                                                    : std::to_string(byteCount) + " B";
+}
+
+class Table {
+public:
+    explicit Table(std::vector<std::string> head) : rows_{std::move(head)} {}
+    void add(std::vector<std::string> row) { rows_.push_back(std::move(row)); }
+
+    void print(const std::string& title) const
+    {
+        std::vector<std::size_t> widths(rows_.front().size());
+        for (const auto& row : rows_)
+            for (std::size_t i = 0; i < row.size(); ++i)
+                widths[i] = std::max(widths[i], lettersOf(row[i]));
+        std::printf("\n%s\n", title.c_str());
+        for (std::size_t r = 0; r < rows_.size(); ++r) {
+            for (std::size_t i = 0; i < rows_[r].size(); ++i) {
+                const std::string space(widths[i] - lettersOf(rows_[r][i]), ' ');
+                std::printf(i == 0 ? "| %s%s |" : " %s%s |", i == 0 ? rows_[r][i].c_str() : space.c_str(),
+                            i == 0 ? space.c_str() : rows_[r][i].c_str());
+            }
+            std::printf("\n");
+            if (r == 0)
+                for (std::size_t i = 0; i < widths.size(); ++i)
+                    std::printf("%s%s%s%s", i == 0 ? "|" : "", std::string(widths[i] + 1, '-').c_str(),
+                                i == 0 ? "-|" : ":|", i + 1 == widths.size() ? "\n" : "");
+        }
+        std::fflush(stdout);
+    }
+
+private:
+    // Of UTF-8.
+    static std::size_t lettersOf(const std::string& s)
+    {
+        return static_cast<std::size_t>(
+            std::count_if(s.begin(), s.end(), [](char c) { return (static_cast<unsigned char>(c) & 0xc0) != 0x80; }));
+    }
+
+    std::vector<std::vector<std::string>> rows_;
+};
+
+} // namespace bench
