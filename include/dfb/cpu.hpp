@@ -9,6 +9,7 @@
 #include <dfb/version.hpp>
 
 #if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
+#include <immintrin.h>
 #define DFB_HAS_AVX2_CLONES 1
 #define DFB_AVX2 __attribute__((target("avx2")))
 #define DFB_INLINE inline __attribute__((always_inline))

@@ -11,6 +11,7 @@
 
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/message.hpp>
+#include <dfb/cpu.hpp>
 #include <dfb/detail/active_pixels.hpp>
 #include <dfb/detail/plane_filter.hpp>
 #include <dfb/fragment.hpp>
@@ -103,26 +104,22 @@ inline float canonicalDepth(float depth)
     return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
 }
 
+DFB_INLINE void canonicalize(const float* depth, int count, float* out)
+{
+    for (int i = 0; i < count; ++i)
+        out[i] = canonicalDepth(depth[i]);
+}
+DFB_AVX2 inline void canonicalizeAvx2(const float* depth, int count, float* out) { canonicalize(depth, count, out); }
+inline void canonicalDepths(const float* depth, int count, float* out)
+{
+    cpuHasAvx2() ? canonicalizeAvx2(depth, count, out) : canonicalize(depth, count, out);
+}
+
 // What is wrong with the pixels of an input.
 struct InputFaults {
     std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
     std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
 };
-
-// Whether countFaults() would count anything. No branches, so that it can be vectorized.
-inline bool hasFault(const float* rgba, const float* depth, int count)
-{
-    // As a number, the bits of a float without its sign grow with it: infinity has 0x7f800000, what is above is NaN.
-    std::uint32_t largest = 0, nanDepth = 0;
-    int alpha = 0;
-    for (int i = 0; i < 4 * count; ++i)
-        largest |= static_cast<std::uint32_t>((bitsOf(rgba[i]) & 0x7fffffffu) + 0x00800000u); // its top bit: not finite
-    for (int i = 0; i < count; ++i)
-        alpha |= static_cast<int>(!(rgba[4 * i + 3] >= 0.0f)) | static_cast<int>(!(rgba[4 * i + 3] <= 1.0f));
-    for (int i = 0; depth && i < count; ++i)
-        nanDepth |= static_cast<std::uint32_t>(depth[i] != depth[i]);
-    return (largest & 0x80000000u) != 0 || alpha != 0 || nanDepth != 0;
-}
 
 // `depth` may be null. Each pixel counts `repeats` times.
 inline void countFaults(const float* rgba, const float* depth, int count, std::uint64_t repeats, InputFaults& faults)
@@ -200,8 +197,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
             coder.encodeColor(h.colorFormat, rgba, count, to);
         } else if (c == Depth) {
             float* canonical = h.depthFormat == WireFormat::Float32 ? floatsOf(to) : active.scratch(stored);
-            for (int i = 0; i < count; ++i)
-                canonical[i] = canonicalDepth(depth[i]);
+            canonicalDepths(depth, count, canonical);
             if (h.depthFormat != WireFormat::Float32)
                 coder.encodeDepth(h.depthFormat, canonical, count, to);
         } else {
@@ -209,7 +205,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         }
         to += bytes;
     }
-    if (hasFault(rgba, depth, count))
+    if (active.mayBeFaulty())
         countFaults(rgba, depth, count, h.encoding == FragmentEncoding::Constant ? active.pixels : 1, faults);
 
     if (codec && payload > 0) {
