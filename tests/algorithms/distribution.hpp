@@ -208,7 +208,7 @@ struct Ordered {
     }
 
     template <class Op, class Transport>
-    static void render(const typename Transport::Communicator& communicator, Result& result, int copies,
+    static void render(const typename Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
                        std::int64_t& bytes)
     {
         const dfb::Vec3 eye{0.7f, 0.8f, 6.5f}, target{1.1f, 1.0f, 0};
@@ -220,26 +220,48 @@ struct Ordered {
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
         dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
         const dfb::SharedWorld world(fb, replicated(boxes(), fb.rank(), fb.size(), copies));
-        const auto renderBrick = [&](const dfb::Brick& b, auto& tile) {
-            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
-                const float t = enter(b.bounds, eye, camera.direction(x + 0.5, y + 0.5, 97, 61));
-                if (t < 0 || (x + y) % 11 == static_cast<int>(b.id) % 11)
-                    return;
-                rgba[3] = 0.3f + 0.05f * static_cast<float>(b.id % 5);
-                rgba[b.id % 3] = rgba[3] * 0.9f;
-                depth = t;
-            });
+        const auto shade = [&](const dfb::Brick& b, int x, int y, float* rgba, float& depth) {
+            const float t = enter(b.bounds, eye, camera.direction(x + 0.5, y + 0.5, 97, 61));
+            if (t < 0 || (x + y) % 11 == static_cast<int>(b.id) % 11)
+                return;
+            rgba[3] = 0.3f + 0.05f * static_cast<float>(b.id % 5);
+            rgba[b.id % 3] = rgba[3] * 0.9f;
+            depth = t;
         };
+        const auto renderBrick = [&](const dfb::Brick& b, auto& tile) {
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) { shade(b, x, y, rgba, depth); });
+        };
+        // The same pixels, as images of this rank's bricks that are there beforehand.
+        constexpr std::size_t stride = 97 + 5;
+        struct BrickImage {
+            std::vector<float> rgba = std::vector<float>(4 * stride * 61, 0.0f);
+            std::vector<float> depth = std::vector<float>(stride * 61, std::numeric_limits<float>::infinity());
+        };
+        std::map<std::uint32_t, BrickImage> images;
+        for (const dfb::SharedBrick& b : world.bricks())
+            for (std::size_t i = 0; i < stride * 61; ++i)
+                if (BrickImage& image = images[b.brick.id]; i % stride < 97)
+                    shade(b.brick, static_cast<int>(i % stride), static_cast<int>(i / stride), &image.rgba[4 * i],
+                          image.depth[i]);
+        const auto findBrick = dfb::inPlace([&](const dfb::Brick& b, auto& view) {
+            const std::size_t first =
+                static_cast<std::size_t>(view.region.y0) * stride + static_cast<std::size_t>(view.region.x0);
+            view.stride = stride;
+            view.color = &images.at(b.id).rgba[4 * first];
+            view.depth = &images.at(b.id).depth[first];
+        });
         dfb::FrameParams params;
         params.passes = 2;
         params.background = {0.1f, 0.2f, 0.3f, 1};
         dfb::RoundRobinBricks owner{copies > 1};
-        dfb::FrameReport report;
-        if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
-            report =
-                dfb::renderOrdered(fb, world, camera, dfb::visibilityOrder(world, eye), owner, renderBrick, params);
-        else
-            report = dfb::renderMixedParallel(fb, world, camera, owner, renderBrick, params);
+        const auto frame = [&](const auto& brickSource) {
+            if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
+                return dfb::renderOrdered(fb, world, camera, dfb::visibilityOrder(world, eye), owner, brickSource,
+                                          params);
+            else
+                return dfb::renderMixedParallel(fb, world, camera, owner, brickSource, params);
+        };
+        const dfb::FrameReport report = inPlace ? frame(findBrick) : frame(renderBrick);
         bytes = report.bytesSent;
         if (!fb.isDisplayRank())
             return;
@@ -254,8 +276,10 @@ struct Ordered {
         Result result;
         for (const int copies : {1, 2}) {
             std::int64_t sorted = 0, ordered = 0;
-            render<Blend, Transport>(communicator, result, copies, sorted);
-            render<dfb::BasicOrderedBlend<16>, Transport>(communicator, result, copies, ordered);
+            for (const bool inPlace : {true, false}) {
+                render<Blend, Transport>(communicator, result, copies, inPlace, sorted);
+                render<dfb::BasicOrderedBlend<16>, Transport>(communicator, result, copies, inPlace, ordered);
+            }
             result.expect(sorted == 0 || ordered < sorted, "no depth to send, and yet " + std::to_string(ordered)
                                                                + " bytes beside " + std::to_string(sorted));
         }

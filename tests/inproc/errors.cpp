@@ -285,6 +285,15 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
             texts.push_back(outcomeOf([&] { frame.start(*tile, 0, 1); }));
             texts.push_back(outcomeOf([&] { frame.declare({}); }));
             texts.push_back(outcomeOf([&] { fb.begin(); }));
+            const std::vector<float> pixels(16 * 16 * 4, 0.5f);
+            Fb::TileView view;
+            frame.start(view, 3);
+            view.stride = 16;
+            view.color = pixels.data();
+            texts.push_back(outcomeOf([&] { frame.setTile(view); })); // no depth
+            view.depth = pixels.data();
+            view.stride = static_cast<std::size_t>(view.region.width()) - 1;
+            texts.push_back(outcomeOf([&] { frame.setTile(view); }));
             sentMeanwhile = board->sent - before;
             over.set_value();
             // None of it has harmed the frame.
@@ -309,7 +318,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
             wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
         }
     });
-    REQUIRE(texts.size() == 16);
+    REQUIRE(texts.size() == 18);
     for (const std::string& text : texts) {
         INFO(text);
         CHECK(has(text, "InvalidArgument"));
@@ -317,6 +326,8 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     CHECK(has(texts[0], "frame 2"));
     CHECK(has(texts[10], "-1 children"));
     CHECK(has(texts[10], "tile 3"));
+    CHECK(has(texts[16], "without channel 1"));
+    CHECK(has(texts[17], "rows of"));
     CHECK(sentMeanwhile == 0);
     CHECK(wrong == 0);
 }

@@ -162,6 +162,25 @@ void roundTrips(const dfb::TileLayout& layout, int index, const dfb::Codec* code
                     active += isActive(tile->pixel(x, y));
             const auto pixels = static_cast<std::size_t>(tile->region.width() * tile->region.height());
 
+            // The same pixels somewhere in a larger image.
+            const std::size_t stride = static_cast<std::size_t>(Size) + 13;
+            std::vector<float> rgba(4 * stride * Size, notANumber), depth(stride * Size, notANumber);
+            dfb::TileView<TileOf<Size>::channels, Size> view;
+            static_cast<dfb::TileHeader&>(view) = *tile;
+            view.stride = stride;
+            view.color = &rgba[4 * 7];
+            view.depth = withDepth ? &depth[7] : nullptr;
+            for (int y = 0; y < tile->region.height(); ++y) {
+                const std::size_t first = static_cast<std::size_t>(y) * stride + 7;
+                const auto width = static_cast<std::size_t>(tile->region.width());
+                std::memcpy(&rgba[4 * first], tile->pixel(0, y), 4 * sizeof(float) * width);
+                std::memcpy(&depth[first], tile->depth + y * Size, sizeof(float) * width);
+            }
+            const dfb::Buffer viewed = dfb::detail::encodeFragment(
+                *pool, view, wanted, 9, codec, dfb::detail::WireCoder(), dfb::WireFormat::Float32, uncounted);
+            CHECK(viewed.size() == message.size());
+            CHECK(std::memcmp(viewed.data(), message.data(), message.size()) == 0);
+
             CHECK(faults.nonFinite == 0);
             CHECK(message.size() <= rawBytes);
             const auto header = dfb::detail::readMessageHeader(message);

@@ -180,9 +180,9 @@ public:
     template <class AnyTile>
     void setTile(const AnyTile& tile)
     {
-        pipeline_->checkPlanes(tile);
         checkTile(tile, layout(), pipeline_->table().frameInfo(),
                   [this](int index) { return pipeline_->table().samples(index).count; });
+        pipeline_->checkPlanes(tile);
         if (outcome_->failed())
             return;
         Buffer message = pipeline_->encode(tile);

@@ -107,6 +107,9 @@ public:
     void checkPlanes(const Tile&) const {}
     void checkPlanes(const TileView& tile) const
     {
+        if (tile.color && tile.stride < static_cast<std::size_t>(tile.region.width()))
+            throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " with rows of "
+                                  + std::to_string(tile.stride) + " pixels");
         const ConstPlanes planes = tile.planes();
         for (std::size_t c = 0; c < channelCount; ++c)
             if (tile.color && !planes.at[c] && hasChannel(travelling(config_), c))

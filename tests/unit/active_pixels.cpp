@@ -1,0 +1,115 @@
+// ActivePixels: which pixels of a row are active, and the check of what is copied; the fast loops beside the plain ones.
+#include "catch.hpp"
+
+#include <dfb/detail/active_pixels.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <random>
+#include <vector>
+
+namespace {
+
+constexpr float infinity = std::numeric_limits<float>::infinity();
+constexpr float notANumber = std::numeric_limits<float>::quiet_NaN();
+constexpr float denormal = std::numeric_limits<float>::denorm_min();
+
+} // namespace
+
+TEST_CASE("A pixel is active if any of its channels is not 0, whatever the sign", "[wire]")
+{
+    std::mt19937 random(5);
+    const float values[] = {0, -0.0f, 0, -0.0f, 0, 1, denormal, -denormal, notANumber, infinity};
+    for (int count = 1; count <= 64; ++count)
+        for (int round = 0; round < 20; ++round) {
+            std::vector<float> row(4 * static_cast<std::size_t>(count) + 1);
+            for (float& value : row)
+                value = values[random() % (round % 2 ? 10 : 5)];
+            const float* rgba = row.data() + random() % 2; // not aligned either
+            row.back() = 0;
+            const int pixels = count - 1;
+            std::uint64_t expected = 0;
+            for (int i = 0; i < pixels; ++i) {
+                const float* p = rgba + 4 * i;
+                const bool isActive = p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0;
+                expected |= std::uint64_t{isActive} << i;
+            }
+            CHECK(dfb::detail::activePixelBits(rgba, pixels) == expected);
+            CHECK(dfb::detail::findActivePixels(rgba, pixels) == expected);
+        }
+}
+
+TEST_CASE("What is copied is checked, in each channel of each pixel", "[wire]")
+{
+    using namespace dfb::detail;
+    const float fine[] = {0, -0.0f, 1, 0.5f, denormal, 0x1p-126f}, colors[] = {-1e30f, 1e38f, 2, -denormal};
+    const float never[] = {notANumber, -notANumber, infinity, -infinity};
+    std::mt19937 random(6);
+    for (int count = 1; count <= 20; ++count) {
+        std::vector<float> rgba(4 * static_cast<std::size_t>(count)), out(rgba.size());
+        for (std::size_t i = 0; i < rgba.size(); ++i)
+            rgba[i] = i % 4 < 3 && random() % 2 ? colors[random() % 4] : fine[random() % 6];
+        const auto isClean = [&] {
+            std::fill(out.begin(), out.end(), 7.0f);
+            const bool plain = copyAndCheckColors(rgba.data(), count, out.data());
+            CHECK(std::memcmp(rgba.data(), out.data(), 4 * rgba.size()) == 0);
+            if (cpuHasAvx2()) {
+                std::fill(out.begin(), out.end(), 7.0f);
+                CHECK(copyAndCheckColorsAvx2(rgba.data(), count, out.data()) == plain);
+                CHECK(std::memcmp(rgba.data(), out.data(), 4 * rgba.size()) == 0);
+            }
+            return plain;
+        };
+        CHECK(isClean());
+        for (std::size_t i = 0; i < rgba.size(); ++i) {
+            const float before = rgba[i];
+            for (const float wrong : never) {
+                rgba[i] = wrong;
+                CHECK_FALSE(isClean());
+            }
+            for (const float alpha : {std::nextafter(1.0f, 2.0f), -denormal, -1.0f}) {
+                rgba[i] = alpha;
+                CHECK(isClean() == (i % 4 != 3));
+            }
+            rgba[i] = before;
+        }
+        std::vector<float> depth(static_cast<std::size_t>(count), infinity), to(depth.size());
+        for (std::size_t i = 0; i <= depth.size(); ++i) {
+            if (i < depth.size())
+                depth[i] = i % 2 ? notANumber : -notANumber;
+            CHECK(copyAndCheckDepths(depth.data(), count, to.data()) == (i == depth.size()));
+            CHECK((!cpuHasAvx2()
+                   || copyAndCheckDepthsAvx2(depth.data(), count, to.data()) == (i == depth.size())));
+            CHECK(std::memcmp(depth.data(), to.data(), 4 * depth.size()) == 0);
+            if (i < depth.size())
+                depth[i] = -infinity;
+        }
+    }
+}
+
+TEST_CASE("Spans reach over the places where a row is cut for the search", "[wire]")
+{
+    constexpr int size = 256;
+    using Tile = dfb::Tile<dfb::colorChannel, size>;
+    const auto tile = std::make_unique<Tile>();
+    dfb::detail::ActivePixels active;
+    for (const int width : {1, 63, 64, 65, 127, 128, 129, 256}) {
+        tile->clear();
+        tile->region = {0, 0, width, 3};
+        for (int x = 0; x < width; ++x) {
+            tile->pixel(x, 0)[3] = 1;                   // all
+            tile->pixel(x, 1)[0] = x % 64 != 5 ? 1 : 0; // with gaps
+        }
+        active.gather(*tile, dfb::colorChannel);
+        REQUIRE(active.rowCounts.size() == 2);
+        CHECK(active.rowCounts[0] == 1);
+        CHECK(active.spans[0].count == width);
+        const int gaps = (width + 58) / 64;
+        CHECK(active.rowCounts[1] == gaps + (width % 64 != 6));
+        CHECK(active.pixels == static_cast<std::uint32_t>(2 * width - gaps));
+    }
+}
