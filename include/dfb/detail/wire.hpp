@@ -114,7 +114,7 @@ struct ActiveSpans {
         for (int y = 0; y < height; ++y) {
             const std::size_t before = spans.size();
             const float* row = tile.pixel(0, y);
-            const auto active = [row](int x) { // all bits but the signs
+            const auto active = [row](int x) -> int { // all bits but the signs; int, as Clang warns of & on bool
                 std::uint64_t halves[2];
                 std::memcpy(halves, row + 4 * x, sizeof halves);
                 return ((halves[0] | halves[1]) & 0x7fffffff7fffffffu) != 0;
