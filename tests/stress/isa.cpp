@@ -31,6 +31,10 @@ int write(const char* path)
         for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8})
             for (const std::byte level : dfb::testing::runTileOp<Op>(in, in.order(), format).color)
                 put(static_cast<float>(level));
+        // A dithered one may differ by 1 where floats do; so that this is an ulp, it is counted from 1.
+        for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8})
+            for (const std::byte level : dfb::testing::runTileOp<Op>(in, in.order(), format, true, {}, true).color)
+                put(1.0f + 0x1p-23f * static_cast<float>(level));
     }
     return file.flush() ? 0 : 1;
 }
