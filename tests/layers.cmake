@@ -12,7 +12,7 @@ set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp c
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
 set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
             testing/transport_conformance.hpp image.hpp render/world.hpp)
-set(level_5 tile.hpp render/footprint.hpp)
+set(level_5 dither.hpp tile.hpp render/footprint.hpp)
 set(level_6 deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
 set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
@@ -32,10 +32,10 @@ set(door_of_tbb tbb_executor.hpp)
 
 # Who must not see whom, however many includes are in between: pixels and operations know nothing of messages and
 # threads; messages know nothing of pixels (that one follows from the levels, too, as long as they stay so).
-set(pixels_and_operations "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|deep_tile|compositing|tile_op|pixel_op|ops/.*)\\.hpp$")
+set(pixels_and_operations "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|dither|deep_tile|compositing|tile_op|pixel_op|ops/.*)\\.hpp$")
 set(messages_and_threads "^(comm/.*|exec|tbb_executor|frame|detail/.*|display_wall|distributed_framebuffer)\\.hpp$")
 set(messages "^comm/.*\\.hpp$")
-set(pixels "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|deep_tile|compositing|tile_op|pixel_op|ops/.*|render/.*)\\.hpp$")
+set(pixels "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|dither|deep_tile|compositing|tile_op|pixel_op|ops/.*|render/.*)\\.hpp$")
 
 foreach(level RANGE ${last_level})
   foreach(header IN LISTS level_${level})

@@ -60,6 +60,7 @@ struct Options {
     float earlyTermination = 0;                     // 0: off
     float exposure = 0;                             // 0: off
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
+    bool dither = false;
 
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
@@ -405,6 +406,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1e6))
         ->option_text("E")
         ->group(picture);
+    app.add_flag("--dither", options.dither, "Dither the colour of a .png, so that gradients have no bands")
+        ->group(picture);
 
     const char* files = "Files to write";
     app.add_option("--output", options.output, "The last frame: sRGB in a .png, linear colour in a .pfm; default none")
@@ -473,7 +476,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.adaptive > 0 && options.spp < 8, "--adaptive",
                "needs --spp 8 or more: the most samples per pixel");
         refuse(options.errorBudget > 0, "--wire", "does not go with --error-budget");
-        for (const char* other : {"--adaptive", "--interleave", "--deep", "--exposure", "--blend", "--wall"})
+        refuse(options.wallColumns > 0, "--dither", "does not go with --wall");
+        refuse(detail::endingOf(options.output) != ".png", "--dither", "needs --output FILE.png");
+        for (const char* other :
+             {"--adaptive", "--interleave", "--deep", "--exposure", "--blend", "--wall", "--dither"})
             refuse(options.verify, other, "does not go with --verify");
         for (const char* other : {"--adaptive", "--wall"})
             refuse(options.inFlight > 1, other, "does not go with --in-flight");

@@ -64,6 +64,7 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.format = wantsFloat(o)                                             ? dfb::OutputFormat::RGBA32F
                     : !o.output.empty() || !o.depth.empty() || !o.aux.empty() ? dfb::OutputFormat::SRGBA8
                                                                               : dfb::OutputFormat::None;
+    config.dither = o.dither;
     config.depth = !o.depth.empty();
     config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
     config.wire.depth = o.wireDepth;
@@ -125,7 +126,7 @@ inline std::string numbered(const std::string& path, int number)
     return path.substr(0, dot) + '.' + std::to_string(number) + path.substr(dot);
 }
 
-inline void writeImage(const std::string& path, const dfb::Image& image)
+inline void writeImage(const std::string& path, const dfb::Image& image, bool dither = false)
 {
     const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
     const int width = image.width(), height = image.height();
@@ -137,7 +138,10 @@ inline void writeImage(const std::string& path, const dfb::Image& image)
         std::vector<std::byte> srgb(4 * image.pixelCount());
         for (int y = 0; y < height; ++y) {
             const std::size_t first = 4 * static_cast<std::size_t>(y) * static_cast<std::size_t>(width);
-            dfb::convertPixels(image.rgba32f() + first, width, dfb::OutputFormat::SRGBA8, srgb.data() + first);
+            if (dither)
+                dfb::ditherPixels(image.rgba32f() + first, width, dfb::OutputFormat::SRGBA8, 0, y, srgb.data() + first);
+            else
+                dfb::convertPixels(image.rgba32f() + first, width, dfb::OutputFormat::SRGBA8, srgb.data() + first);
         }
         writePng(path, width, height, reinterpret_cast<const std::uint8_t*>(srgb.data()));
     }
@@ -146,7 +150,7 @@ inline void writeImage(const std::string& path, const dfb::Image& image)
 inline void writeFiles(const Options& o, const dfb::Image& image, const RunStats& stats)
 {
     if (!o.output.empty() && !image.empty())
-        writeImage(o.output, image);
+        writeImage(o.output, image, o.dither);
     if (!o.alpha.empty())
         writeGreyPfm(o.alpha, o.width, o.height, image.rgba32f() + 3, 4);
     if (!o.depth.empty())

@@ -119,10 +119,10 @@ inline bool isNearSrgbThreshold(double linear, std::uint8_t level) noexcept
            || (level < 255 && t[level] - linear <= 0x1p-35 * t[level]);
 }
 
-// Where level k ends and the next begins, to about 100 bits.
-inline DoubleDouble srgbBoundary(int k) noexcept
+// The linear value of so many half levels, to about 100 bits.
+inline DoubleDouble srgbInverse(int halves) noexcept
 {
-    const DoubleDouble s = DoubleDouble{2.0 * k + 1, 0} / 510;
+    const DoubleDouble s = DoubleDouble{static_cast<double>(halves), 0} / 510;
     if (s.high < 0.04045)
         return s * DoubleDouble{100, 0} / 1292;
     const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
@@ -132,6 +132,9 @@ inline DoubleDouble srgbBoundary(int k) noexcept
     const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
     return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
 }
+
+// Where level k ends and the next begins.
+inline DoubleDouble srgbBoundary(int k) noexcept { return srgbInverse(2 * k + 1); }
 
 // The same for a value that is known to about 100 bits.
 inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept

@@ -23,6 +23,7 @@
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
+#include <dfb/dither.hpp>
 #include <dfb/fragment.hpp>
 
 #include <algorithm>
@@ -63,8 +64,9 @@ struct AuxRow {
 class FinishedTile {
 public:
     // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
-    FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride)
-        : region_(region), format_(format), to_(to), stride_(stride)
+    FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
+                 bool dither = false)
+        : region_(region), format_(format), to_(to), stride_(stride), dither_(dither)
     {
     }
 
@@ -72,17 +74,21 @@ public:
     int width() const noexcept { return region_.width(); }
     int height() const noexcept { return region_.height(); }
     OutputFormat format() const noexcept { return format_; }
+    bool isDithered() const noexcept { return dither_; } // the colour, not alpha
     bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
     // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
     // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once. Returns what
-    // convertPixels() returns.
+    // convertPixels() or ditherPixels() returns.
     double setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
     {
         const std::size_t first = static_cast<std::size_t>(y) * stride_;
         double farthest = 0;
-        if (to_.at[detail::Color])
-            farthest = convertPixels(rgba, width(), format_, to_.at[detail::Color] + first * bytesPerPixel(format_));
+        if (std::byte* color = to_.at[detail::Color]; color) {
+            color += first * bytesPerPixel(format_);
+            farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
+                               : convertPixels(rgba, width(), format_, color);
+        }
         const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
             if (!to_.at[channel])
                 return;
@@ -122,6 +128,7 @@ private:
     OutputFormat format_;
     detail::Planes to_;
     std::size_t stride_;
+    bool dither_;
 };
 
 // What a TileOp says of a tile that it has finished, if it has a member report().

@@ -65,6 +65,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.seed == 1);
     CHECK(o.earlyTermination == 0.0f);
     CHECK_FALSE(o.background);
+    CHECK_FALSE(o.dither);
     CHECK(o.output.empty());
     CHECK(o.stats.empty());
 }
@@ -108,6 +109,7 @@ TEST_CASE("Every option arrives", "[options]")
                                "0,0.5,1",
                                "--exposure",
                                "2",
+                               "--dither",
                                "--output",
                                "o.png",
                                "--alpha",
@@ -143,6 +145,7 @@ TEST_CASE("Every option arrives", "[options]")
     REQUIRE(o.background);
     CHECK((*o.background)[1] == 0.5f);
     CHECK(o.exposure == 2.0f);
+    CHECK(o.dither);
     CHECK(o.output == "o.png");
     CHECK(o.alpha == "a.pfm");
     CHECK(o.depth == "d.pfm");

@@ -294,3 +294,22 @@ TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
             CHECK(c.wrongBytes == 0);
         }
 }
+
+TEST_CASE("Where colour is dithered alpha is the exact result rounded all the same, and not exceeded", "[ops]")
+{
+    // Alpha is 1/2, a tie, less something far below the last bit of a double.
+    TileInputs<8> in;
+    in.add(0, 0).fill({0, 0, 0, -0x1p-70f}, 0);
+    in.add(0, 1).fill({0.5f, 0.49f, 0, 0.5f}, 1);
+    using Op = dfb::BasicAlphaBlend<8>;
+    const auto rounded = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA8);
+    const auto dithered = dfb::testing::runTileOp<Op>(in, in.order(), dfb::OutputFormat::RGBA8, true, {}, true);
+    int wrong = 0, other = 0;
+    for (std::size_t i = 0; i < 64; ++i) {
+        wrong += rounded.color[4 * i + 3] != std::byte{127} || dithered.color[4 * i + 3] != std::byte{127};
+        wrong += dithered.color[4 * i] > std::byte{127};
+        other += dithered.color[4 * i + 1] != rounded.color[4 * i + 1];
+    }
+    CHECK(wrong == 0);
+    CHECK(other == 3); // 0.49 is 124.95: 61 of 64 places take 125, as all do when it is rounded
+}

@@ -29,6 +29,7 @@ struct GatherSettings {
     std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
     bool atEnd = false; // nothing leaves before flush()
+    bool dither = false;
 };
 
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
@@ -272,7 +273,7 @@ public:
                 continue;
             const Region region = layout_.region(tile);
             const Place place = inImage(region);
-            FinishedTile out(region, settings_.format, place.planes, place.stride);
+            FinishedTile out(region, settings_.format, place.planes, place.stride, settings_.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
                 row[i] = static_cast<double>(rgba[i % 4]);

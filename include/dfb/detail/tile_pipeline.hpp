@@ -41,7 +41,8 @@ public:
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
           gather_(pool_, table_.layout(),
-                  {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd},
+                  {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd,
+                   config.dither},
                   rank == config.displayRank, rank, rankCount, std::move(sendToDisplay)),
           coder_(config.wire)
     {
@@ -182,7 +183,7 @@ public:
         const Region region = table_.layout().region(tile);
         if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {
             auto place = gather_.reserve(tile);
-            FinishedTile out(region, config_.format, place.planes, place.stride);
+            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither);
             table_.finish(tile, out);
             gather_.commit(tile, std::move(place));
         } else {
@@ -210,8 +211,12 @@ public:
             std::as_const(pixelOp_).process(pixels);
             auto place = gather_.reserve(tile);
             for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
-                convertPixels(pixels.color + 4 * width * y, region.width(), config_.format,
-                              place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format));
+                const float* row = pixels.color + 4 * width * y;
+                std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format);
+                if (config_.dither)
+                    ditherPixels(row, region.width(), config_.format, region.x0, region.y0 + static_cast<int>(y), to);
+                else
+                    convertPixels(row, region.width(), config_.format, to);
                 for (std::size_t c = Depth; c < channelCount; ++c) {
                     const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
                     if (place.planes.at[c])

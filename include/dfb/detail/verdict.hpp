@@ -244,7 +244,7 @@ struct Agreement {
                           + ", wire depth " + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to "
                           + text(c.wire.depthFar) + ", least transmittance " + text(c.minTransmittance) + ", checksums "
                           + text(c.checksums) + ", message pool " + text(c.messagePoolBytes) + ", owner map "
-                          + text(owners.value())};
+                          + text(owners.value()) + ", dither " + text(c.dither)};
     }
 
     std::vector<std::byte> bytes() const

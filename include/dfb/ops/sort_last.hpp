@@ -198,7 +198,8 @@ private:
         if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
             return;
         const std::vector<DoubleDouble> exact = exactRow(y);
-        for (int i = 0; i < 4 * out.width(); ++i) {
+        const int step = out.isDithered() ? 4 : 1; // then of alpha alone
+        for (int i = step - 1; i < 4 * out.width(); i += step) {
             const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
             out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
         }

@@ -89,7 +89,7 @@ struct TileOutput {
 // What the framebuffer does with a tile, with the inputs arriving in this order.
 template <class Op>
 TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order, OutputFormat format,
-                     bool withDepth = true, const TileWire& wire = {})
+                     bool withDepth = true, const TileWire& wire = {}, bool dither = false)
 {
     namespace d = dfb::detail;
     const auto pool = MemoryPool::create();
@@ -126,7 +126,7 @@ TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::
         d::Planes planes;
         planes.at[d::Color] = out.color.data();
         planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
-        FinishedTile finished(region, format, planes, width);
+        FinishedTile finished(region, format, planes, width, dither);
         op.finish(finished);
         if constexpr (d::HasReport<Op>::value)
             op.report(out.report);

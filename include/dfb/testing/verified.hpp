@@ -1,5 +1,6 @@
 // Verified: a tile operation of the library that checks itself: each finished tile against the reference of the inputs
-// that it got, as they were decoded. For tests and for users who want to see it; slow.
+// that it got, as they were decoded. For tests and for users who want to see it; slow. Dithered values are not the
+// exact ones rounded, and are counted as wrong.
 //
 //   dfb::testing::Verification verification;      // one per rank
 //   DistributedFrameBuffer<dfb::testing::Verified<dfb::AlphaBlend>> fb(...);
