@@ -6,7 +6,7 @@ cmake_minimum_required(VERSION 3.21)
 set(level_0 version.hpp fwd.hpp testing/reference.hpp)
 set(level_1 channels.hpp moments.hpp wire_format.hpp error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
-set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
+set(level_2 detail/image_gate.hpp comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
             comm/transport.hpp tbb_executor.hpp)
 set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
@@ -18,8 +18,8 @@ set(level_7 compositing.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detai
 set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
             detail/tile_table.hpp detail/verdict.hpp)
 set(level_9 detail/final_gather.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
-            testing/adversarial.hpp testing/verified.hpp detail/frame_figures.hpp detail/outcome.hpp)
-set(level_10 detail/tile_pipeline.hpp)
+            detail/frame_figures.hpp detail/outcome.hpp)
+set(level_10 detail/tile_pipeline.hpp testing/adversarial.hpp testing/verified.hpp)
 set(level_11 detail/frame_engine.hpp)
 set(level_12 display_wall.hpp distributed_framebuffer.hpp)
 set(level_13 dfb.hpp)

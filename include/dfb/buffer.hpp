@@ -98,6 +98,8 @@ protected:
 // handle of the pool are gone. All members may be called from any thread.
 class MemoryPool final : public BlockOwner, public std::enable_shared_from_this<MemoryPool> {
 public:
+    static constexpr std::size_t smallestShared = 2048; // blocks below are never in memory that other processes see
+
     // `mayBeShared`: a transport may put its blocks into memory that other processes see.
     static std::shared_ptr<MemoryPool> create(bool mayBeShared = true)
     {
@@ -175,7 +177,6 @@ public:
 private:
     static constexpr std::size_t alignment = 64;
     static constexpr std::size_t smallest = 256;
-    static constexpr std::size_t smallestShared = 2048;
     static constexpr int classCount = 2 * 48;
 
     struct SizeClass {

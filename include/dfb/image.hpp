@@ -351,6 +351,9 @@ public:
     const std::uint32_t* primitiveId() const { return detail::idsOf(plane(detail::PrimitiveId, "primitive ids")); }
     const std::uint32_t* instanceId() const { return detail::idsOf(plane(detail::InstanceId, "instance ids")); }
 
+    // Gives its memory away; there is nothing in it then.
+    std::array<Buffer, detail::channelCount> release() noexcept { return std::move(planes_); }
+
     // Where pixel `first` of each plane is; null where there is none.
     detail::Planes planesAt(std::size_t first) noexcept
     {

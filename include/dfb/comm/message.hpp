@@ -20,18 +20,19 @@ enum class MessageKind : std::uint8_t {
     Manifest,      // what a rank will send to this owner
     ManifestAck,   // the owner has it
     FinishedTiles, // a batch, to the display rank
-    TilesDone,     // how many finished tiles a rank has sent to the display rank
+    TilesDone,     // how many finished tiles a rank has for the display rank, and which it has put into the image
     Abort,         // the frame has failed on the sender
     CreditRequest, // the sender has more for this rank than it may send
     Credit,        // how much the receiver of this may send
     JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
     Jobs,          // a range of them
+    ImagePlace,    // where in shared memory the image of the display rank lies
     Failure        // the sender's messenger can not go on, nor can anybody who waits for it
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb;
-    static constexpr std::uint8_t formatVersion = 2;
+    static constexpr std::uint8_t formatVersion = 3;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;

@@ -170,6 +170,30 @@ public:
         transport_.send(destination, std::move(message));
     }
 
+    // Whether another rank sees memory of this one; where a block of pool() lies there, -1: nowhere; and what lies in
+    // such a place of another rank, null: this one does not see it.
+    bool isSeenBy(int other) const
+    {
+        if constexpr (detail::SharesMemory<Transport>::value)
+            return other != rank() && transport_.lendsTo(other);
+        else
+            return false;
+    }
+    std::int32_t placeOf(const std::byte* block) const
+    {
+        if constexpr (detail::SharesMemory<Transport>::value)
+            return transport_.placeOf(block);
+        else
+            return -1;
+    }
+    std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const
+    {
+        if constexpr (detail::SharesMemory<Transport>::value)
+            return transport_.blockAt(other, place, byteCount);
+        else
+            return nullptr;
+    }
+
     // Messages that came twice, since the start; they are dropped.
     std::int64_t duplicates() const noexcept { return duplicates_; }
 

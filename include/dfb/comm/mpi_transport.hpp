@@ -150,6 +150,17 @@ public:
     int size() const noexcept { return size_; }
     // Whether messages to that rank stay where they are, in memory that it sees.
     bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
+    // Where a block of the pool lies for those ranks, -1: nowhere; and the block of another rank that lies there, null:
+    // this rank does not see it. It does as long as this lives.
+    std::int32_t placeOf(const std::byte* block) const noexcept
+    {
+        return memory_ && memory_->holds(block) ? memory_->placeOf(block) : -1;
+    }
+    std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
+    {
+        const auto& memory = peers_[static_cast<std::size_t>(other)].itsMemory;
+        return memory ? memory->at(place, byteCount) : nullptr;
+    }
     bool needsPolling() const noexcept { return true; }
     // At MPI_THREAD_FUNNELED only the thread that initialised MPI, above that any.
     bool mayPoll() const noexcept

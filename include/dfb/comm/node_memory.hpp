@@ -137,10 +137,19 @@ public:
     }
     Buffer borrow(std::int32_t place, std::uint64_t byteCount)
     {
-        const std::size_t offset = place < 2 ? capacity : static_cast<std::size_t>(place) * alignment;
-        if (offset > capacity || byteCount > capacity - offset || !isLent(base_ + offset))
+        std::byte* block = at(place, byteCount);
+        if (!block || !isLent(block))
             return Buffer();
-        return Buffer(shared_from_this(), base_ + offset, static_cast<std::size_t>(byteCount), 0);
+        return Buffer(shared_from_this(), block, static_cast<std::size_t>(byteCount), 0);
+    }
+
+    // What is there; null if there can be no block of that size.
+    std::byte* at(std::int32_t place, std::uint64_t byteCount) const noexcept
+    {
+        if (place < 2 || static_cast<std::size_t>(place) >= capacity / alignment)
+            return nullptr;
+        const std::size_t offset = static_cast<std::size_t>(place) * alignment;
+        return byteCount <= capacity - offset ? base_ + offset : nullptr;
     }
 
 private:

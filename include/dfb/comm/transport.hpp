@@ -29,6 +29,10 @@
 //                                                Else: waits for nobody; other ranks may get fail(), and what was under
 //                                                way may be lost
 //
+// And, if other ranks can see memory of this one (see comm/mpi_transport.hpp):
+//   bool lendsTo(int other) const;  std::int32_t placeOf(const std::byte* block) const;
+//   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
+//
 // Messages may outlive the transport.
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
@@ -141,6 +145,16 @@ struct HasStartAndStop : std::false_type {
 template <class T>
 struct HasStartAndStop<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
                                       decltype(std::declval<T&>().stop(true))>> : std::true_type {
+};
+
+// Optional.
+template <class T, class = void>
+struct SharesMemory : std::false_type {
+};
+template <class T>
+struct SharesMemory<T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)),
+                                   decltype(std::declval<const T&>().placeOf(nullptr)),
+                                   decltype(std::declval<const T&>().blockAt(0, 0, 0))>> : std::true_type {
 };
 
 } // namespace detail

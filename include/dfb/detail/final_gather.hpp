@@ -1,8 +1,9 @@
-// FinalGather: finished tiles to the display rank. The owner writes them straight into a message of several
-// tiles (on the display rank: into the image); background tiles do not travel.
+// FinalGather: finished tiles to the display rank. The owner writes them straight into the image, if it sees that, else
+// into a message of several tiles; background tiles do not travel.
 #pragma once
 
 #include <dfb/comm/compression.hpp>
+#include <dfb/detail/image_gate.hpp>
 #include <dfb/detail/wire.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
@@ -11,11 +12,14 @@
 #include <algorithm>
 #include <array>
 #include <atomic>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <new>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -49,6 +53,7 @@ public:
         Planes planes;
         std::size_t stride = 0; // of rows, in pixels
         std::shared_ptr<Batch> batch;
+        ImageWriter writer; // into the image of another rank
     };
 
     // `send`: to the display rank, batches and the count of them.
@@ -75,6 +80,8 @@ public:
         frame_ = frame;
         batch_.reset();
         tilesSent_ = 0;
+        placed_.clear();
+        placedBytes_ = 0;
         held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
@@ -86,6 +93,77 @@ public:
         for (auto& s : state_)
             if (s == TileState::Received)
                 s = TileState::Old;
+        if (imageGate_)
+            imageGate_->open(frame);
+    }
+
+    // ---- an image that other ranks see
+
+    // On the display rank. `placeOf(block)`: where a block lies for others, or -1. Empty if they do not see all of it.
+    template <class PlaceOf>
+    std::optional<ImagePlaces> shareImage(const PlaceOf& placeOf)
+    {
+        if (image_.empty() || settings_.atEnd)
+            return std::nullopt;
+        gateMemory_ = pool_->acquire(std::max(sizeof(ImageGate), MemoryPool::smallestShared));
+        const Planes planes = image_.planesAt(0);
+        ImagePlaces places;
+        places.gate = placeOf(gateMemory_.data());
+        bool all = places.gate >= 0;
+        for (std::size_t c = 0; c < channelCount; ++c) {
+            places.planes[c] = planes.at[c] ? placeOf(planes.at[c]) : -1;
+            all = all && (!planes.at[c] || places.planes[c] >= 0);
+        }
+        if (!all) {
+            gateMemory_ = Buffer();
+            return std::nullopt;
+        }
+        imageGate_ = new (gateMemory_.data()) ImageGate;
+        return places;
+    }
+
+    // On another rank. `blockAt(place, byteCount)`: what lies there, or null. Throws Error (MalformedMessage).
+    template <class BlockAt>
+    void useImage(const ImagePlaces& places, const BlockAt& blockAt)
+    {
+        if (isDisplay_ || !enabled() || settings_.atEnd)
+            return;
+        SharedImage image;
+        image.gate = reinterpret_cast<ImageGate*>(blockAt(places.gate, sizeof(ImageGate)));
+        bool all = image.gate != nullptr;
+        const std::size_t pixels =
+            static_cast<std::size_t>(layout_.width()) * static_cast<std::size_t>(layout_.height());
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (travels(c)) {
+                image.planes.at[c] = blockAt(places.planes[c], pixels * pixelBytes(c));
+                all = all && image.planes.at[c];
+            }
+        if (!all)
+            failMalformed("the image is not where the display rank says");
+        const std::lock_guard<std::mutex> lock(mutex_);
+        remote_ = image;
+    }
+
+    // Bytes of the finished tiles that this rank has put into the image of another in this frame.
+    std::int64_t placedBytes() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return placedBytes_;
+    }
+
+    // The frame is over: nobody writes into the image any more.
+    void closeImage()
+    {
+        if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
+            return;
+        // Somebody is still at it, or has died there: the memory is left to it.
+        for (Buffer& plane : image_.release())
+            pool_->lend(plane);
+        pool_->lend(gateMemory_);
+        imageGate_ = nullptr;
+        image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+        for (auto& s : state_)
+            s = TileState::Undefined;
     }
 
     // The most that a message to the display rank can have.
@@ -103,7 +181,13 @@ public:
             return place;
         const Region region = layout_.region(tile);
         if (isDisplay_)
-            return inImage(region);
+            return inImage(image_.planesAt(0), region);
+        if (SharedImage image = remote(); image.gate)
+            if (ImageWriter writer(*image.gate, frame_); writer) {
+                place = inImage(image.planes, region);
+                place.writer = std::move(writer);
+                return place;
+            }
         const auto width = static_cast<std::size_t>(region.width());
         const std::size_t bytes = recordBytes(region);
         std::shared_ptr<Batch> full;
@@ -151,6 +235,14 @@ public:
             return;
         }
         bool send = false;
+        if (place.writer) {
+            const std::size_t bytes = recordBytes(layout_.region(tile));
+            const std::lock_guard<std::mutex> lock(mutex_);
+            placed_.push_back(tile);
+            placedBytes_ += static_cast<std::int64_t>(bytes);
+            ++tilesSent_;
+            return; // and with `place` the writer leaves
+        }
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             ++tilesSent_;
@@ -181,7 +273,12 @@ public:
         for (Buffer& message : held)
             send_(std::move(message));
         const MessageHeader header = messageHeader(MessageKind::TilesDone);
-        send_(makeMessage(*pool_, header, reinterpret_cast<const std::byte*>(&tilesSent_), sizeof tilesSent_));
+        Buffer message = pool_->acquire(sizeof header + sizeof tilesSent_ + sizeof(std::int32_t) * placed_.size());
+        std::memcpy(message.data(), &header, sizeof header);
+        std::memcpy(message.data() + sizeof header, &tilesSent_, sizeof tilesSent_);
+        std::copy(placed_.begin(), placed_.end(),
+                  reinterpret_cast<std::int32_t*>(message.data() + sizeof header + sizeof tilesSent_));
+        send_(std::move(message));
     }
 
     // The display rank's side of a FinishedTiles message. Throws Error (MalformedMessage).
@@ -227,9 +324,20 @@ public:
     void receiveDone(int source, const Buffer& message)
     {
         requireDisplay();
-        if (message.size() != sizeof(MessageHeader) + sizeof(std::int64_t))
+        const std::byte* in = message.data() + sizeof(MessageHeader);
+        const std::size_t placedBytes = std::max(message.size(), sizeof(MessageHeader) + sizeof(std::int64_t))
+                                        - sizeof(MessageHeader) - sizeof(std::int64_t);
+        if (message.size() < sizeof(MessageHeader) + sizeof(std::int64_t) || placedBytes % sizeof(std::int32_t) != 0)
             failMalformed("a count of tiles has the wrong size");
-        const auto count = loadAs<std::int64_t>(message.data() + sizeof(MessageHeader));
+        const auto count = loadAs<std::int64_t>(in);
+        for (std::size_t at = 0; at < placedBytes; at += sizeof(std::int32_t)) {
+            const auto tile = loadAs<std::int32_t>(in + sizeof count + at);
+            if (tile < 0 || tile >= layout_.tileCount() || !imageGate_)
+                failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
+            receiveOnce(tile);
+            ++tilesOf_[static_cast<std::size_t>(source)].received;
+            ++tilesReceived_;
+        }
         tilesOf_[static_cast<std::size_t>(source)].announced = count;
         tilesAnnounced_ += count;
         ++ranksDone_; // after the count: who sees all ranks done sees all counts
@@ -272,7 +380,7 @@ public:
             if (s == TileState::Received || (s == TileState::Background && same) || (s == TileState::Old && kept(tile)))
                 continue;
             const Region region = layout_.region(tile);
-            const Place place = inImage(region);
+            const Place place = inImage(image_.planesAt(0), region);
             FinishedTile out(region, settings_.format, place.planes, place.stride, settings_.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
@@ -333,16 +441,26 @@ private:
         return std::max(batchBytes, recordBytes({0, 0, layout_.tileSize(), layout_.tileSize()}));
     }
 
-    Place inImage(const Region& region)
+    // `planes`: of the whole image.
+    Place inImage(const Planes& planes, const Region& region) const
     {
         Place place;
         place.stride = static_cast<std::size_t>(layout_.width());
-        place.planes =
-            image_.planesAt(static_cast<std::size_t>(region.y0) * place.stride + static_cast<std::size_t>(region.x0));
+        const std::size_t first =
+            static_cast<std::size_t>(region.y0) * place.stride + static_cast<std::size_t>(region.x0);
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (planes.at[c])
+                place.planes.at[c] = planes.at[c] + first * pixelBytes(c);
         return place;
     }
 
-    void store(int tile, const Region& region, const std::byte* pixels)
+    SharedImage remote()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return remote_;
+    }
+
+    void receiveOnce(int tile)
     {
         if (state_[static_cast<std::size_t>(tile)].exchange(TileState::Received) == TileState::Received) {
             ErrorInfo info;
@@ -351,7 +469,12 @@ private:
             info.message = "a finished tile came twice";
             throw Error(std::move(info));
         }
-        const Place place = inImage(region);
+    }
+
+    void store(int tile, const Region& region, const std::byte* pixels)
+    {
+        receiveOnce(tile);
+        const Place place = inImage(image_.planesAt(0), region);
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
         for (std::size_t c = 0; c < channelCount; ++c) {
             if (!place.planes.at[c])
@@ -413,12 +536,17 @@ private:
     Send send_;
     std::int64_t frame_ = 0;
 
-    std::mutex mutex_;
-    std::shared_ptr<Batch> batch_; // under mutex_
-    std::vector<Buffer> held_;     // under mutex_
-    std::int64_t tilesSent_ = 0;   // under mutex_
+    mutable std::mutex mutex_;
+    std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
+    std::vector<Buffer> held_;
+    std::int64_t tilesSent_ = 0;
+    SharedImage remote_;               // of the display rank, if this one sees it
+    std::vector<std::int32_t> placed_; // tiles that are in it
+    std::int64_t placedBytes_ = 0;
 
     Image image_;
+    Buffer gateMemory_;
+    ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
     std::array<float, 4> background_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};

@@ -81,6 +81,7 @@ public:
             messaging_.reset(); // before the exception passes: all ranks throw it, so this end is in order
             throw InvalidArgument(all.text);
         }
+        tellImagePlace();
     }
 
     FrameEngine(const FrameEngine&) = delete;
@@ -391,6 +392,28 @@ private:
             messaging_->send(config_.displayRank, std::move(message));
     }
 
+    // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
+    // not heard of it by the end of the first frame goes on sending tiles.
+    void tellImagePlace()
+    {
+        if (rank() != config_.displayRank)
+            return;
+        Messenger<Transport>& messenger = messaging_->messenger();
+        std::vector<int> seers;
+        for (int other = 0; other < size(); ++other)
+            if (messenger.isSeenBy(other))
+                seers.push_back(other);
+        if (seers.empty())
+            return;
+        const auto places =
+            pipeline_->gather().shareImage([&](const std::byte* block) { return messenger.placeOf(block); });
+        if (!places)
+            return;
+        const auto* first = reinterpret_cast<const std::byte*>(&*places);
+        for (const int other : seers)
+            messaging_->send(other, MessageKind::ImagePlace, gate_.next(), Bytes(first, first + sizeof *places));
+    }
+
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
     // next one can not do without it.
     void undecodable(int source, const ErrorInfo& error) override
@@ -435,6 +458,14 @@ private:
         }
         if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown) {
             receiveReduction(source, header, message);
+            return;
+        }
+        if (kind == MessageKind::ImagePlace) {
+            if (source != config_.displayRank)
+                failMalformed("a rank that displays nothing has an image", config_.displayRank, source);
+            pipeline_->gather().useImage(bodyAs<ImagePlaces>(message), [&](std::int32_t place, std::size_t byteCount) {
+                return messaging_->messenger().blockAt(source, place, byteCount);
+            });
             return;
         }
         if (outcome_->failed())
@@ -656,7 +687,7 @@ private:
                            const std::int64_t repeated = messaging_->messenger().duplicates();
                            v.paramsHash = fingerprintOf(params_);
                            const auto reports = pipeline_->reports();
-                           v.sums = {messaging_->bytesSent() - bytesBefore_,
+                           v.sums = {messaging_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
                                      messaging_->messagesSent() - messagesBefore_,
                                      ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
                                      pipeline_->nonFinitePixels(),
@@ -724,6 +755,7 @@ private:
         messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
         lastFailed_ = transportError || verdict.error;
+        pipeline_->gather().closeImage();
         if (lastFailed_)
             pipeline_->gather().invalidate();
         if (transportError)

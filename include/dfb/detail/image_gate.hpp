@@ -1,0 +1,88 @@
+// ImageGate: lets other processes write finished tiles straight into the image of the display rank, where they see its
+// memory: as long as the frame is open there, and never into what a user may be looking at.
+#pragma once
+
+#include <dfb/buffer.hpp>
+#include <dfb/channels.hpp>
+
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <new>
+#include <thread>
+#include <utility>
+
+namespace dfb::detail {
+
+// Lies in shared memory. A writer says that it is there and then looks whether the gate is open; who closes it closes
+// it and then looks whether anybody is there: one of them sees the other.
+class ImageGate {
+public:
+    bool enter(std::int64_t frame) noexcept
+    {
+        writers_.fetch_add(1);
+        if (frame_.load() == frame)
+            return true;
+        leave();
+        return false;
+    }
+    void leave() noexcept { writers_.fetch_sub(1); }
+
+    void open(std::int64_t frame) noexcept { frame_.store(frame); } // not 0
+    // False if a writer does not leave in time; it may have died.
+    bool close(std::chrono::milliseconds limit) noexcept
+    {
+        frame_.store(0);
+        const auto end = std::chrono::steady_clock::now() + limit;
+        while (writers_.load() != 0) {
+            if (std::chrono::steady_clock::now() > end)
+                return false;
+            std::this_thread::sleep_for(std::chrono::microseconds(100));
+        }
+        return true;
+    }
+
+private:
+    std::atomic<std::int64_t> frame_{0};
+    std::atomic<std::int32_t> writers_{0};
+};
+static_assert(std::atomic<std::int64_t>::is_always_lock_free && std::atomic<std::int32_t>::is_always_lock_free);
+
+// Somebody who is inside.
+class ImageWriter {
+public:
+    ImageWriter() = default;
+    ImageWriter(ImageGate& gate, std::int64_t frame) : gate_(gate.enter(frame) ? &gate : nullptr) {}
+    ImageWriter(ImageWriter&& other) noexcept : gate_(std::exchange(other.gate_, nullptr)) {}
+    ImageWriter& operator=(ImageWriter&& other) noexcept
+    {
+        std::swap(gate_, other.gate_);
+        return *this;
+    }
+    ~ImageWriter()
+    {
+        if (gate_)
+            gate_->leave();
+    }
+    explicit operator bool() const noexcept { return gate_ != nullptr; }
+
+private:
+    ImageGate* gate_ = nullptr;
+};
+
+// Where the gate and the planes of an image lie in its rank's shared memory, as that counts places; -1: nowhere. What
+// the display rank tells those who see its memory.
+struct ImagePlaces {
+    std::int32_t gate = -1;
+    std::array<std::int32_t, channelCount> planes{};
+};
+
+// The same as pointers; null until it is known.
+struct SharedImage {
+    ImageGate* gate = nullptr;
+    Planes planes;
+};
+
+} // namespace dfb::detail
