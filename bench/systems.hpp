@@ -4,6 +4,7 @@
 
 #include "brick_images.hpp"
 #include "direct_send.hpp"
+#include "radix_k.hpp"
 #include "results.hpp"
 #ifdef DFB_BENCH_HAS_ICET
 #include "icet.hpp"
@@ -216,6 +217,15 @@ inline void addDirectSend(std::vector<System>& systems, const Inputs& inputs)
     addPlain(systems, inputs, "direct send, float", [&inputs](bool toBytes) {
         return std::make_shared<DirectSend>(inputs.comm, inputs.order, inputs.viewports, inputs.image.width,
                                             inputs.image.height, toBytes);
+    });
+}
+
+inline void addRadixK(std::vector<System>& systems, const Inputs& inputs, const std::string& name,
+                      const std::vector<int>& factors)
+{
+    addPlain(systems, inputs, name + ", float", [&inputs, factors](bool toBytes) {
+        return std::make_shared<RadixK>(inputs.comm, inputs.order, inputs.viewports, inputs.image.width,
+                                        inputs.image.height, factors, toBytes);
     });
 }
 
