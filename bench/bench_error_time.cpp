@@ -3,28 +3,17 @@
 // in a scene with noise.
 //   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--svg FILE] [--table FILE] [--commit
 //   ID]
-#include "direct_send.hpp"
-#include "results.hpp"
-#ifdef DFB_BENCH_HAS_ICET
-#include "icet.hpp"
-#endif
+#include "systems.hpp"
 
-#include <dfb/dfb.hpp>
-#include <dfb/testing/error_report.hpp>
-
-#include <cstring>
-#include <functional>
-#include <map>
+#include <fstream>
 #include <memory>
 #include <sstream>
 
 namespace {
 
-using bench::BrickImage;
+using bench::Inputs;
 using bench::Result;
-using dfb::testing::ErrorReport;
-using Messenger = dfb::Messenger<dfb::MpiTransport>;
-using Exact = std::vector<dfb::testing::Pixel>;
+using bench::System;
 
 struct Options {
     int width = 1024, height = 1024, frames = 21;
@@ -32,128 +21,14 @@ struct Options {
     std::string only; // the systems whose name and configuration have one of these, with | between
 };
 
-// Something that makes an image of what all ranks have, and what is known of it.
-struct System {
-    std::string name, config, output; // output: of the image, "float" or "8 bit"
-    std::function<void()> frame;      // collective
-    // Of the last frame on rank 0: 4 a pixel, one of the two.
-    std::function<const float*()> floats;
-    std::function<const std::uint8_t*()> bytes;
-    std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
-    bool trafficIsOfAll = false;
-    std::function<double()> peakMemory;
-    bool isDefault = false;
-    std::vector<double> ms{}, cpuMs{};
-    Result result{};
-};
-
-// ---- dfb: inputs that are ready are read where they are
-
-// The boxes of bricks are in pixels.
-struct PixelCamera {
-    dfb::Region project(const dfb::Box3& box, int, int) const
-    {
-        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
-                static_cast<int>(box.upper.y)};
-    }
-};
-
-// Each rank has one brick.
-dfb::World worldOf(const BrickImage& image, int rank)
+void addAllDfb(std::vector<System>& systems, const std::shared_ptr<bench::Messenger>& messenger, const Inputs& inputs)
 {
-    dfb::World world;
-    const auto& v = image.viewport;
-    if (v[2] > 0)
-        world.add({static_cast<std::uint32_t>(rank),
-                   {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
-                    {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
-    return world;
-}
-
-template <class TileOp>
-inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
-
-struct DfbSettings {
-    dfb::WirePrecision wire{};
-    std::shared_ptr<const dfb::Codec> codec{};
-    float minTransmittance = 0;
-    bool isDefault = false;
-};
-
-// `order`: the ranks front to back, for OrderedBlend.
-template <class TileOp>
-void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
-            const std::vector<int>& order, const std::string& config, const DfbSettings& settings)
-{
-    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
-    struct Renderer {
-        Renderer(const std::shared_ptr<Messenger>& sharedMessenger, const dfb::FrameBufferConfig& c,
-                 const BrickImage& brick)
-            : fb(sharedMessenger, c), world(worldOf(brick, fb.rank())), shared(fb, world)
-        {
-        }
-        FrameBuffer fb;
-        dfb::World world;
-        dfb::SharedWorld shared;
-        dfb::RoundRobinBricks owner;
-        dfb::FrameReport report;
-    };
-    for (const bool toBytes : {false, true}) {
-        dfb::FrameBufferConfig c;
-        c.width = image.width;
-        c.height = image.height;
-        c.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
-        c.wire = settings.wire;
-        c.codec = settings.codec;
-        c.minTransmittance = settings.minTransmittance;
-        c.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        const auto r = std::make_shared<Renderer>(messenger, c, image);
-        System s;
-        s.name = "dfb";
-        s.config = config;
-        s.output = toBytes ? "8 bit" : "float";
-        s.isDefault = settings.isDefault;
-        s.frame = [r, from = &image, order] {
-            const auto renderBrick = dfb::inPlace([from](const dfb::Brick&, auto& view) {
-                view.stride = static_cast<std::size_t>(from->width);
-                const std::size_t first = static_cast<std::size_t>(view.region.y0) * view.stride
-                                          + static_cast<std::size_t>(view.region.x0);
-                view.color = &from->rgba[4 * first];
-                view.depth = &from->depth[first];
-            });
-            if constexpr (isOrdered<TileOp>) {
-                std::vector<int> places; // of bricks in the shared world, which has them by id
-                for (const int rank : order)
-                    for (std::size_t i = 0; i < r->shared.bricks().size(); ++i)
-                        if (r->shared.bricks()[i].brick.id == static_cast<std::uint32_t>(rank))
-                            places.push_back(static_cast<int>(i));
-                r->report = dfb::renderOrdered(r->fb, r->shared, PixelCamera(), places, r->owner, renderBrick);
-            } else {
-                dfb::FrameParams params;
-                params.maxLayers = r->fb.size();
-                r->report = dfb::renderDataParallel(r->fb, r->world, PixelCamera(), renderBrick, params);
-            }
-        };
-        if (toBytes)
-            s.bytes = [r] { return r->fb.image().rgba8(); };
-        else
-            s.floats = [r] { return r->fb.image().rgba32f(); };
-        s.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
-        s.trafficIsOfAll = true;
-        s.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
-        systems.push_back(std::move(s));
-    }
-}
-
-void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const BrickImage& image,
-               const std::vector<int>& order)
-{
-    using dfb::WireFormat;
+    using bench::addDfb, bench::DfbSettings, dfb::WireFormat;
     const auto add = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::AlphaBlend>(systems, messenger, image, order, config, settings);
+        addDfb<dfb::AlphaBlend>(systems, messenger, inputs, config, settings);
     };
     const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::OrderedBlend>(systems, messenger, image, order, config, settings);
+        addDfb<dfb::OrderedBlend>(systems, messenger, inputs, config, settings);
     };
     add("float32", {WireFormat::Float32, {}, 0, true});
     addOrdered("in order, float32", {WireFormat::Float32, {}, 0, true});
@@ -167,118 +42,16 @@ void addAllDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& m
         add(name.str(), {dfb::ErrorBudget{budget}});
     }
     add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
-    addDfb<dfb::BasicAlphaBlend<32>>(systems, messenger, image, order, "float32, tiles of 32", {});
-    addDfb<dfb::BasicAlphaBlend<128>>(systems, messenger, image, order, "float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, image, order, "in order, float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, image, order, "in order, unorm16, tiles of 128",
+    addDfb<dfb::BasicAlphaBlend<32>>(systems, messenger, inputs, "float32, tiles of 32", {});
+    addDfb<dfb::BasicAlphaBlend<128>>(systems, messenger, inputs, "float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, unorm16, tiles of 128",
                                         {WireFormat::Unorm16});
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
     for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})
         add(std::string(nameOf(format)) + ", snappy", {format, snappy});
 #endif
-}
-
-// ---- the peers
-
-void addPlain(std::vector<System>& systems, MPI_Comm comm, const bench::BrickScene& scene, const BrickImage& image,
-              const std::vector<std::array<int, 4>>& viewports)
-{
-    for (const bool toBytes : {false, true}) {
-        const auto plain =
-            std::make_shared<bench::DirectSend>(comm, scene.order(), viewports, image.width, image.height, toBytes);
-        const auto out = std::make_shared<const std::byte*>(nullptr);
-        System s;
-        s.name = "plain";
-        s.config = "direct send, float";
-        s.output = toBytes ? "8 bit" : "float";
-        s.frame = [plain, out, &image] { *out = plain->composite(image.rgba); };
-        if (toBytes)
-            s.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
-        else
-            s.floats = [out] { return reinterpret_cast<const float*>(*out); };
-        s.traffic = [plain] { return std::make_pair(plain->bytesSent(), plain->messagesSent()); };
-        systems.push_back(std::move(s));
-    }
-}
-
-#ifdef DFB_BENCH_HAS_ICET
-// As a user would, whose renderer has floats: for bytes they are converted first; for bytes out of floats, afterwards.
-void addIceT(std::vector<System>& systems, MPI_Comm comm, const bench::BrickScene& scene, const BrickImage& image)
-{
-    enum class Way { Floats, FloatsToBytes, Bytes };
-    for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {
-        const std::string name = strategy.name;
-        if (name != "direct" && name != "sequential, radix-k" && name != "sequential, binary swap"
-            && name != "sequential, tree")
-            continue;
-        for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes}) {
-            bench::IceTSettings settings;
-            settings.strategy = strategy.strategy;
-            settings.singleImage = strategy.singleImage;
-            settings.ubyte = way == Way::Bytes;
-            const auto icet = std::make_shared<bench::IceT>(comm, settings, image.width, image.height);
-            const std::size_t values =
-                4 * static_cast<std::size_t>(image.width) * static_cast<std::size_t>(image.height);
-            const auto converted = std::make_shared<std::vector<std::uint8_t>>(way == Way::Floats ? 0 : values);
-            const auto out = std::make_shared<const void*>(nullptr);
-            const auto toBytes = [](const float* from, std::uint8_t* to, std::size_t count) {
-                for (std::size_t i = 0; i < count; ++i)
-                    to[i] = static_cast<std::uint8_t>(std::min(std::max(from[i], 0.0f), 1.0f) * 255 + 0.5f);
-            };
-            System s;
-            s.name = "icet";
-            s.config = (way == Way::Bytes ? "ubyte, " : "float, ") + name;
-            s.output = way == Way::Floats ? "float" : "8 bit";
-            const std::vector<int> order = scene.order();
-            s.frame = [=, &image] {
-                const auto& v = image.viewport;
-                const void* input = image.rgba.data();
-                if (way == Way::Bytes) {
-                    for (int y = v[1]; y < v[1] + v[3]; ++y) {
-                        const std::size_t first = 4
-                                                  * (static_cast<std::size_t>(y) * static_cast<std::size_t>(image.width)
-                                                     + static_cast<std::size_t>(v[0]));
-                        toBytes(&image.rgba[first], converted->data() + first, 4 * static_cast<std::size_t>(v[2]));
-                    }
-                    input = converted->data();
-                }
-                icet->resetTraffic();
-                *out = icet->composite(input, v.data(), order);
-                if (way == Way::FloatsToBytes && *out) {
-                    toBytes(static_cast<const float*>(*out), converted->data(), values);
-                    *out = converted->data();
-                }
-            };
-            if (way == Way::Floats)
-                s.floats = [out] { return static_cast<const float*>(*out); };
-            else
-                s.bytes = [out] { return static_cast<const std::uint8_t*>(*out); };
-            s.traffic = [icet] { return std::make_pair(icet->bytesSent(), icet->messagesSent()); };
-            systems.push_back(std::move(s));
-        }
-    }
-}
-#endif
-
-// ---- measuring
-
-// Of an image, 4 values a pixel, one of the two.
-ErrorReport errorOf(const float* floats, const std::uint8_t* bytes, const Exact& exact)
-{
-    ErrorReport report;
-    for (std::size_t i = 0; i < 4 * exact.size(); ++i) {
-        const auto value = exact[i / 4].rgba[i % 4];
-        const std::uint8_t level = dfb::testing::toUnorm8(value);
-        if (floats) {
-            report.add(floats[i], value);
-            report.addByte(dfb::testing::toUnorm8(static_cast<dfb::testing::Exact>(floats[i])), level);
-        } else {
-            report.add(static_cast<float>(bytes[i]) / 255, value);
-            report.addByte(bytes[i], level);
-        }
-    }
-    return report;
 }
 
 class Bench {
@@ -292,56 +65,25 @@ public:
     void bricks()
     {
         const bench::BrickScene scene(size_, o_.width, o_.height);
-        const BrickImage image = scene.render(rank_);
-        std::vector<std::array<int, 4>> viewports;
-        for (int rank = 0; rank < size_; ++rank)
-            viewports.push_back(rank == rank_ ? image.viewport : scene.render(rank).viewport);
-        Exact exact;
+        const Inputs inputs(comm_, scene, rank_);
+        bench::ExactImage exact;
         if (rank_ == 0)
             exact = scene.exact();
         bench::meet(comm_);
-        const auto messenger = std::make_shared<Messenger>(comm_);
         std::vector<System> systems;
-        addAllDfb(systems, messenger, image, scene.order());
-        addPlain(systems, comm_, scene, image, viewports);
+        addAllDfb(systems, std::make_shared<bench::Messenger>(comm_), inputs);
+        bench::addDirectSend(systems, inputs);
 #ifdef DFB_BENCH_HAS_ICET
-        addIceT(systems, comm_, scene, image);
+        bench::addIceT(systems, inputs);
 #endif
-        systems.erase(std::remove_if(
-                          systems.begin(), systems.end(),
-                          [this](const System& s) { return !isWanted(s.name + ": " + s.config + ", to " + s.output); }),
-                      systems.end());
-        for (int frame = -1; frame < o_.frames; ++frame) // the first touches memory
-            for (std::size_t i = 0; i < systems.size(); ++i)
-                time(systems[(i + static_cast<std::size_t>(frame + 1)) % systems.size()], frame >= 0);
+        bench::keepWanted(systems, o_.only);
+        bench::measureInTurns(comm_, systems, o_.frames, exact);
+        bench::takeErrorsOfFloats(systems);
         for (System& s : systems) {
-            describe(s, "bricks");
-            const auto traffic = s.traffic();
-            s.result.bytes = static_cast<double>(traffic.first);
-            s.result.messages = static_cast<double>(traffic.second);
-            if (!s.trafficIsOfAll) {
-                s.result.bytes = bench::reduce(comm_, s.result.bytes, MPI_SUM);
-                s.result.messages = bench::reduce(comm_, s.result.messages, MPI_SUM);
-            }
-            if (rank_ == 0) {
-                const ErrorReport e = errorOf(s.floats ? s.floats() : nullptr, s.bytes ? s.bytes() : nullptr, exact);
-                s.result.maxError = e.maxAbs;
-                s.result.rmse = e.rmse();
-                s.result.levels = e.maxLevels;
-            }
-            if (s.peakMemory)
-                s.result.peakMemoryBytes = s.peakMemory();
-        }
-        // Of a system that makes 8 bits out of an image in float, the error is that of the image.
-        for (System& s : systems)
-            for (const System& f : systems)
-                if (s.bytes && f.floats && s.name == f.name && s.config == f.config) {
-                    s.result.maxError = f.result.maxError;
-                    s.result.rmse = f.result.rmse;
-                }
-        for (System& s : systems)
+            describe(s, "bricks", o_.width, o_.height);
             if (rank_ == 0)
-                (s.bytes ? bytes_ : floats_).push_back({s.result, s.output, s.isDefault});
+                (s.output == "float" ? floats_ : bytes_).push_back({s.result, s.output, s.isDefault});
+        }
     }
 
     // A disc with a noisy rim and half of it in noisy light before a background without any: what samples cost, of
@@ -380,12 +122,12 @@ public:
         c.format = dfb::OutputFormat::RGBA32F;
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<Op> fb(comm_, c);
-        Exact exact;
+        bench::ExactImage exact{width};
         for (int i = 0; i < width * height; ++i) {
             dfb::testing::Pixel pixel;
             for (std::size_t k = 0; k < 4; ++k)
                 pixel.rgba[k] = k == 3 ? 1.0 : meanOf(i % width, i / width);
-            exact.push_back(pixel);
+            exact.add(pixel);
         }
         std::uint64_t accumulation = 1;
         std::vector<System> systems;
@@ -395,7 +137,7 @@ public:
             s.config = config;
             s.output = "float";
             const auto bytes = std::make_shared<std::pair<std::int64_t, std::int64_t>>();
-            s.frame = [&fb, &accumulation, render, samples, threshold, bytes] {
+            s.compositor.frame = [&fb, &accumulation, render, samples, threshold, bytes] {
                 *bytes = {0, 0};
                 const auto take = [&](const dfb::FrameReport& report) {
                     bytes->first += report.bytesSent;
@@ -414,8 +156,9 @@ public:
                     take(dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, render, params));
                 }
             };
-            s.floats = [&fb] { return fb.image().rgba32f(); };
-            s.traffic = [bytes] { return *bytes; };
+            s.compositor.floats = [&fb] { return fb.image().rgba32f(); };
+            s.compositor.traffic = [bytes] { return *bytes; };
+            s.compositor.trafficIsOfAll = true;
             systems.push_back(std::move(s));
         };
         for (const int samples : {1, 4, 16, 64})
@@ -426,23 +169,11 @@ public:
             add(name.str(), 256, threshold);
         }
         const int frames = std::max(3, o_.frames / 4);
-        for (System& s : systems)
-            for (int frame = -1; frame < frames; ++frame) {
-                time(s, frame >= 0);
-                if (frame + 1 == frames && rank_ == 0) {
-                    const ErrorReport e = errorOf(s.floats(), nullptr, exact);
-                    s.result.maxError = e.maxAbs;
-                    s.result.rmse = e.rmse();
-                    s.result.levels = e.maxLevels;
-                }
-            }
         for (System& s : systems) {
-            describe(s, "noise");
-            const auto traffic = s.traffic();
-            s.result.bytes = static_cast<double>(traffic.first);
-            s.result.messages = static_cast<double>(traffic.second);
-            s.result.width = width;
-            s.result.height = height;
+            for (int frame = -1; frame < frames; ++frame)
+                bench::timeFrame(comm_, s, frame >= 0);
+            bench::takeResult(comm_, s, exact); // before the next one's image is in the framebuffer
+            describe(s, "noise", width, height);
             if (rank_ == 0)
                 noise_.push_back({s.result, s.output, s.isDefault});
         }
@@ -565,47 +296,18 @@ private:
                });
     }
 
-    bool isWanted(const std::string& name) const
-    {
-        std::istringstream parts(o_.only);
-        bool any = o_.only.empty();
-        for (std::string part; std::getline(parts, part, '|');)
-            any = any || name.find(part) != std::string::npos;
-        return any;
-    }
-
     struct Kernel {
         int layers;
         bench::Figure exact, plain;
     };
 
-    void time(System& s, bool counts)
+    void describe(System& s, const std::string& scene, int width, int height) const
     {
-        bench::meet(comm_);
-        const double start = bench::now(), cpuBefore = bench::processCpuSeconds();
-        s.frame();
-        const double end = bench::now(), cpu = bench::processCpuSeconds() - cpuBefore;
-        const double first = bench::reduce(comm_, start, MPI_MIN);
-        const double cpuOfAll = bench::reduce(comm_, cpu, MPI_SUM);
-        if (!counts)
-            return;
-        s.ms.push_back(1e3 * (end - first)); // on rank 0, when it has the image
-        s.cpuMs.push_back(1e3 * cpuOfAll);
-    }
-
-    void describe(System& s, const std::string& scene) const
-    {
-        Result& r = s.result;
-        r.bench = "bench_error_time";
-        r.system = s.name;
-        r.config = s.config + ", to " + s.output;
-        r.scene = scene;
-        r.ranks = size_;
-        r.width = o_.width;
-        r.height = o_.height;
-        r.ms = bench::figureOf(s.ms);
-        r.cpuMs = bench::figureOf(s.cpuMs);
-        r.commit = o_.commit;
+        s.result.bench = "bench_error_time";
+        s.result.scene = scene;
+        s.result.width = width;
+        s.result.height = height;
+        s.result.commit = o_.commit;
     }
 
     static std::string line(const Result& r, const std::vector<Result>& all)
@@ -629,41 +331,17 @@ private:
 Options optionsOf(int argc, char** argv)
 {
     Options o;
-    const char* usage =
+    bench::readOptions(
+        argc, argv,
         "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--svg PREFIX] "
-        "[--table FILE] [--commit ID] [--only TEXT]";
-    const auto fail = [usage](int code) {
-        std::printf("%s\n", usage);
-        std::exit(code);
-    };
-    for (int i = 1; i < argc; ++i) {
-        const std::string name = argv[i];
-        if (name == "--help")
-            fail(0);
-        if (i + 1 == argc)
-            fail(2);
-        const std::string value = argv[++i];
-        if (name == "--size") {
-            if (std::sscanf(value.c_str(), "%dx%d", &o.width, &o.height) != 2)
-                fail(2);
-        } else if (name == "--frames") {
-            o.frames = std::atoi(value.c_str());
-        } else if (name == "--json") {
-            o.json = value;
-        } else if (name == "--svg") {
-            o.svg = value;
-        } else if (name == "--table") {
-            o.table = value;
-        } else if (name == "--only") {
-            o.only = value;
-        } else if (name == "--commit") {
-            o.commit = value;
-        } else {
-            fail(2);
-        }
-    }
-    if (o.width < 16 || o.height < 16 || o.frames < 1)
-        fail(2);
+        "[--table FILE] [--commit ID] [--only TEXT]",
+        {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
+         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--json", bench::readText(o.json)},
+         {"--svg", bench::readText(o.svg)},
+         {"--table", bench::readText(o.table)},
+         {"--only", bench::readText(o.only)},
+         {"--commit", bench::readText(o.commit)}});
     return o;
 }
 

@@ -1,5 +1,5 @@
-// The partial images that compositing starts from: each rank has one brick of a cube, seen from obliquely above, as a
-// ray marcher would have rendered it; and what they make together, exactly.
+// The partial images that compositing starts from, and what they make together, exactly: Scene, of which BrickScene is
+// one: each rank has one brick of a cube, seen from obliquely above, as a ray marcher would have rendered it.
 #pragma once
 
 #include "baselines.hpp"
@@ -10,44 +10,50 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
 #include <numeric>
+#include <utility>
 #include <vector>
 
 namespace bench {
 
-struct BrickImage {
+struct PartialImage {
     int width = 0, height = 0;
-    std::array<int, 4> viewport{}; // x, y, width, height of what is not empty
+    std::array<int, 4> viewport{}; // x, y, width, height of what may have pixels
     std::vector<float> rgba;       // premultiplied, of the whole image; 4 a pixel
     std::vector<float> depth;      // infinite where there is nothing
 };
 
-class BrickScene {
-public:
-    BrickScene(int ranks, int width, int height) : width_(width), height_(height)
-    {
-        for (int left = ranks, axis = 0; left > 1; axis = (axis + 1) % 3) { // 2: 2x1x1, 4: 2x2x1, 8: 2x2x2, 16: 4x2x2
-            int factor = 2;
-            while (left % factor != 0)
-                ++factor;
-            cells_[static_cast<std::size_t>(axis)] *= factor;
-            left /= factor;
-        }
-        // Front to back: in a grid of equal bricks that is the order of their centres along the view.
-        order_.resize(static_cast<std::size_t>(ranks));
-        std::iota(order_.begin(), order_.end(), 0);
-        std::sort(order_.begin(), order_.end(), [this](int a, int b) { return centreDepth(a) < centreDepth(b); });
-        place_.resize(order_.size());
-        for (std::size_t i = 0; i < order_.size(); ++i)
-            place_[static_cast<std::size_t>(order_[i])] = static_cast<int>(i);
-    }
+// What an image should be, in every rowStep-th of its rows from the first on.
+struct ExactImage {
+    int width = 0, rowStep = 1;
+    std::vector<dfb::testing::Pixel> pixels{};
+    std::vector<std::uint8_t> levels{}; // the same in 8 bits, 4 a pixel
 
+    void add(const dfb::testing::Pixel& pixel)
+    {
+        pixels.push_back(pixel);
+        for (const dfb::testing::Exact value : pixel.rgba)
+            levels.push_back(dfb::testing::toUnorm8(value));
+    }
+};
+
+// What each rank has of an image. In each pixel the ranks lie behind each other in the same order.
+class Scene {
+public:
+    Scene(const Scene&) = delete;
+    Scene& operator=(const Scene&) = delete;
+    virtual ~Scene() = default;
+
+    int width() const { return width_; }
+    int height() const { return height_; }
+    // The ranks, front to back.
     const std::vector<int>& order() const { return order_; }
 
-    BrickImage render(int rank) const
+    PartialImage render(int rank) const
     {
-        BrickImage image;
+        PartialImage image;
         image.width = width_;
         image.height = height_;
         const std::size_t pixels = static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
@@ -64,28 +70,95 @@ public:
                 y0 = std::min(y0, y), y1 = std::max(y1, y + 1);
             }
         if (x1 > x0)
-            image.viewport = {x0, y0, x1 - x0, y1 - y0};
+            image.viewport = viewportOf({x0, y0, x1 - x0, y1 - y0});
         return image;
     }
 
-    // What the images of all ranks make together; slow.
-    std::vector<dfb::testing::Pixel> exact() const
+    // What the images of all ranks make together; slow. It holds none of these images, only the rows it is asked for.
+    ExactImage exact(int rowStep = 1) const
     {
-        std::vector<dfb::testing::Pixel> result;
-        std::vector<BrickImage> all;
-        for (const int other : order_)
-            all.push_back(render(other));
+        ExactImage result{width_, rowStep};
         std::vector<dfb::testing::Sample> samples;
-        for (std::size_t i = 0; i < all.front().depth.size(); ++i) {
-            samples.clear();
-            for (const BrickImage& image : all) {
-                const float* p = &image.rgba[4 * i];
-                if (p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0)
-                    samples.push_back({{p[0], p[1], p[2], p[3]}, image.depth[i], 0, 0});
+        for (int y = 0; y < height_; y += rowStep)
+            for (int x = 0; x < width_; ++x) {
+                samples.clear();
+                for (const int rank : order_)
+                    if (dfb::testing::Sample s; shade(rank, x, y, s.rgba.data(), s.depth))
+                        samples.push_back(s);
+                result.add(dfb::testing::compositeInOrder(samples, {}));
             }
-            result.push_back(dfb::testing::compositeInOrder(samples, {}));
-        }
         return result;
+    }
+
+protected:
+    // In the order of the ranks, until it is set.
+    Scene(int ranks, int width, int height) : width_(width), height_(height)
+    {
+        std::vector<int> order(static_cast<std::size_t>(ranks));
+        std::iota(order.begin(), order.end(), 0);
+        setOrder(std::move(order));
+    }
+    void setOrder(std::vector<int> order)
+    {
+        order_ = std::move(order);
+        place_.resize(order_.size());
+        for (std::size_t i = 0; i < order_.size(); ++i)
+            place_[static_cast<std::size_t>(order_[i])] = static_cast<int>(i);
+    }
+    // Where a rank is in the order. Depths that grow with it keep the order.
+    int placeOf(int rank) const { return place_[static_cast<std::size_t>(rank)]; }
+
+    // Of a pixel's centre; the image is 3.4 high, and 0 is in its middle.
+    std::array<double, 2> positionOf(int x, int y) const
+    {
+        return {3.4 * (x + 0.5 - 0.5 * width_) / height_, 3.4 * (0.5 * height_ - y - 0.5) / height_};
+    }
+    // A rank's colour at a position, premultiplied.
+    static void paint(int rank, double u, double v, double alpha, float* rgba)
+    {
+        rgba[3] = static_cast<float>(alpha);
+        for (int c = 0; c < 3; ++c)
+            rgba[c] =
+                std::min(static_cast<float>(alpha * (0.5 + 0.5 * std::sin(4 * u + 3 * v + 2 * c + rank))), rgba[3]);
+    }
+
+private:
+    // What a rank has in a pixel: premultiplied, and its depth; false, and nothing written, if it has nothing.
+    virtual bool shade(int rank, int x, int y, float* rgba, float& depth) const = 0;
+    // The part of the image in which a renderer would look for pixels, given that in which there are any.
+    virtual std::array<int, 4> viewportOf(const std::array<int, 4>& used) const { return used; }
+
+    int width_, height_;
+    std::vector<int> order_, place_; // front to back; and where each rank is in that
+};
+
+// Of all ranks, of what this one has. Collective.
+inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
+{
+    int size = 1;
+    MPI_Comm_size(comm, &size);
+    std::vector<std::array<int, 4>> all(static_cast<std::size_t>(size));
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallgather(image.viewport.data(), 4, MPI_INT, all.data(), 4, MPI_INT, comm, &request);
+    napThrough(request);
+    return all;
+}
+
+class BrickScene : public Scene {
+public:
+    BrickScene(int ranks, int width, int height) : Scene(ranks, width, height)
+    {
+        for (int left = ranks, axis = 0; left > 1; axis = (axis + 1) % 3) { // 2: 2x1x1, 4: 2x2x1, 8: 2x2x2, 16: 4x2x2
+            int factor = 2;
+            while (left % factor != 0)
+                ++factor;
+            cells_[static_cast<std::size_t>(axis)] *= factor;
+            left /= factor;
+        }
+        // Front to back: in a grid of equal bricks that is the order of their centres along the view.
+        std::vector<int> sorted = order();
+        std::sort(sorted.begin(), sorted.end(), [this](int a, int b) { return centreDepth(a) < centreDepth(b); });
+        setOrder(std::move(sorted));
     }
 
 private:
@@ -119,9 +192,9 @@ private:
     }
 
     // The part of the ray within the brick absorbs and glows; false if there is none.
-    bool shade(int rank, int x, int y, float* rgba, float& depth) const
+    bool shade(int rank, int x, int y, float* rgba, float& depth) const override
     {
-        const double u = 3.4 * (x + 0.5 - 0.5 * width_) / height_, v = 3.4 * (0.5 * height_ - y - 0.5) / height_;
+        const auto [u, v] = positionOf(x, y);
         double enter = -10, leave = 10;
         for (std::size_t a = 0; a < 3; ++a) {
             const double origin = u * right()[a] + v * up()[a], to = forward()[a];
@@ -133,19 +206,13 @@ private:
             return false;
         const double density = 0.8 + 0.7 * std::sin(9 * u + rank) * std::sin(11 * v);
         const double alpha = 1 - std::exp(-density * (leave - enter));
-        for (int c = 0; c < 3; ++c)
-            rgba[c] = static_cast<float>(alpha * (0.5 + 0.5 * std::sin(4 * u + 3 * v + 2 * c + rank)));
-        rgba[3] = static_cast<float>(alpha);
-        for (int c = 0; c < 3; ++c)
-            rgba[c] = std::min(rgba[c], rgba[3]);
+        paint(rank, u, v, alpha, rgba);
         // Grows from brick to brick, also where a ray meets two faces at once.
-        depth = static_cast<float>(place_[static_cast<std::size_t>(rank)] + (enter + 10) / 20);
+        depth = static_cast<float>(placeOf(rank) + (enter + 10) / 20);
         return true;
     }
 
-    int width_, height_;
     std::array<int, 3> cells_{1, 1, 1};
-    std::vector<int> order_, place_; // front to back; and where each rank is in that
 };
 
 } // namespace bench

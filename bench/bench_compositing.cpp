@@ -1,0 +1,376 @@
+// Compositing alone: partial images that are ready, in scenes from nothing on any rank to everything on all of them,
+// are made one image by dfb, by IceT and by plain loops, frame by frame in turn.
+//   mpirun -n 4 bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size 1024x1024,...] [--frames 21]
+//   [--systems dfb,icet,plain] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]
+#include "scenes.hpp"
+#include "systems.hpp"
+
+#include <algorithm>
+#include <array>
+#include <fstream>
+#include <functional>
+#include <iterator>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#if defined(__GLIBC__)
+#include <malloc.h>
+#endif
+
+namespace {
+
+using bench::Inputs;
+using bench::Result;
+using bench::System;
+
+struct Options {
+    std::vector<std::string> scenes{"bricks"}, systems{"dfb", "icet", "plain"};
+    std::vector<std::array<int, 2>> sizes{{1024, 1024}};
+    int frames = 21;
+    std::string json, table, commit;
+    std::string only; // the systems whose name and configuration have one of these, with | between
+
+    bool wants(const std::string& system) const
+    {
+        return std::find(systems.begin(), systems.end(), system) != systems.end();
+    }
+};
+
+void addAllDfb(std::vector<System>& systems, const std::shared_ptr<bench::Messenger>& messenger, const Inputs& inputs)
+{
+    using bench::addDfb, dfb::WireFormat, dfb::BasicOrderedBlend, dfb::BasicAlphaBlend;
+    const auto addOrdered = [&](const std::string& wire, const bench::DfbSettings& settings) {
+        addDfb<BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, " + wire + ", tiles of 128", settings);
+    };
+    addDfb<BasicOrderedBlend<64>>(systems, messenger, inputs, "in order, float32, tiles of 64", {});
+    addOrdered("float32", {});
+    addDfb<BasicAlphaBlend<64>>(systems, messenger, inputs, "float32, tiles of 64", {});
+    addDfb<BasicAlphaBlend<128>>(systems, messenger, inputs, "float32, tiles of 128", {});
+    addOrdered("unorm16", {WireFormat::Unorm16});
+    addOrdered("unorm8", {WireFormat::Unorm8});
+#if defined(DFB_HAS_SNAPPY)
+    addOrdered("float32, snappy", {WireFormat::Float32, std::make_shared<dfb::SnappyCodec>()});
+#endif
+}
+
+void addAllPlain(std::vector<System>& systems, const Inputs& inputs)
+{
+    const auto ranks = static_cast<int>(inputs.order.size());
+    bench::addDirectSend(systems, inputs);
+    const std::vector<int> twos = bench::RadixK::factorsOf(ranks, 2), fours = bench::RadixK::factorsOf(ranks, 4);
+    const bool canSwap = std::all_of(twos.begin(), twos.end(), [](int factor) { return factor == 2; });
+    if (canSwap)
+        bench::addRadixK(systems, inputs, "binary swap", twos);
+    if (!canSwap || fours != twos) // else it is the same
+        bench::addRadixK(systems, inputs, "radix-k", fours);
+}
+
+// ---- memory: all ranks are taken to be on one node, as they are where these figures matter
+
+// About what systems allocate on all ranks together, in bytes: measured at 8 and 16 ranks, rounded up.
+class MemoryNeeds {
+public:
+    explicit MemoryNeeds(const Inputs& inputs)
+        : image_(static_cast<double>(inputs.image.depth.size())),
+          all_(image_ * static_cast<double>(inputs.viewports.size()))
+    {
+        for (const auto& v : inputs.viewports)
+            used_ += static_cast<double>(v[2]) * v[3];
+    }
+
+    double of(const std::vector<System>& systems) const
+    {
+        double sum = 0;
+        bool hasDfb = false;
+        for (const System& s : systems) {
+            const auto has = [&](const char* text) { return s.config.find(text) != std::string::npos; };
+            hasDfb = hasDfb || s.name == "dfb";
+            if (s.name == "dfb")
+                sum += 4 * used_ + 16 * image_;
+            else if (s.name == "plain")
+                sum += 33 * used_ + 8 * all_ + 20 * image_;
+            else
+                sum += (has("direct") ? 20 : has("tree") ? 35 : 60) * used_ * (has("ubyte") ? 0.3 : 1) + 10 * all_;
+        }
+        return sum + (hasDfb ? 24 * used_ : 0); // the messenger's, of which there is one
+    }
+
+private:
+    double image_, all_, used_ = 0; // pixels of the image, of all ranks' images, and of their viewports
+};
+
+// In bytes; as good as infinite where the system does not say.
+double freeMemory()
+{
+    std::ifstream file("/proc/meminfo");
+    for (std::string line; std::getline(file, line);)
+        if (double kibibytes = 0; std::sscanf(line.c_str(), "MemAvailable: %lf", &kibibytes) == 1)
+            return 1024 * kibibytes;
+    return 1e18;
+}
+
+// What was freed is the system's again; malloc would keep it, and the next group has to fit beside it.
+void giveBackMemory()
+{
+#if defined(__GLIBC__)
+    malloc_trim(0);
+#endif
+}
+
+// ---- the best of each kind, and how they compare
+
+const Result* fastestOf(const std::vector<Result>& results, const std::function<bool(const Result&)>& isOfKind)
+{
+    const Result* fastest = nullptr;
+    for (const Result& r : results)
+        if (isOfKind(r) && (!fastest || r.ms.median < fastest->ms.median))
+            fastest = &r;
+    return fastest;
+}
+
+// Of results for one output. Null where there is none.
+struct Best {
+    explicit Best(const std::vector<Result>& results)
+        : exact(
+            fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, nameOf(dfb::WireFormat::Float32)); })),
+          oneLevel(fastestOf(results, [](const Result& r) { return isDfb(r) && r.levels <= 1; })),
+          icetFloat(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "float, "); })),
+          icetUbyte(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "ubyte, "); }))
+    {
+    }
+    static bool isDfb(const Result& r) { return r.system == "dfb"; }
+    static bool has(const Result& r, const char* text) { return r.config.find(text) != std::string::npos; }
+
+    const Result* exact;    // of dfb, whose inputs travel as float32
+    const Result* oneLevel; // of dfb, with 8-bit values that are off by one at most
+    const Result *icetFloat, *icetUbyte;
+};
+
+std::string timeText(const Result* r) { return r ? bench::text(r->ms) : "-"; }
+
+// Of time, CPU time and bytes.
+std::string ratios(const Result* a, const Result* b)
+{
+    if (!a || !b)
+        return "-";
+    const auto ratio = [](double x, double y) { return y > 0 ? bench::text(x / y) : std::string("-"); };
+    return ratio(a->ms.median, b->ms.median) + ", " + ratio(a->cpuMs.median, b->cpuMs.median) + ", "
+           + ratio(a->bytes, b->bytes);
+}
+
+class Bench {
+public:
+    Bench(MPI_Comm comm, Options o) : comm_(comm), o_(std::move(o))
+    {
+        MPI_Comm_rank(comm, &rank_);
+        MPI_Comm_size(comm, &size_);
+#ifndef DFB_BENCH_HAS_ICET
+        if (rank_ == 0 && o_.wants("icet"))
+            std::printf("IceT is not measured: this was built without it (bench/get_icet.sh gets it)\n");
+#endif
+    }
+
+    void run(const std::string& sceneName, int width, int height)
+    {
+        const auto scene = bench::makeScene(sceneName, size_, width, height);
+        const Inputs inputs(comm_, *scene, rank_);
+        bench::ExactImage exact;
+        exact.rowStep = rowStepOf(width, height);
+        if (rank_ == 0)
+            exact = scene->exact(exact.rowStep);
+        bench::meet(comm_);
+        std::vector<System> systems;
+        if (o_.wants("dfb"))
+            addAllDfb(systems, std::make_shared<bench::Messenger>(comm_), inputs);
+        if (o_.wants("plain"))
+            addAllPlain(systems, inputs);
+#ifdef DFB_BENCH_HAS_ICET
+        if (o_.wants("icet"))
+            bench::addIceT(systems, inputs);
+#endif
+        bench::keepWanted(systems, o_.only);
+        systems = measure(std::move(systems), inputs, exact);
+        bench::takeErrorsOfFloats(systems);
+        if (rank_ != 0)
+            return;
+        std::vector<Result> all, floats, bytes;
+        for (System& s : systems) {
+            s.result.bench = "bench_compositing";
+            s.result.scene = sceneName;
+            s.result.width = width;
+            s.result.height = height;
+            s.result.commit = o_.commit;
+            all.push_back(s.result);
+            (s.output == "float" ? floats : bytes).push_back(s.result);
+        }
+        if (!o_.json.empty())
+            bench::appendJson(o_.json, all);
+        report(std::move(floats), "float", exact.rowStep);
+        report(std::move(bytes), "8 bit", exact.rowStep);
+    }
+
+private:
+    // Errors are taken of about a million pixels. An odd step meets all rows of the tiles.
+    static int rowStepOf(int width, int height)
+    {
+        const std::int64_t pixels = std::int64_t{width} * height, most = std::int64_t{1} << 20;
+        return pixels <= most ? 1 : static_cast<int>((pixels + most - 1) / most) | 1;
+    }
+
+    // All in turns, if they have room in memory together; else some after the others. Returns those that were measured.
+    std::vector<System> measure(std::vector<System> systems, const Inputs& inputs, const bench::ExactImage& exact) const
+    {
+        const MemoryNeeds needs(inputs);
+        const double room = 0.7 * bench::reduce(comm_, freeMemory(), MPI_MIN);
+        std::vector<std::vector<System>> groups(1);
+        for (System& s : systems) {
+            std::vector<System>& group = groups.back();
+            group.push_back(std::move(s));
+            if (needs.of(group) <= room)
+                continue;
+            std::vector<System> next;
+            next.push_back(std::move(group.back()));
+            group.pop_back();
+            if (needs.of(next) > room) {
+                if (rank_ == 0)
+                    std::printf("\nNOT MEASURED, as it may need %.1f GB, and there are %.1f: %s\n",
+                                needs.of(next) / 1e9, room / 1e9, next.back().title().c_str());
+            } else {
+                groups.push_back(std::move(next));
+            }
+        }
+        if (groups.size() > 1 && rank_ == 0)
+            std::printf("\nThe systems have no room in memory together (%.1f GB): they are measured in %zu groups, in "
+                        "turns only within each\n",
+                        room / 1e9, groups.size());
+        std::vector<System> measured;
+        for (std::vector<System>& group : groups) {
+            bench::measureInTurns(comm_, group, o_.frames, exact);
+            giveBackMemory();
+            std::move(group.begin(), group.end(), std::back_inserter(measured));
+        }
+        return measured;
+    }
+
+    void report(std::vector<Result> results, const std::string& output, int rowStep) const
+    {
+        if (results.empty())
+            return;
+        std::sort(results.begin(), results.end(),
+                  [](const Result& a, const Result& b) { return a.ms.median < b.ms.median; });
+        const Result& first = results.front();
+        const std::string size = std::to_string(first.width) + 'x' + std::to_string(first.height);
+        std::string title = first.scene + ", " + size + ", " + std::to_string(size_) + " ranks, to " + output;
+        if (rowStep > 1)
+            title += "; errors are those of every " + std::to_string(rowStep) + "th row";
+        bench::Table table({"", "ms", "CPU ms", "MB sent", "messages", "max error", "RMSE", "levels off"});
+        for (const Result& r : results) {
+            const auto format = [](const char* form, double value) {
+                char text[32];
+                std::snprintf(text, sizeof text, form, value);
+                return std::string(text);
+            };
+            table.add({r.system + ": " + r.config, bench::text(r.ms), bench::text(r.cpuMs),
+                       format("%.2f", r.bytes / 1e6), format("%.0f", r.messages), format("%.2g", r.maxError),
+                       format("%.2g", r.rmse), std::to_string(r.levels)});
+        }
+        table.print(title);
+
+        const Best best(results);
+        std::printf("\n%s: ms: dfb float32 %s, dfb within a level %s, IceT float %s, ubyte %s; ratios of time, CPU "
+                    "time, bytes: dfb float32 to IceT float %s, to ubyte %s; dfb within a level to IceT float %s, to "
+                    "ubyte %s\n",
+                    title.c_str(), timeText(best.exact).c_str(), timeText(best.oneLevel).c_str(),
+                    timeText(best.icetFloat).c_str(), timeText(best.icetUbyte).c_str(),
+                    ratios(best.exact, best.icetFloat).c_str(), ratios(best.exact, best.icetUbyte).c_str(),
+                    ratios(best.oneLevel, best.icetFloat).c_str(), ratios(best.oneLevel, best.icetUbyte).c_str());
+        std::fflush(stdout);
+        if (!o_.table.empty())
+            addToTable(best, {first.scene, size, std::to_string(size_), output});
+    }
+
+    // With a head, if the file is new.
+    void addToTable(const Best& best, const std::array<std::string, 4>& what) const
+    {
+        const bool isNew = std::ifstream(o_.table).peek() == std::ifstream::traits_type::eof();
+        std::ofstream file(o_.table, std::ios::app);
+        if (isNew)
+            file << "| scene | size | ranks | to | dfb float32 [ms] | dfb within a level [ms] | IceT float [ms] "
+                    "| IceT ubyte [ms] | dfb float32 : IceT float | : ubyte | dfb within a level : IceT float "
+                    "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|\n";
+        for (const std::string& text : what)
+            file << "| " << text << ' ';
+        for (const Result* r : {best.exact, best.oneLevel, best.icetFloat, best.icetUbyte})
+            file << "| " << timeText(r) << ' ';
+        for (const Result* mine : {best.exact, best.oneLevel})
+            for (const Result* peer : {best.icetFloat, best.icetUbyte})
+                file << "| " << ratios(mine, peer) << ' ';
+        file << "|\n";
+        if (!file.flush())
+            throw std::runtime_error("can not write " + o_.table);
+    }
+
+    MPI_Comm comm_;
+    Options o_;
+    int rank_ = 0, size_ = 1;
+};
+
+// Ends the program after --help, or if it was called wrongly.
+Options optionsOf(int argc, char** argv)
+{
+    Options o;
+    const auto isOneOf = [](const std::vector<std::string>& some, const std::vector<std::string>& all) {
+        return !some.empty() && std::all_of(some.begin(), some.end(), [&](const std::string& name) {
+            return std::find(all.begin(), all.end(), name) != all.end();
+        });
+    };
+    const auto readSizes = [&o](const std::string& value) {
+        o.sizes.clear();
+        for (const std::string& part : bench::partsOf(value, ',')) {
+            o.sizes.emplace_back();
+            if (!bench::readSize(part, o.sizes.back()[0], o.sizes.back()[1]))
+                return false;
+        }
+        return !o.sizes.empty();
+    };
+    const auto readScenes = [&](const std::string& value) {
+        o.scenes = value == "all" ? bench::sceneNames() : bench::partsOf(value, ',');
+        return isOneOf(o.scenes, bench::sceneNames());
+    };
+    const auto readSystems = [&](const std::string& value) {
+        o.systems = bench::partsOf(value, ',');
+        return isOneOf(o.systems, Options().systems);
+    };
+    bench::readOptions(
+        argc, argv,
+        "usage: mpirun -n RANKS bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size WxH,...] "
+        "[--frames N] [--systems dfb,icet,plain] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]",
+        {{"--scene", readScenes},
+         {"--size", readSizes},
+         {"--systems", readSystems},
+         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--only", bench::readText(o.only)},
+         {"--json", bench::readText(o.json)},
+         {"--table", bench::readText(o.table)},
+         {"--commit", bench::readText(o.commit)}});
+    return o;
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    const Options options = optionsOf(argc, argv);
+    int level = 0;
+    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
+    bench::shortenNaps();
+    {
+        Bench bench(MPI_COMM_WORLD, options);
+        for (const auto& [width, height] : options.sizes)
+            for (const std::string& scene : options.scenes)
+                bench.run(scene, width, height);
+    }
+    MPI_Finalize();
+}
