@@ -1,4 +1,5 @@
-// ActivePixels: which pixels of a row are active, and the check of what is copied; the fast loops beside the plain ones.
+// ActivePixels: which pixels of a row are active, and the check of what is copied; the fast loops beside the plain
+// ones.
 #include "catch.hpp"
 
 #include <dfb/detail/active_pixels.hpp>
@@ -82,8 +83,7 @@ TEST_CASE("What is copied is checked, in each channel of each pixel", "[wire]")
             if (i < depth.size())
                 depth[i] = i % 2 ? notANumber : -notANumber;
             CHECK(copyAndCheckDepths(depth.data(), count, to.data()) == (i == depth.size()));
-            CHECK((!cpuHasAvx2()
-                   || copyAndCheckDepthsAvx2(depth.data(), count, to.data()) == (i == depth.size())));
+            CHECK((!cpuHasAvx2() || copyAndCheckDepthsAvx2(depth.data(), count, to.data()) == (i == depth.size())));
             CHECK(std::memcmp(depth.data(), to.data(), 4 * depth.size()) == 0);
             if (i < depth.size())
                 depth[i] = -infinity;
