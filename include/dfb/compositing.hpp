@@ -9,9 +9,9 @@
 // again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/channels.hpp>
+#include <dfb/detail/blend_kernels.hpp>
 #include <dfb/double_double.hpp>
-#include <dfb/fragment.hpp>
 
 #include <algorithm>
 #include <cstddef>
@@ -249,48 +249,32 @@ inline int firstOutOfOrder(const float* front, const float* back, bool frontWins
     return end;
 }
 
-// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on: block by block, so that what
-// is accumulated stays where it is computed. Behind a block that nothing comes through there is nothing to do.
-DFB_INLINE void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                            const std::vector<int>& order)
+// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on.
+inline void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                        const std::vector<int>& order)
 {
-    constexpr int block = 16;
-    for (int first = begin; first < end; first += block) {
-        const int count = std::min(block, end - first);
-        double* acc = row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + first);
-        double* t = row.transmittance.data() + x + first;
-        const float* front = layers[static_cast<std::size_t>(order[0])].from(first).color;
-        for (int i = 0; i < 4 * count; ++i)
-            acc[i] = 0.0 + static_cast<double>(front[i]); // -0 becomes 0
-        for (int i = 0; i < count; ++i)
-            t[i] = 1.0 - static_cast<double>(front[4 * i + 3]);
-        for (std::size_t k = 1; k < order.size() && !closeOpaque(row, x + first, count); ++k) {
-            const float* c = layers[static_cast<std::size_t>(order[k])].from(first).color;
-            for (int i = 0; i < count; ++i) {
-                const double through = t[i];
-                acc[4 * i] += through * static_cast<double>(c[4 * i]);
-                acc[4 * i + 1] += through * static_cast<double>(c[4 * i + 1]);
-                acc[4 * i + 2] += through * static_cast<double>(c[4 * i + 2]);
-                acc[4 * i + 3] += through * static_cast<double>(c[4 * i + 3]);
-                t[i] = through * (1.0 - static_cast<double>(c[4 * i + 3]));
-            }
-        }
-        closeOpaque(row, x + first, count); // for the background
+    double* rgba = row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + begin);
+    double* transmittance = row.transmittance.data() + x + begin;
+    const auto colorOf = [&](std::size_t k) { return layers[static_cast<std::size_t>(order[k])].from(begin).color; };
+    if (order.size() == 1) {
+        takeLayer(rgba, transmittance, end - begin, colorOf(0), row.minTransmittance);
+        return;
     }
-}
-DFB_AVX2 inline void blendColorsAvx2(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                                     const std::vector<int>& order)
-{
-    blendColors(row, x, begin, end, layers, order);
+    BlendGroup group;
+    group.minTransmittance = row.minTransmittance;
+    for (std::size_t k = 0; k < order.size();) {
+        for (group.layers = 0; k < order.size() && group.layers < BlendGroup::mostLayers; ++k)
+            group.colors[group.layers++] = colorOf(k);
+        if (!blendGroup(rgba, transmittance, end - begin, group))
+            break;
+        group.isFirst = false;
+    }
 }
 
 inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                         const std::vector<int>& order)
 {
-    if (cpuHasAvx2())
-        blendColorsAvx2(row, x, begin, end, layers, order);
-    else
-        blendColors(row, x, begin, end, layers, order);
+    blendColors(row, x, begin, end, layers, order);
     if (!row.wantsDepth)
         return;
     float* nearest = row.depth.data() + x + begin;
@@ -417,111 +401,5 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
         over(row, x + i, 1, l);
     }
 }
-
-// How the inputs of a pixel become one.
-enum class BlendRule {
-    SortByDepth, // sortAndBlend
-    InOrder,     // over, in the order of the fragments
-    Nearest      // keepNearest
-};
-
-// Composites the fragments of one tile and pass, row by row. The fragments' order decides between equal depths:
-// sort them by (source, part) first.
-class FragmentCompositor {
-public:
-    explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
-
-    // `begin` to `end` are iterators of pointers to fragments, which must outlive this.
-    template <class Iterator>
-    void start(Iterator begin, Iterator end)
-    {
-        cursors_.clear();
-        for (; begin != end; ++begin)
-            if (!(*begin)->empty())
-                cursors_.emplace_back(**begin);
-    }
-
-    void skipRows(int count)
-    {
-        for (FragmentCursor& cursor : cursors_)
-            for (int i = 0; i < count; ++i)
-                cursor.next();
-    }
-
-    // Composites the next row of all fragments into `row`, which has been sized for the region's width.
-    void nextRow(CompositeRow& row)
-    {
-        edges_.clear();
-        const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
-                              || !row.aux.position.empty() || !row.aux.primitiveId.empty()
-                              || !row.aux.instanceId.empty();
-        active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
-        std::size_t rows = 0;
-        for (FragmentCursor& cursor : cursors_) {
-            FragmentRow& r = active_[rows];
-            if (!cursor.next(r))
-                continue;
-            ++rows;
-            if (wantsAux)
-                r.aux = cursor.aux();
-            cursor.advance(r);
-            for (int i = 0; i < r.spanCount; ++i) {
-                edges_.push_back(r.spans[i].x);
-                edges_.push_back(r.spans[i].x + r.spans[i].count);
-            }
-        }
-        active_.resize(rows);
-        // Between two neighbouring edges the set of layers is constant.
-        std::sort(edges_.begin(), edges_.end());
-        edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
-        const int width = static_cast<int>(row.transmittance.size());
-        if (edges_.empty())
-            row.clear(0, width);
-        else
-            row.clear(0, edges_.front()), row.clear(edges_.back(), width - edges_.back());
-        for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
-            const int x0 = edges_[e], x1 = edges_[e + 1];
-            layers_.clear();
-            aux_.resize(wantsAux ? active_.size() : 0); // before anybody points into it
-            for (FragmentRow& r : active_) {
-                while (r.spanCount > 0 && r.spans->x + r.spans->count <= x0) {
-                    r.color += 4 * static_cast<std::ptrdiff_t>(r.spans->count);
-                    if (r.depth)
-                        r.depth += r.spans->count;
-                    if (wantsAux)
-                        r.aux.advance(r.spans->count);
-                    ++r.spans;
-                    --r.spanCount;
-                }
-                if (r.spanCount > 0 && r.spans->x <= x0) {
-                    const int offset = x0 - r.spans->x;
-                    layers_.push_back(Layer{r.color, r.depth, nullptr}.from(offset));
-                    if (wantsAux) {
-                        aux_[layers_.size() - 1] = r.aux.from(static_cast<std::size_t>(offset));
-                        layers_.back().aux = &aux_[layers_.size() - 1];
-                    }
-                }
-            }
-            if (layers_.empty()) {
-                row.clear(x0, x1 - x0);
-                continue;
-            }
-            switch (rule_) {
-            case BlendRule::SortByDepth: sortAndBlend(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::Nearest: keepNearest(row, x0, x1 - x0, layers_); break;
-            }
-        }
-    }
-
-private:
-    BlendRule rule_;
-    std::vector<FragmentCursor> cursors_;
-    std::vector<FragmentRow> active_;
-    std::vector<detail::ConstPlanes> aux_; // of layers_
-    std::vector<int> edges_;
-    std::vector<Layer> layers_;
-    std::vector<int> order_;
-};
 
 } // namespace dfb

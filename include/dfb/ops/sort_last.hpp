@@ -2,7 +2,7 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
-#include <dfb/compositing.hpp>
+#include <dfb/fragment_compositor.hpp>
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>
