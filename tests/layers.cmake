@@ -7,7 +7,7 @@ set(level_0 version.hpp fwd.hpp testing/reference.hpp)
 set(level_1 channels.hpp moments.hpp wire_format.hpp error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/progress.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
 set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/reduction.hpp comm/snappy_codec.hpp
-            comm/transport.hpp tbb_executor.hpp detail/blend_kernels.hpp)
+            comm/transport.hpp tbb_executor.hpp detail/blend_kernels.hpp detail/sort_kernels.hpp)
 set(level_3 comm/flow_control.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
 set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
@@ -34,7 +34,7 @@ set(door_of_tbb tbb_executor.hpp)
 # threads; messages know nothing of pixels (that one follows from the levels, too, as long as they stay so).
 set(pixels_and_operations "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|deep_tile|compositing|fragment_compositor|tile_op|pixel_op|ops/.*)\\.hpp$")
 set(messages_and_threads "^(comm/.*|exec|tbb_executor|frame|detail/.*|display_wall|distributed_framebuffer)\\.hpp$")
-set(kernels "^detail/(blend_kernels|sort_network)\\.hpp$") # loops over numbers, whoever calls them
+set(kernels "^detail/(blend_kernels|sort_kernels)\\.hpp$") # loops over numbers, whoever calls them
 set(messages "^comm/.*\\.hpp$")
 set(pixels "^(image|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|deep_tile|compositing|fragment_compositor|tile_op|pixel_op|ops/.*|render/.*)\\.hpp$")
 

@@ -11,12 +11,14 @@
 
 #include <dfb/channels.hpp>
 #include <dfb/detail/blend_kernels.hpp>
+#include <dfb/detail/sort_kernels.hpp>
 #include <dfb/double_double.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <numeric>
 #include <vector>
 
 namespace dfb {
@@ -226,29 +228,6 @@ inline void overBackground(CompositeRow& row, const float (&rgba)[4])
 
 namespace detail {
 
-// The order of layers is constant over most neighbouring pixels. Returns the first pixel in [begin, end) where
-// layer `front` does not come before layer `back`; `frontWinsTies` tells how equal depths are decided.
-inline int firstOutOfOrder(const float* front, const float* back, bool frontWinsTies, int begin, int end)
-{
-    constexpr int chunk = 16;
-    int x = begin;
-    for (; x + chunk <= end; x += chunk) {
-        int wrong = 0;
-        if (frontWinsTies)
-            for (int k = 0; k < chunk; ++k)
-                wrong |= !(front[x + k] <= back[x + k]);
-        else
-            for (int k = 0; k < chunk; ++k)
-                wrong |= !(front[x + k] < back[x + k]);
-        if (wrong)
-            break;
-    }
-    for (; x < end; ++x)
-        if (!(frontWinsTies ? front[x] <= back[x] : front[x] < back[x]))
-            return x;
-    return end;
-}
-
 // Composites pixels [begin, end) of layers, in this order, into the row from x + begin on.
 inline void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                         const std::vector<int>& order)
@@ -271,16 +250,15 @@ inline void blendColors(CompositeRow& row, int x, int begin, int end, const std:
     }
 }
 
-inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                        const std::vector<int>& order)
+// The nearest depths of pixels [begin, end), if they are wanted.
+inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers)
 {
-    blendColors(row, x, begin, end, layers, order);
     if (!row.wantsDepth)
         return;
     float* nearest = row.depth.data() + x + begin;
     std::fill_n(nearest, end - begin, std::numeric_limits<float>::infinity());
-    for (const int layer : order)
-        if (const Layer l = layers[static_cast<std::size_t>(layer)].from(begin); l.depth)
+    for (const Layer& layer : layers) // of equal depths, such as 0 and -0, that of the first
+        if (const Layer l = layer.from(begin); l.depth)
             takeNearest(nearest, end - begin, l);
 }
 
@@ -304,7 +282,93 @@ inline void blend(CompositeRow& row, int x, int begin, int end, const std::vecto
     if (layers.front().aux || !row.rgbaLow.empty())
         blendFully(row, x, begin, end, layers, order);
     else
-        blendBlocks(row, x, begin, end, layers, order);
+        blendColors(row, x, begin, end, layers, order), takeDepths(row, x, begin, end, layers);
+}
+
+// The first pixel in [begin, end) where the order of the layers is not that of their depths; end if there is none.
+inline int firstOutOfOrder(const std::vector<Layer>& layers, const std::vector<int>& order, int begin, int end)
+{
+    OrderedDepths some;
+    for (std::size_t first = 0; first + 1 < order.size() && begin < end; first += OrderedDepths::mostLayers - 1) {
+        const std::size_t count = std::min<std::size_t>(OrderedDepths::mostLayers, order.size() - first);
+        for (std::size_t k = 0; k < count; ++k) {
+            some.depths[k] = layers[static_cast<std::size_t>(order[first + k])].depth;
+            some.winsTies[k] = first + k + 1 < order.size() && order[first + k] < order[first + k + 1];
+        }
+        some.layers = static_cast<int>(count);
+        end = firstOutOfOrder(some, begin, end);
+    }
+    return end;
+}
+
+// Puts the layers into the order that they have at a pixel.
+inline void sortAt(int pixel, const std::vector<Layer>& layers, std::vector<int>& order)
+{
+    const auto depthOf = [&](int layer) { return layers[static_cast<std::size_t>(layer)].depth[pixel]; };
+    // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
+    std::size_t movesLeft = 8 * order.size();
+    for (std::size_t i = 1; i < order.size(); ++i) {
+        if (movesLeft < i) {
+            std::sort(order.begin(), order.end(), [&](int a, int b) {
+                const float depthOfA = depthOf(a), depthOfB = depthOf(b);
+                return depthOfA != depthOfB ? depthOfA < depthOfB : a < b;
+            });
+            return;
+        }
+        const int layer = order[i];
+        const float depth = depthOf(layer);
+        std::size_t j = i;
+        for (; j > 0; --j) {
+            const int before = order[j - 1];
+            const float beforeDepth = depthOf(before);
+            if (beforeDepth < depth || (beforeDepth == depth && before < layer))
+                break;
+            order[j] = before;
+        }
+        order[j] = layer;
+        movesLeft -= i - j;
+    }
+}
+
+// Sorts and blends four pixels, each for itself; `order` becomes that of the last one. For up to
+// SortNetwork::mostLayers layers.
+inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vector<Layer>& layers,
+                             std::vector<int>& order)
+{
+    const float *colors[SortNetwork::mostLayers], *depths[SortNetwork::mostLayers];
+    for (std::size_t k = 0; k < layers.size(); ++k) {
+        const Layer l = layers[k].from(begin);
+        colors[k] = l.color;
+        depths[k] = l.depth;
+    }
+    const int count = static_cast<int>(layers.size());
+    FourOrders orders;
+    sortFour(depths, SortNetwork::of(count), orders);
+    blendFour(row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + begin), row.transmittance.data() + x + begin,
+              colors, orders, count, row.minTransmittance);
+    takeDepths(row, x, begin, begin + 4, layers);
+    for (std::size_t k = 0; k < order.size(); ++k)
+        order[k] = static_cast<int>(orders[k][3]);
+}
+
+// Marks pixels [begin, end), in which the layers have this order, where some have equal depths.
+inline void countTies(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                      const std::vector<int>& order)
+{
+    for (std::size_t i = 1; i < order.size(); ++i)
+        for (int p = begin; p < end; ++p) {
+            const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
+            if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
+                && depth < std::numeric_limits<float>::infinity())
+                row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
+        }
+}
+
+// Layers 0, 1, 2 and so on.
+inline void resetOrder(std::vector<int>& order, std::size_t count)
+{
+    order.resize(count);
+    std::iota(order.begin(), order.end(), 0);
 }
 
 } // namespace detail
@@ -313,9 +377,7 @@ inline void blend(CompositeRow& row, int x, int begin, int end, const std::vecto
 // scratch space. There is a layer at least, here and below.
 inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
-    order.resize(layers.size());
-    for (std::size_t i = 0; i < order.size(); ++i)
-        order[i] = static_cast<int>(i);
+    detail::resetOrder(order, layers.size());
     detail::blend(row, x, 0, count, layers, order);
 }
 
@@ -325,53 +387,28 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     const std::size_t n = layers.size();
-    const bool sorted =
-        n > 1 && std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
-    if (!sorted) {
+    if (n == 1 || std::any_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth == nullptr; })) {
         blendInOrder(row, x, count, layers, order);
         return;
     }
-    order.resize(n);
-    for (std::size_t i = 0; i < n; ++i)
-        order[i] = static_cast<int>(i);
+    detail::resetOrder(order, n);
+    const bool inFours = count >= 4 && n <= static_cast<std::size_t>(detail::SortNetwork::mostLayers)
+                         && !layers.front().aux && row.rgbaLow.empty() && !row.countTies;
+    // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
     for (int begin = 0; begin < count;) {
-        // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
-        std::size_t movesLeft = 8 * n;
-        for (std::size_t i = 1; i < n; ++i) {
-            if (movesLeft < i) {
-                std::sort(order.begin(), order.end(), [&](int a, int b) {
-                    const float depthOfA = layers[static_cast<std::size_t>(a)].depth[begin];
-                    const float depthOfB = layers[static_cast<std::size_t>(b)].depth[begin];
-                    return depthOfA != depthOfB ? depthOfA < depthOfB : a < b;
-                });
-                break;
-            }
-            const int layer = order[i];
-            const float depth = layers[static_cast<std::size_t>(layer)].depth[begin];
-            std::size_t j = i;
-            for (; j > 0; --j) {
-                const int before = order[j - 1];
-                const float beforeDepth = layers[static_cast<std::size_t>(before)].depth[begin];
-                if (beforeDepth < depth || (beforeDepth == depth && before < layer))
-                    break;
-                order[j] = before;
-            }
-            order[j] = layer;
-            movesLeft -= i - j;
+        int end = detail::firstOutOfOrder(layers, order, begin, count);
+        if (inFours && end < count && end < begin + 4) {
+            begin = std::min(begin, count - 4);
+            detail::sortAndBlendFour(row, x, begin, layers, order);
+            begin += 4;
+            continue;
         }
-        int end = count;
-        for (std::size_t i = 1; i < n && end > begin + 1; ++i)
-            end = detail::firstOutOfOrder(layers[static_cast<std::size_t>(order[i - 1])].depth,
-                                          layers[static_cast<std::size_t>(order[i])].depth, order[i - 1] < order[i],
-                                          begin + 1, end);
+        if (end == begin) {
+            detail::sortAt(begin, layers, order);
+            end = detail::firstOutOfOrder(layers, order, begin + 1, count);
+        }
         if (row.countTies)
-            for (std::size_t i = 1; i < n; ++i)
-                for (int p = begin; p < end; ++p) {
-                    const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
-                    if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
-                        && depth < std::numeric_limits<float>::infinity())
-                        row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
-                }
+            detail::countTies(row, x, begin, end, layers, order);
         detail::blend(row, x, begin, end, layers, order);
         begin = end;
     }

@@ -45,21 +45,21 @@ inline void takeLayerPlain(double* rgba, double* transmittance, int count, const
     }
 }
 
-// Composites layers [first, last) of a group under one pixel. Under nothing, -0 becomes 0.
-template <bool HasLeast>
-inline void blendPixel(double* rgba, double& transmittance, std::ptrdiff_t pixel, const BlendGroup& group, int first,
-                       int last)
+// Composites the k-th layer, for k in [first, last), under one pixel. Under nothing, -0 becomes 0.
+template <bool HasLeast, class ColorOf>
+void blendPixel(double* rgba, double& transmittance, double minTransmittance, int first, int last,
+                const ColorOf& colorOf)
 {
     double red = rgba[0], green = rgba[1], blue = rgba[2], alpha = rgba[3], t = transmittance;
     for (int k = first; k < last; ++k) {
-        const float* color = group.colors[k] + 4 * pixel;
+        const float* color = colorOf(k);
         red += t * static_cast<double>(color[0]);
         green += t * static_cast<double>(color[1]);
         blue += t * static_cast<double>(color[2]);
         alpha += t * static_cast<double>(color[3]);
         t *= 1.0 - static_cast<double>(color[3]);
         if constexpr (HasLeast)
-            t = t < group.minTransmittance ? 0.0 : t;
+            t = t < minTransmittance ? 0.0 : t;
     }
     rgba[0] = red, rgba[1] = green, rgba[2] = blue, rgba[3] = alpha, transmittance = t;
 }
@@ -81,7 +81,8 @@ inline bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel
     for (int k = 0; k < group.layers && !isOpaque(transmittance, count);) {
         const int end = nextLook(k, group.layers);
         for (int p = 0; p < count; ++p)
-            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], pixel + p, group, k, end);
+            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], group.minTransmittance, k, end,
+                                 [&](int layer) { return group.colors[layer] + 4 * (pixel + p); });
         k = end;
     }
     return !isOpaque(transmittance, count);
@@ -97,6 +98,23 @@ inline bool blendGroupPlain(double* rgba, double* transmittance, int count, cons
     for (std::ptrdiff_t i = inBlocks; i < count; ++i)
         isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 1, group);
     return isSeen;
+}
+
+// Four pixels, each with an order of its own. `colors`: of the first of them, by layer. `orders[k][p]`: which layer is
+// the k-th, seen from the front, at pixel p.
+template <bool HasLeast>
+void blendFourPlain(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
+                    int layers, double minTransmittance)
+{
+    std::fill_n(rgba, 16, 0.0);
+    std::fill_n(transmittance, 4, 1.0);
+    for (int k = 0; k < layers && !isOpaque(transmittance, 4);) {
+        const int end = nextLook(k, layers);
+        for (int p = 0; p < 4; ++p)
+            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], minTransmittance, k, end,
+                                 [&](int place) { return colors[orders[place][p]] + 4 * p; });
+        k = end;
+    }
 }
 
 // ---- AVX2
@@ -207,6 +225,22 @@ DFB_AVX2 bool blendGroupAvx2(double* rgba, double* transmittance, int count, con
     return isSeen;
 }
 
+template <bool HasLeast>
+DFB_AVX2 void blendFourAvx2(double* rgba, double* transmittance, const float* const* colors,
+                            const std::uint32_t (*orders)[4], int layers, double minTransmittance)
+{
+    Avx2Block<HasLeast> block;
+    block.clear();
+    for (int k = 0; k < layers && !block.isOpaque();)
+        for (const int end = nextLook(k, layers); k < end; ++k) {
+            block.a.add(colors[orders[k][0]], minTransmittance);
+            block.b.add(colors[orders[k][1]] + 4, minTransmittance);
+            block.c.add(colors[orders[k][2]] + 8, minTransmittance);
+            block.d.add(colors[orders[k][3]] + 12, minTransmittance);
+        }
+    block.store(rgba, transmittance);
+}
+
 #endif
 
 // ---- the faster one
@@ -231,6 +265,21 @@ inline bool blendGroup(double* rgba, double* transmittance, int count, const Ble
 #endif
     return group.minTransmittance > 0 ? blendGroupPlain<true>(rgba, transmittance, count, group)
                                       : blendGroupPlain<false>(rgba, transmittance, count, group);
+}
+
+inline void blendFour(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
+                      int layers, double minTransmittance)
+{
+    const bool hasLeast = minTransmittance > 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        (hasLeast ? blendFourAvx2<true> : blendFourAvx2<false>)(rgba, transmittance, colors, orders, layers,
+                                                                minTransmittance);
+        return;
+    }
+#endif
+    (hasLeast ? blendFourPlain<true> : blendFourPlain<false>)(rgba, transmittance, colors, orders, layers,
+                                                              minTransmittance);
 }
 
 } // namespace dfb::detail
