@@ -293,7 +293,7 @@ inline int firstOutOfOrder(const std::vector<Layer>& layers, const std::vector<i
         const std::size_t count = std::min<std::size_t>(OrderedDepths::mostLayers, order.size() - first);
         for (std::size_t k = 0; k < count; ++k) {
             some.depths[k] = layers[static_cast<std::size_t>(order[first + k])].depth;
-            some.winsTies[k] = first + k + 1 < order.size() && order[first + k] < order[first + k + 1];
+            some.losesTies[k] = first + k + 1 < order.size() && order[first + k] > order[first + k + 1] ? -1 : 0;
         }
         some.layers = static_cast<int>(count);
         end = firstOutOfOrder(some, begin, end);

@@ -152,7 +152,7 @@ TEST_CASE("How far an order of depths holds: by hand as in plain C++", "[kernels
         const Stack stack(random, Kind::Any, 2 + static_cast<int>(below(random, 15)), width);
         d::OrderedDepths order;
         for (const dfb::Layer& layer : stack.layers) {
-            order.winsTies[order.layers] = below(random, 4) > 0;
+            order.losesTies[order.layers] = below(random, 4) > 0 ? 0 : -1;
             order.depths[order.layers++] = layer.depth;
         }
         if (round % 2 == 0) // and where most of it is in order
@@ -164,7 +164,7 @@ TEST_CASE("How far an order of depths holds: by hand as in plain C++", "[kernels
         const auto isRight = [&](int x) {
             for (int k = 0; k + 1 < order.layers; ++k) {
                 const float front = order.depths[k][x], back = order.depths[k + 1][x];
-                if (!(order.winsTies[k] ? front <= back : front < back))
+                if (!(order.losesTies[k] ? front < back : front <= back))
                     return false;
             }
             return true;

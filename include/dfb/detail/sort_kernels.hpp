@@ -24,7 +24,7 @@ struct OrderedDepths {
     static constexpr int mostLayers = 16;
 
     const float* depths[mostLayers];
-    bool winsTies[mostLayers]; // whether equal depths are right between this layer and the next
+    std::int32_t losesTies[mostLayers]; // between this layer and the next equal depths are wrong: -1, else 0
     int layers = 0;
 };
 
@@ -34,7 +34,7 @@ inline int firstOutOfOrderPlain(const OrderedDepths& order, int begin, int end)
     constexpr int chunk = 16;
     for (int k = 0; k + 1 < order.layers; ++k) {
         const float *front = order.depths[k], *back = order.depths[k + 1];
-        const bool winsTies = order.winsTies[k];
+        const bool winsTies = order.losesTies[k] == 0;
         int x = begin;
         for (; x + chunk <= end; x += chunk) {
             int wrong = 0;
@@ -68,8 +68,10 @@ DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, i
         __m256 front = _mm256_maskload_ps(depths[0] + x, lanes);
         for (int k = 0; k + 1 < order.layers; ++k) {
             const __m256 back = _mm256_maskload_ps(depths[k + 1] + x, lanes);
-            wrong = _mm256_or_ps(wrong, order.winsTies[k] ? _mm256_cmp_ps(front, back, _CMP_NLE_UQ)
-                                                          : _mm256_cmp_ps(front, back, _CMP_NLT_UQ));
+            // Without a branch, as who wins is random where depths are.
+            const __m256 losesTies = _mm256_castsi256_ps(_mm256_set1_epi32(order.losesTies[k]));
+            wrong = _mm256_or_ps(wrong, _mm256_cmp_ps(front, back, _CMP_NLE_UQ));
+            wrong = _mm256_or_ps(wrong, _mm256_and_ps(losesTies, _mm256_cmp_ps(front, back, _CMP_EQ_OQ)));
             front = back;
         }
         const int bits = _mm256_movemask_ps(_mm256_and_ps(wrong, _mm256_castsi256_ps(lanes)));
