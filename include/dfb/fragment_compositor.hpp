@@ -43,10 +43,31 @@ public:
     // Composites the next row of all fragments into `row`, which has been sized for the region's width.
     void nextRow(CompositeRow& row)
     {
-        edges_.clear();
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
+        const bool isOneRun = takeRows(wantsAux) && !wantsAux;
+        const int width = static_cast<int>(row.transmittance.size());
+        if (active_.empty()) {
+            row.clear(0, width);
+        } else if (isOneRun) {
+            const Span span = *active_.front().spans;
+            row.clear(0, span.x);
+            row.clear(span.x + span.count, width - span.x - span.count);
+            layers_.resize(active_.size());
+            for (std::size_t k = 0; k < layers_.size(); ++k)
+                layers_[k] = {active_[k].color, active_[k].depth, nullptr};
+            composite(row, span.x, span.count);
+        } else {
+            compositeRuns(row, wantsAux);
+        }
+    }
+
+private:
+    // The rows of the fragments that have one. True if each is one run of pixels, the same in all.
+    bool takeRows(bool wantsAux)
+    {
+        bool isOneRun = true;
         active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
         std::size_t rows = 0;
         for (FragmentCursor& cursor : cursors_) {
@@ -57,20 +78,26 @@ public:
             if (wantsAux)
                 r.aux = cursor.aux();
             cursor.advance(r);
+            const Span &a = *r.spans, &b = *active_.front().spans;
+            isOneRun = isOneRun && r.spanCount == 1 && a.x == b.x && a.count == b.count;
+        }
+        active_.resize(rows);
+        return isOneRun;
+    }
+
+    void compositeRuns(CompositeRow& row, bool wantsAux)
+    {
+        edges_.clear();
+        for (const FragmentRow& r : active_)
             for (int i = 0; i < r.spanCount; ++i) {
                 edges_.push_back(r.spans[i].x);
                 edges_.push_back(r.spans[i].x + r.spans[i].count);
             }
-        }
-        active_.resize(rows);
         // Between two neighbouring edges the set of layers is constant.
         std::sort(edges_.begin(), edges_.end());
         edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
-        const int width = static_cast<int>(row.transmittance.size());
-        if (edges_.empty())
-            row.clear(0, width);
-        else
-            row.clear(0, edges_.front()), row.clear(edges_.back(), width - edges_.back());
+        row.clear(0, edges_.front());
+        row.clear(edges_.back(), static_cast<int>(row.transmittance.size()) - edges_.back());
         for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
             const int x0 = edges_[e], x1 = edges_[e + 1];
             layers_.clear();
@@ -94,19 +121,23 @@ public:
                     }
                 }
             }
-            if (layers_.empty()) {
+            if (layers_.empty())
                 row.clear(x0, x1 - x0);
-                continue;
-            }
-            switch (rule_) {
-            case BlendRule::SortByDepth: sortAndBlend(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::Nearest: keepNearest(row, x0, x1 - x0, layers_); break;
-            }
+            else
+                composite(row, x0, x1 - x0);
         }
     }
 
-private:
+    // layers_, which are `count` pixels each.
+    void composite(CompositeRow& row, int x, int count)
+    {
+        switch (rule_) {
+        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_); break;
+        case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
+        case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
+        }
+    }
+
     BlendRule rule_;
     std::vector<FragmentCursor> cursors_;
     std::vector<FragmentRow> active_;
