@@ -68,6 +68,7 @@ DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, i
         __m256 front = _mm256_maskload_ps(depths[0] + x, lanes);
         for (int k = 0; k + 1 < order.layers; ++k) {
             const __m256 back = _mm256_maskload_ps(depths[k + 1] + x, lanes);
+            _mm_prefetch(reinterpret_cast<const char*>(depths[k + 1] + x + 128), _MM_HINT_T0); // rows to come
             // Without a branch, as who wins is random where depths are.
             const __m256 losesTies = _mm256_castsi256_ps(_mm256_set1_epi32(order.losesTies[k]));
             wrong = _mm256_or_ps(wrong, _mm256_cmp_ps(front, back, _CMP_NLE_UQ));
