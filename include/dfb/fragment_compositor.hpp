@@ -132,7 +132,7 @@ private:
     void composite(CompositeRow& row, int x, int count)
     {
         switch (rule_) {
-        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_); break;
+        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_, true); break;
         case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
         case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
         }

@@ -251,7 +251,11 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
         row.clear(0, x);
         expected = row;
         expected.clear(0, x + width);
-        dfb::sortAndBlend(row, x, width, stack.layers, scratch);
+        dfb::sortAndBlend(row, x, width, stack.layers, scratch, round % 4 < 2); // from other layers, mostly
+        if (round % 4 == 0) {
+            std::shuffle(scratch.begin(), scratch.end(), random);
+            dfb::sortAndBlend(row, x, width, stack.layers, scratch, true);
+        }
         std::vector<std::size_t> order(stack.layers.size());
         for (int i = 0; i < width; ++i) {
             std::iota(order.begin(), order.end(), 0u);
