@@ -208,7 +208,7 @@ public:
             for (int sample = 0; sample < 41; ++sample) {
                 double start = bench::now();
                 for (int i = 0; i < rounds; ++i) {
-                    dfb::detail::blendBlocks(row, 0, 0, width, stack, order);
+                    dfb::detail::blend(row, 0, 0, width, stack, order);
                     dfb::convertPixels(row.rgba.data(), width, dfb::OutputFormat::RGBA8, bytes.data());
                 }
                 exact.push_back(1e9 * (bench::now() - start) / rounds / width);

@@ -9,14 +9,16 @@
 // again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/channels.hpp>
+#include <dfb/detail/blend_kernels.hpp>
+#include <dfb/detail/sort_kernels.hpp>
 #include <dfb/double_double.hpp>
-#include <dfb/fragment.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <numeric>
 #include <vector>
 
 namespace dfb {
@@ -226,77 +228,37 @@ inline void overBackground(CompositeRow& row, const float (&rgba)[4])
 
 namespace detail {
 
-// The order of layers is constant over most neighbouring pixels. Returns the first pixel in [begin, end) where
-// layer `front` does not come before layer `back`; `frontWinsTies` tells how equal depths are decided.
-inline int firstOutOfOrder(const float* front, const float* back, bool frontWinsTies, int begin, int end)
-{
-    constexpr int chunk = 16;
-    int x = begin;
-    for (; x + chunk <= end; x += chunk) {
-        int wrong = 0;
-        if (frontWinsTies)
-            for (int k = 0; k < chunk; ++k)
-                wrong |= !(front[x + k] <= back[x + k]);
-        else
-            for (int k = 0; k < chunk; ++k)
-                wrong |= !(front[x + k] < back[x + k]);
-        if (wrong)
-            break;
-    }
-    for (; x < end; ++x)
-        if (!(frontWinsTies ? front[x] <= back[x] : front[x] < back[x]))
-            return x;
-    return end;
-}
-
-// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on: block by block, so that what
-// is accumulated stays where it is computed. Behind a block that nothing comes through there is nothing to do.
-DFB_INLINE void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                            const std::vector<int>& order)
-{
-    constexpr int block = 16;
-    for (int first = begin; first < end; first += block) {
-        const int count = std::min(block, end - first);
-        double* acc = row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + first);
-        double* t = row.transmittance.data() + x + first;
-        const float* front = layers[static_cast<std::size_t>(order[0])].from(first).color;
-        for (int i = 0; i < 4 * count; ++i)
-            acc[i] = 0.0 + static_cast<double>(front[i]); // -0 becomes 0
-        for (int i = 0; i < count; ++i)
-            t[i] = 1.0 - static_cast<double>(front[4 * i + 3]);
-        for (std::size_t k = 1; k < order.size() && !closeOpaque(row, x + first, count); ++k) {
-            const float* c = layers[static_cast<std::size_t>(order[k])].from(first).color;
-            for (int i = 0; i < count; ++i) {
-                const double through = t[i];
-                acc[4 * i] += through * static_cast<double>(c[4 * i]);
-                acc[4 * i + 1] += through * static_cast<double>(c[4 * i + 1]);
-                acc[4 * i + 2] += through * static_cast<double>(c[4 * i + 2]);
-                acc[4 * i + 3] += through * static_cast<double>(c[4 * i + 3]);
-                t[i] = through * (1.0 - static_cast<double>(c[4 * i + 3]));
-            }
-        }
-        closeOpaque(row, x + first, count); // for the background
-    }
-}
-DFB_AVX2 inline void blendColorsAvx2(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                                     const std::vector<int>& order)
-{
-    blendColors(row, x, begin, end, layers, order);
-}
-
-inline void blendBlocks(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on.
+inline void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                         const std::vector<int>& order)
 {
-    if (cpuHasAvx2())
-        blendColorsAvx2(row, x, begin, end, layers, order);
-    else
-        blendColors(row, x, begin, end, layers, order);
+    double* rgba = row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + begin);
+    double* transmittance = row.transmittance.data() + x + begin;
+    const auto colorOf = [&](std::size_t k) { return layers[static_cast<std::size_t>(order[k])].from(begin).color; };
+    if (order.size() == 1) {
+        takeLayer(rgba, transmittance, end - begin, colorOf(0), row.minTransmittance);
+        return;
+    }
+    BlendGroup group;
+    group.minTransmittance = row.minTransmittance;
+    for (std::size_t k = 0; k < order.size();) {
+        for (group.layers = 0; k < order.size() && group.layers < BlendGroup::mostLayers; ++k)
+            group.colors[group.layers++] = colorOf(k);
+        if (!blendGroup(rgba, transmittance, end - begin, group))
+            break;
+        group.isFirst = false;
+    }
+}
+
+// The nearest depths of pixels [begin, end), if they are wanted.
+inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers)
+{
     if (!row.wantsDepth)
         return;
     float* nearest = row.depth.data() + x + begin;
     std::fill_n(nearest, end - begin, std::numeric_limits<float>::infinity());
-    for (const int layer : order)
-        if (const Layer l = layers[static_cast<std::size_t>(layer)].from(begin); l.depth)
+    for (const Layer& layer : layers) // of equal depths, such as 0 and -0, that of the first
+        if (const Layer l = layer.from(begin); l.depth)
             takeNearest(nearest, end - begin, l);
 }
 
@@ -320,7 +282,93 @@ inline void blend(CompositeRow& row, int x, int begin, int end, const std::vecto
     if (layers.front().aux || !row.rgbaLow.empty())
         blendFully(row, x, begin, end, layers, order);
     else
-        blendBlocks(row, x, begin, end, layers, order);
+        blendColors(row, x, begin, end, layers, order), takeDepths(row, x, begin, end, layers);
+}
+
+// The first pixel in [begin, end) where the order of the layers is not that of their depths; end if there is none.
+inline int firstOutOfOrder(const std::vector<Layer>& layers, const std::vector<int>& order, int begin, int end)
+{
+    OrderedDepths some;
+    for (std::size_t first = 0; first + 1 < order.size() && begin < end; first += OrderedDepths::mostLayers - 1) {
+        const std::size_t count = std::min<std::size_t>(OrderedDepths::mostLayers, order.size() - first);
+        for (std::size_t k = 0; k < count; ++k) {
+            some.depths[k] = layers[static_cast<std::size_t>(order[first + k])].depth;
+            some.losesTies[k] = first + k + 1 < order.size() && order[first + k] > order[first + k + 1] ? -1 : 0;
+        }
+        some.layers = static_cast<int>(count);
+        end = firstOutOfOrder(some, begin, end);
+    }
+    return end;
+}
+
+// Puts the layers into the order that they have at a pixel.
+inline void sortAt(int pixel, const std::vector<Layer>& layers, std::vector<int>& order)
+{
+    const auto depthOf = [&](int layer) { return layers[static_cast<std::size_t>(layer)].depth[pixel]; };
+    // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
+    std::size_t movesLeft = 8 * order.size();
+    for (std::size_t i = 1; i < order.size(); ++i) {
+        if (movesLeft < i) {
+            std::sort(order.begin(), order.end(), [&](int a, int b) {
+                const float depthOfA = depthOf(a), depthOfB = depthOf(b);
+                return depthOfA != depthOfB ? depthOfA < depthOfB : a < b;
+            });
+            return;
+        }
+        const int layer = order[i];
+        const float depth = depthOf(layer);
+        std::size_t j = i;
+        for (; j > 0; --j) {
+            const int before = order[j - 1];
+            const float beforeDepth = depthOf(before);
+            if (beforeDepth < depth || (beforeDepth == depth && before < layer))
+                break;
+            order[j] = before;
+        }
+        order[j] = layer;
+        movesLeft -= i - j;
+    }
+}
+
+// Sorts and blends four pixels, each for itself; `order` becomes that of the last one. For up to
+// SortNetwork::mostLayers layers.
+inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vector<Layer>& layers,
+                             std::vector<int>& order)
+{
+    const float *colors[SortNetwork::mostLayers], *depths[SortNetwork::mostLayers];
+    for (std::size_t k = 0; k < layers.size(); ++k) {
+        const Layer l = layers[k].from(begin);
+        colors[k] = l.color;
+        depths[k] = l.depth;
+    }
+    const int count = static_cast<int>(layers.size());
+    FourOrders orders;
+    sortFour(depths, SortNetwork::of(count), orders);
+    blendFour(row.rgba.data() + 4 * static_cast<std::ptrdiff_t>(x + begin), row.transmittance.data() + x + begin,
+              colors, orders, count, row.minTransmittance);
+    takeDepths(row, x, begin, begin + 4, layers);
+    for (std::size_t k = 0; k < order.size(); ++k)
+        order[k] = static_cast<int>(orders[k][3]);
+}
+
+// Marks pixels [begin, end), in which the layers have this order, where some have equal depths.
+inline void countTies(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
+                      const std::vector<int>& order)
+{
+    for (std::size_t i = 1; i < order.size(); ++i)
+        for (int p = begin; p < end; ++p) {
+            const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
+            if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
+                && depth < std::numeric_limits<float>::infinity())
+                row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
+        }
+}
+
+// Layers 0, 1, 2 and so on.
+inline void resetOrder(std::vector<int>& order, std::size_t count)
+{
+    order.resize(count);
+    std::iota(order.begin(), order.end(), 0);
 }
 
 } // namespace detail
@@ -329,68 +377,55 @@ inline void blend(CompositeRow& row, int x, int begin, int end, const std::vecto
 // scratch space. There is a layer at least, here and below.
 inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
-    order.resize(layers.size());
-    for (std::size_t i = 0; i < order.size(); ++i)
-        order[i] = static_cast<int>(i);
+    detail::resetOrder(order, layers.size());
     detail::blend(row, x, 0, count, layers, order);
 }
 
+namespace detail {
+
+// Sorts and blends, beginning with layers in `order`: the better that is, the sooner it is done. All have a depth.
+inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vector<Layer>& layers,
+                             std::vector<int>& order)
+{
+    const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(SortNetwork::mostLayers)
+                         && !layers.front().aux && row.rgbaLow.empty() && !row.countTies;
+    // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
+    for (int begin = 0; begin < count;) {
+        int end = firstOutOfOrder(layers, order, begin, count);
+        if (inFours && end < count && end < begin + 4) {
+            begin = std::min(begin, count - 4);
+            sortAndBlendFour(row, x, begin, layers, order);
+            begin += 4;
+            continue;
+        }
+        if (end == begin) {
+            sortAt(begin, layers, order);
+            end = firstOutOfOrder(layers, order, begin + 1, count);
+        }
+        if (row.countTies)
+            countTies(row, x, begin, end, layers, order);
+        blend(row, x, begin, end, layers, order);
+        begin = end;
+    }
+}
+
+} // namespace detail
+
 // Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to
 // back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
-// without depth makes all depths count as equal. `order` is scratch space.
-inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
+// without depth makes all depths count as equal. `order` is scratch space; with `orderIsKept`, which is quicker, it is
+// what the last call left of it.
+inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order,
+                         bool orderIsKept = false)
 {
-    const std::size_t n = layers.size();
-    const bool sorted =
-        n > 1 && std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
-    if (!sorted) {
+    if (layers.size() == 1
+        || std::any_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth == nullptr; })) {
         blendInOrder(row, x, count, layers, order);
         return;
     }
-    order.resize(n);
-    for (std::size_t i = 0; i < n; ++i)
-        order[i] = static_cast<int>(i);
-    for (int begin = 0; begin < count;) {
-        // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
-        std::size_t movesLeft = 8 * n;
-        for (std::size_t i = 1; i < n; ++i) {
-            if (movesLeft < i) {
-                std::sort(order.begin(), order.end(), [&](int a, int b) {
-                    const float depthOfA = layers[static_cast<std::size_t>(a)].depth[begin];
-                    const float depthOfB = layers[static_cast<std::size_t>(b)].depth[begin];
-                    return depthOfA != depthOfB ? depthOfA < depthOfB : a < b;
-                });
-                break;
-            }
-            const int layer = order[i];
-            const float depth = layers[static_cast<std::size_t>(layer)].depth[begin];
-            std::size_t j = i;
-            for (; j > 0; --j) {
-                const int before = order[j - 1];
-                const float beforeDepth = layers[static_cast<std::size_t>(before)].depth[begin];
-                if (beforeDepth < depth || (beforeDepth == depth && before < layer))
-                    break;
-                order[j] = before;
-            }
-            order[j] = layer;
-            movesLeft -= i - j;
-        }
-        int end = count;
-        for (std::size_t i = 1; i < n && end > begin + 1; ++i)
-            end = detail::firstOutOfOrder(layers[static_cast<std::size_t>(order[i - 1])].depth,
-                                          layers[static_cast<std::size_t>(order[i])].depth, order[i - 1] < order[i],
-                                          begin + 1, end);
-        if (row.countTies)
-            for (std::size_t i = 1; i < n; ++i)
-                for (int p = begin; p < end; ++p) {
-                    const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
-                    if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
-                        && depth < std::numeric_limits<float>::infinity())
-                        row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
-                }
-        detail::blend(row, x, begin, end, layers, order);
-        begin = end;
-    }
+    if (!orderIsKept || order.size() != layers.size())
+        detail::resetOrder(order, layers.size());
+    detail::sortAndBlendFrom(row, x, count, layers, order);
 }
 
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
@@ -417,111 +452,5 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
         over(row, x + i, 1, l);
     }
 }
-
-// How the inputs of a pixel become one.
-enum class BlendRule {
-    SortByDepth, // sortAndBlend
-    InOrder,     // over, in the order of the fragments
-    Nearest      // keepNearest
-};
-
-// Composites the fragments of one tile and pass, row by row. The fragments' order decides between equal depths:
-// sort them by (source, part) first.
-class FragmentCompositor {
-public:
-    explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
-
-    // `begin` to `end` are iterators of pointers to fragments, which must outlive this.
-    template <class Iterator>
-    void start(Iterator begin, Iterator end)
-    {
-        cursors_.clear();
-        for (; begin != end; ++begin)
-            if (!(*begin)->empty())
-                cursors_.emplace_back(**begin);
-    }
-
-    void skipRows(int count)
-    {
-        for (FragmentCursor& cursor : cursors_)
-            for (int i = 0; i < count; ++i)
-                cursor.next();
-    }
-
-    // Composites the next row of all fragments into `row`, which has been sized for the region's width.
-    void nextRow(CompositeRow& row)
-    {
-        edges_.clear();
-        const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
-                              || !row.aux.position.empty() || !row.aux.primitiveId.empty()
-                              || !row.aux.instanceId.empty();
-        active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
-        std::size_t rows = 0;
-        for (FragmentCursor& cursor : cursors_) {
-            FragmentRow& r = active_[rows];
-            if (!cursor.next(r))
-                continue;
-            ++rows;
-            if (wantsAux)
-                r.aux = cursor.aux();
-            cursor.advance(r);
-            for (int i = 0; i < r.spanCount; ++i) {
-                edges_.push_back(r.spans[i].x);
-                edges_.push_back(r.spans[i].x + r.spans[i].count);
-            }
-        }
-        active_.resize(rows);
-        // Between two neighbouring edges the set of layers is constant.
-        std::sort(edges_.begin(), edges_.end());
-        edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
-        const int width = static_cast<int>(row.transmittance.size());
-        if (edges_.empty())
-            row.clear(0, width);
-        else
-            row.clear(0, edges_.front()), row.clear(edges_.back(), width - edges_.back());
-        for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
-            const int x0 = edges_[e], x1 = edges_[e + 1];
-            layers_.clear();
-            aux_.resize(wantsAux ? active_.size() : 0); // before anybody points into it
-            for (FragmentRow& r : active_) {
-                while (r.spanCount > 0 && r.spans->x + r.spans->count <= x0) {
-                    r.color += 4 * static_cast<std::ptrdiff_t>(r.spans->count);
-                    if (r.depth)
-                        r.depth += r.spans->count;
-                    if (wantsAux)
-                        r.aux.advance(r.spans->count);
-                    ++r.spans;
-                    --r.spanCount;
-                }
-                if (r.spanCount > 0 && r.spans->x <= x0) {
-                    const int offset = x0 - r.spans->x;
-                    layers_.push_back(Layer{r.color, r.depth, nullptr}.from(offset));
-                    if (wantsAux) {
-                        aux_[layers_.size() - 1] = r.aux.from(static_cast<std::size_t>(offset));
-                        layers_.back().aux = &aux_[layers_.size() - 1];
-                    }
-                }
-            }
-            if (layers_.empty()) {
-                row.clear(x0, x1 - x0);
-                continue;
-            }
-            switch (rule_) {
-            case BlendRule::SortByDepth: sortAndBlend(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::InOrder: blendInOrder(row, x0, x1 - x0, layers_, order_); break;
-            case BlendRule::Nearest: keepNearest(row, x0, x1 - x0, layers_); break;
-            }
-        }
-    }
-
-private:
-    BlendRule rule_;
-    std::vector<FragmentCursor> cursors_;
-    std::vector<FragmentRow> active_;
-    std::vector<detail::ConstPlanes> aux_; // of layers_
-    std::vector<int> edges_;
-    std::vector<Layer> layers_;
-    std::vector<int> order_;
-};
 
 } // namespace dfb

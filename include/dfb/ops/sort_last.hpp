@@ -2,7 +2,7 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
-#include <dfb/compositing.hpp>
+#include <dfb/fragment_compositor.hpp>
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>
@@ -148,14 +148,17 @@ public:
         const float background[4] = {info_.background[0], info_.background[1], info_.background[2],
                                      info_.background[3]};
         const int width = info_.region.width();
+        scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
+        scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
+        scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
+        scratch.row.resize(width, tracked_);
+        const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
+        scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
         for (int y = 0; y < info_.region.height(); ++y) {
-            scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
-            scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
-            scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
-            const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
-            scratch.isUndefined.assign(tracksOrder ? static_cast<std::size_t>(width) : 0, 0);
+            std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
             for (std::size_t pass = 0; pass < passes; ++pass) {
-                scratch.row.resize(width, tracked_);
+                if (tracked_ != 0 || scratch.row.countTies) // of colour and depth nothing stays from the last row
+                    scratch.row.resize(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
                 overBackground(scratch.row, background);
                 for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)

@@ -1,0 +1,285 @@
+// The kernels of blending: layers under pixels, in double. Each is there in plain C++ and, for processors that have it,
+// by hand for AVX2; the two give the same bits, as products and sums are the same and rounded one by one.
+//
+// A pixel that nothing comes through any more is blended like the others, unless its whole block is opaque: then the
+// layers behind are left out. That is looked at after the first layer and every fourth from there. Of what is behind,
+// an infinity or a NaN can therefore show in an opaque pixel, or not; nothing that is finite can.
+#pragma once
+
+#include <dfb/cpu.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+
+#if defined(DFB_HAS_AVX2_CLONES)
+#include <immintrin.h>
+#endif
+
+namespace dfb::detail {
+
+// Layers to be composited at once under a run of pixels, front to back. Few, as a processor follows few streams of
+// memory, and each is read for the whole run before the next layers are.
+struct BlendGroup {
+    static constexpr int mostLayers = 8;
+
+    const float* colors[mostLayers]; // RGBA of the run's first pixel
+    int layers = 0;
+    bool isFirst = true;         // the layers are in front of all others: what the pixels hold does not count
+    double minTransmittance = 0; // what lets less through counts as opaque
+};
+
+// Up to which layer, of `layers`, to go on after k of them before it is looked whether the pixels are opaque.
+constexpr int nextLook(int k, int layers) noexcept { return std::min(layers, k == 0 ? 1 : k + 4); }
+
+// ---- plain
+
+// A single layer: what it has, in double.
+inline void takeLayerPlain(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
+{
+    for (int i = 0; i < 4 * count; ++i)
+        rgba[i] = 0.0 + static_cast<double>(color[i]); // -0 becomes 0
+    for (int i = 0; i < count; ++i) {
+        const double t = 1.0 - static_cast<double>(color[4 * i + 3]);
+        transmittance[i] = minTransmittance > 0 && t < minTransmittance ? 0.0 : t;
+    }
+}
+
+// Composites the k-th layer, for k in [first, last), under one pixel. Under nothing, -0 becomes 0.
+template <bool HasLeast, class ColorOf>
+void blendPixel(double* rgba, double& transmittance, double minTransmittance, int first, int last,
+                const ColorOf& colorOf)
+{
+    double red = rgba[0], green = rgba[1], blue = rgba[2], alpha = rgba[3], t = transmittance;
+    for (int k = first; k < last; ++k) {
+        const float* color = colorOf(k);
+        red += t * static_cast<double>(color[0]);
+        green += t * static_cast<double>(color[1]);
+        blue += t * static_cast<double>(color[2]);
+        alpha += t * static_cast<double>(color[3]);
+        t *= 1.0 - static_cast<double>(color[3]);
+        if constexpr (HasLeast)
+            t = t < minTransmittance ? 0.0 : t;
+    }
+    rgba[0] = red, rgba[1] = green, rgba[2] = blue, rgba[3] = alpha, transmittance = t;
+}
+
+inline bool isOpaque(const double* transmittance, int count)
+{
+    return std::all_of(transmittance, transmittance + count, [](double t) { return t == 0.0; });
+}
+
+// Composites the layers under `count` pixels from `pixel` on, which are a block. False if nothing behind them can be
+// seen; so below.
+template <bool HasLeast>
+inline bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel, int count, const BlendGroup& group)
+{
+    if (group.isFirst) {
+        std::fill_n(rgba, 4 * count, 0.0);
+        std::fill_n(transmittance, count, 1.0);
+    }
+    for (int k = 0; k < group.layers && !isOpaque(transmittance, count);) {
+        const int end = nextLook(k, group.layers);
+        for (int p = 0; p < count; ++p)
+            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], group.minTransmittance, k, end,
+                                 [&](int layer) { return group.colors[layer] + 4 * (pixel + p); });
+        k = end;
+    }
+    return !isOpaque(transmittance, count);
+}
+
+template <bool HasLeast>
+inline bool blendGroupPlain(double* rgba, double* transmittance, int count, const BlendGroup& group)
+{
+    bool isSeen = false;
+    const std::ptrdiff_t inBlocks = count - count % 4;
+    for (std::ptrdiff_t i = 0; i < inBlocks; i += 4)
+        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 4, group);
+    for (std::ptrdiff_t i = inBlocks; i < count; ++i)
+        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 1, group);
+    return isSeen;
+}
+
+// Four pixels, each with an order of its own. `colors`: of the first of them, by layer. `orders[k][p]`: which layer is
+// the k-th, seen from the front, at pixel p.
+template <bool HasLeast>
+void blendFourPlain(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
+                    int layers, double minTransmittance)
+{
+    std::fill_n(rgba, 16, 0.0);
+    std::fill_n(transmittance, 4, 1.0);
+    for (int k = 0; k < layers && !isOpaque(transmittance, 4);) {
+        const int end = nextLook(k, layers);
+        for (int p = 0; p < 4; ++p)
+            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], minTransmittance, k, end,
+                                 [&](int place) { return colors[orders[place][p]] + 4 * p; });
+        k = end;
+    }
+}
+
+// ---- AVX2
+
+#if defined(DFB_HAS_AVX2_CLONES)
+
+DFB_AVX2 inline void takeLayerAvx2(double* rgba, double* transmittance, int count, const float* color,
+                                   double minTransmittance)
+{
+    const __m256d zero = _mm256_setzero_pd(), one = _mm256_set1_pd(1.0), least = _mm256_set1_pd(minTransmittance);
+    const std::ptrdiff_t inBlocks = count - count % 4;
+    for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
+        const __m256d a = _mm256_cvtps_pd(_mm_loadu_ps(color + 4 * i));
+        const __m256d b = _mm256_cvtps_pd(_mm_loadu_ps(color + 4 * i + 4));
+        const __m256d c = _mm256_cvtps_pd(_mm_loadu_ps(color + 4 * i + 8));
+        const __m256d d = _mm256_cvtps_pd(_mm_loadu_ps(color + 4 * i + 12));
+        _mm256_storeu_pd(rgba + 4 * i, _mm256_add_pd(zero, a));
+        _mm256_storeu_pd(rgba + 4 * i + 4, _mm256_add_pd(zero, b));
+        _mm256_storeu_pd(rgba + 4 * i + 8, _mm256_add_pd(zero, c));
+        _mm256_storeu_pd(rgba + 4 * i + 12, _mm256_add_pd(zero, d));
+        const __m256d alpha = _mm256_permute2f128_pd(_mm256_unpackhi_pd(a, b), _mm256_unpackhi_pd(c, d), 0x31);
+        __m256d t = _mm256_sub_pd(one, alpha);
+        if (minTransmittance > 0)
+            t = _mm256_and_pd(t, _mm256_cmp_pd(t, least, _CMP_NLT_UQ));
+        _mm256_storeu_pd(transmittance + i, t);
+    }
+    takeLayerPlain(rgba + 4 * inBlocks, transmittance + inBlocks, count % 4, color + 4 * inBlocks, minTransmittance);
+}
+
+// A pixel is one register, and so is what it lets through, four times.
+template <bool HasLeast>
+struct Avx2Pixel {
+    __m256d sum, through;
+
+    DFB_AVX2 DFB_INLINE void clear()
+    {
+        sum = _mm256_setzero_pd();
+        through = _mm256_set1_pd(1.0);
+    }
+    DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* transmittance)
+    {
+        sum = _mm256_loadu_pd(rgba);
+        through = _mm256_broadcast_sd(transmittance);
+    }
+    DFB_AVX2 DFB_INLINE void store(double* rgba, double* transmittance) const
+    {
+        _mm256_storeu_pd(rgba, sum);
+        _mm_store_sd(transmittance, _mm256_castpd256_pd128(through));
+    }
+    DFB_AVX2 DFB_INLINE void add(const float* color, double minTransmittance)
+    {
+        const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
+        sum = _mm256_add_pd(sum, _mm256_mul_pd(through, v));
+        through = _mm256_mul_pd(through, _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff)));
+        if constexpr (HasLeast) // what is less than that becomes 0, a NaN stays
+            through = _mm256_and_pd(through, _mm256_cmp_pd(through, _mm256_set1_pd(minTransmittance), _CMP_NLT_UQ));
+    }
+};
+
+// Four of them, each in registers of its own: as an array they would go through memory where loops are not unrolled.
+template <bool HasLeast>
+struct Avx2Block {
+    Avx2Pixel<HasLeast> a, b, c, d;
+
+    DFB_AVX2 DFB_INLINE void clear() { a.clear(), b.clear(), c.clear(), d.clear(); }
+    DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* t)
+    {
+        a.load(rgba, t), b.load(rgba + 4, t + 1), c.load(rgba + 8, t + 2), d.load(rgba + 12, t + 3);
+    }
+    DFB_AVX2 DFB_INLINE void store(double* rgba, double* t) const
+    {
+        a.store(rgba, t), b.store(rgba + 4, t + 1), c.store(rgba + 8, t + 2), d.store(rgba + 12, t + 3);
+    }
+    DFB_AVX2 DFB_INLINE bool isOpaque() const
+    {
+        const __m256d any = _mm256_or_pd(_mm256_or_pd(a.through, b.through), _mm256_or_pd(c.through, d.through));
+        const __m256i withoutSign = _mm256_set1_epi64x(0x7fffffffffffffff);
+        return _mm256_testz_si256(_mm256_castpd_si256(any), withoutSign) != 0;
+    }
+};
+
+template <bool HasLeast>
+DFB_AVX2 bool blendGroupAvx2(double* rgba, double* transmittance, int count, const BlendGroup& group)
+{
+    bool isSeen = false;
+    const std::ptrdiff_t inBlocks = count - count % 4;
+    for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
+        Avx2Block<HasLeast> block;
+        if (group.isFirst)
+            block.clear();
+        else
+            block.load(rgba + 4 * i, transmittance + i);
+        for (int k = 0; k < group.layers && !block.isOpaque();)
+            for (const int end = nextLook(k, group.layers); k < end; ++k) {
+                const float* color = group.colors[k] + 4 * i;
+                // The next row of a tile that is full: streams that jump from layer to layer are not foreseen.
+                _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
+                block.a.add(color, group.minTransmittance);
+                block.b.add(color + 4, group.minTransmittance);
+                block.c.add(color + 8, group.minTransmittance);
+                block.d.add(color + 12, group.minTransmittance);
+            }
+        block.store(rgba + 4 * i, transmittance + i);
+        isSeen |= !block.isOpaque();
+    }
+    for (std::ptrdiff_t i = inBlocks; i < count; ++i)
+        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 1, group);
+    return isSeen;
+}
+
+template <bool HasLeast>
+DFB_AVX2 void blendFourAvx2(double* rgba, double* transmittance, const float* const* colors,
+                            const std::uint32_t (*orders)[4], int layers, double minTransmittance)
+{
+    Avx2Block<HasLeast> block;
+    block.clear();
+    for (int k = 0; k < layers && !block.isOpaque();)
+        for (const int end = nextLook(k, layers); k < end; ++k) {
+            block.a.add(colors[orders[k][0]], minTransmittance);
+            block.b.add(colors[orders[k][1]] + 4, minTransmittance);
+            block.c.add(colors[orders[k][2]] + 8, minTransmittance);
+            block.d.add(colors[orders[k][3]] + 12, minTransmittance);
+        }
+    block.store(rgba, transmittance);
+}
+
+#endif
+
+// ---- the faster one
+
+inline void takeLayer(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        takeLayerAvx2(rgba, transmittance, count, color, minTransmittance);
+        return;
+    }
+#endif
+    takeLayerPlain(rgba, transmittance, count, color, minTransmittance);
+}
+
+inline bool blendGroup(double* rgba, double* transmittance, int count, const BlendGroup& group)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        return group.minTransmittance > 0 ? blendGroupAvx2<true>(rgba, transmittance, count, group)
+                                          : blendGroupAvx2<false>(rgba, transmittance, count, group);
+#endif
+    return group.minTransmittance > 0 ? blendGroupPlain<true>(rgba, transmittance, count, group)
+                                      : blendGroupPlain<false>(rgba, transmittance, count, group);
+}
+
+inline void blendFour(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
+                      int layers, double minTransmittance)
+{
+    const bool hasLeast = minTransmittance > 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        (hasLeast ? blendFourAvx2<true> : blendFourAvx2<false>)(rgba, transmittance, colors, orders, layers,
+                                                                minTransmittance);
+        return;
+    }
+#endif
+    (hasLeast ? blendFourPlain<true> : blendFourPlain<false>)(rgba, transmittance, colors, orders, layers,
+                                                              minTransmittance);
+}
+
+} // namespace dfb::detail

@@ -1,0 +1,150 @@
+// FragmentCompositor: walks the rows of a tile's fragments, and composites each run of pixels that the same ones cover.
+#pragma once
+
+#include <dfb/compositing.hpp>
+#include <dfb/fragment.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <vector>
+
+namespace dfb {
+
+// How the inputs of a pixel become one.
+enum class BlendRule {
+    SortByDepth, // sortAndBlend
+    InOrder,     // over, in the order of the fragments
+    Nearest      // keepNearest
+};
+
+// Composites the fragments of one tile and pass, row by row. The fragments' order decides between equal depths:
+// sort them by (source, part) first.
+class FragmentCompositor {
+public:
+    explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
+
+    // `begin` to `end` are iterators of pointers to fragments, which must outlive this.
+    template <class Iterator>
+    void start(Iterator begin, Iterator end)
+    {
+        cursors_.clear();
+        for (; begin != end; ++begin)
+            if (!(*begin)->empty())
+                cursors_.emplace_back(**begin);
+    }
+
+    void skipRows(int count)
+    {
+        for (FragmentCursor& cursor : cursors_)
+            for (int i = 0; i < count; ++i)
+                cursor.next();
+    }
+
+    // Composites the next row of all fragments into `row`, which has been sized for the region's width.
+    void nextRow(CompositeRow& row)
+    {
+        const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
+                              || !row.aux.position.empty() || !row.aux.primitiveId.empty()
+                              || !row.aux.instanceId.empty();
+        const bool isOneRun = takeRows(wantsAux) && !wantsAux;
+        const int width = static_cast<int>(row.transmittance.size());
+        if (active_.empty()) {
+            row.clear(0, width);
+        } else if (isOneRun) {
+            const Span span = *active_.front().spans;
+            row.clear(0, span.x);
+            row.clear(span.x + span.count, width - span.x - span.count);
+            layers_.resize(active_.size());
+            for (std::size_t k = 0; k < layers_.size(); ++k)
+                layers_[k] = {active_[k].color, active_[k].depth, nullptr};
+            composite(row, span.x, span.count);
+        } else {
+            compositeRuns(row, wantsAux);
+        }
+    }
+
+private:
+    // The rows of the fragments that have one. True if each is one run of pixels, the same in all.
+    bool takeRows(bool wantsAux)
+    {
+        bool isOneRun = true;
+        active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
+        std::size_t rows = 0;
+        for (FragmentCursor& cursor : cursors_) {
+            FragmentRow& r = active_[rows];
+            if (!cursor.next(r))
+                continue;
+            ++rows;
+            if (wantsAux)
+                r.aux = cursor.aux();
+            cursor.advance(r);
+            const Span &a = *r.spans, &b = *active_.front().spans;
+            isOneRun = isOneRun && r.spanCount == 1 && a.x == b.x && a.count == b.count;
+        }
+        active_.resize(rows);
+        return isOneRun;
+    }
+
+    void compositeRuns(CompositeRow& row, bool wantsAux)
+    {
+        edges_.clear();
+        for (const FragmentRow& r : active_)
+            for (int i = 0; i < r.spanCount; ++i) {
+                edges_.push_back(r.spans[i].x);
+                edges_.push_back(r.spans[i].x + r.spans[i].count);
+            }
+        // Between two neighbouring edges the set of layers is constant.
+        std::sort(edges_.begin(), edges_.end());
+        edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
+        row.clear(0, edges_.front());
+        row.clear(edges_.back(), static_cast<int>(row.transmittance.size()) - edges_.back());
+        for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
+            const int x0 = edges_[e], x1 = edges_[e + 1];
+            layers_.clear();
+            aux_.resize(wantsAux ? active_.size() : 0); // before anybody points into it
+            for (FragmentRow& r : active_) {
+                while (r.spanCount > 0 && r.spans->x + r.spans->count <= x0) {
+                    r.color += 4 * static_cast<std::ptrdiff_t>(r.spans->count);
+                    if (r.depth)
+                        r.depth += r.spans->count;
+                    if (wantsAux)
+                        r.aux.advance(r.spans->count);
+                    ++r.spans;
+                    --r.spanCount;
+                }
+                if (r.spanCount > 0 && r.spans->x <= x0) {
+                    const int offset = x0 - r.spans->x;
+                    layers_.push_back(Layer{r.color, r.depth, nullptr}.from(offset));
+                    if (wantsAux) {
+                        aux_[layers_.size() - 1] = r.aux.from(static_cast<std::size_t>(offset));
+                        layers_.back().aux = &aux_[layers_.size() - 1];
+                    }
+                }
+            }
+            if (layers_.empty())
+                row.clear(x0, x1 - x0);
+            else
+                composite(row, x0, x1 - x0);
+        }
+    }
+
+    // layers_, which are `count` pixels each.
+    void composite(CompositeRow& row, int x, int count)
+    {
+        switch (rule_) {
+        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_, true); break;
+        case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
+        case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
+        }
+    }
+
+    BlendRule rule_;
+    std::vector<FragmentCursor> cursors_;
+    std::vector<FragmentRow> active_;
+    std::vector<detail::ConstPlanes> aux_; // of layers_
+    std::vector<int> edges_;
+    std::vector<Layer> layers_;
+    std::vector<int> order_;
+};
+
+} // namespace dfb

@@ -1,0 +1,283 @@
+// The kernels of blending and sorting: those by hand against those in plain C++, bit for bit, and what is made of them
+// against over(), layer by layer and pixel by pixel.
+#include "catch.hpp"
+
+#include <dfb/compositing.hpp>
+#include <dfb/testing/adversarial.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <numeric>
+#include <vector>
+
+namespace {
+
+namespace d = dfb::detail;
+using dfb::testing::below;
+using dfb::testing::Random;
+using dfb::testing::uniform;
+
+constexpr float infinity = std::numeric_limits<float>::infinity();
+constexpr float notANumber = std::numeric_limits<float>::quiet_NaN();
+
+// The same bits, but for NaNs, of which nobody promises which one comes out.
+bool isSame(const std::vector<double>& a, const std::vector<double>& b)
+{
+    return std::equal(a.begin(), a.end(), b.begin(), b.end(), [](double x, double y) {
+        return std::memcmp(&x, &y, sizeof x) == 0 || (std::isnan(x) && std::isnan(y));
+    });
+}
+
+// What a set of layers is like, beside alpha and colour of any kind.
+enum class Kind { Any, Opaque, OddAlpha, NotFinite };
+
+// Layers of `width` pixels, each in memory of just that size, which begin `offset` floats into it.
+struct Stack {
+    Stack(Random& random, Kind kind, int layerCount, int width)
+    {
+        const std::size_t offset = below(random, 4), depthKind = below(random, 8);
+        for (int k = 0; k < layerCount; ++k) {
+            auto& c = colors.emplace_back(offset, 0.0f);
+            auto& z = depths.emplace_back(offset, 0.0f);
+            const float tilt = uniform(random) - 0.5f, base = uniform(random);
+            for (int i = 0; i < width; ++i) {
+                float alpha = dfb::testing::anyAlpha(random);
+                if (kind == Kind::Opaque && below(random, 8) > 0)
+                    alpha = 1.0f;
+                if (kind == Kind::OddAlpha && below(random, 4) == 0)
+                    alpha = below(random, 2) ? 1.5f : -0.5f;
+                for (int channel = 0; channel < 3; ++channel) {
+                    float value = dfb::testing::anyColor(random, alpha);
+                    if (below(random, 6) == 0)
+                        value = -value; // also -0
+                    if (kind == Kind::NotFinite && below(random, 40) == 0)
+                        value = below(random, 2) ? infinity : notANumber;
+                    c.push_back(value);
+                }
+                c.push_back(kind == Kind::NotFinite && below(random, 100) == 0 ? notANumber : alpha);
+                // Surfaces that cross here and there, or depths without order.
+                z.push_back(depthKind == 7 ? base + tilt * static_cast<float>(i) / 16
+                                           : dfb::testing::anyDepth(random, depthKind));
+                if (below(random, 50) == 0)
+                    z.back() = below(random, 2) ? infinity : -infinity;
+            }
+        }
+        for (std::size_t k = 0; k < colors.size(); ++k)
+            layers.push_back({colors[k].data() + offset, depths[k].data() + offset, nullptr});
+    }
+
+    std::vector<std::vector<float>> colors, depths;
+    std::vector<dfb::Layer> layers;
+};
+
+int anyCount(Random& random) { return 1 + static_cast<int>(below(random, 70)); }
+double anyLeast(Random& random) { return below(random, 3) == 0 ? 0.05 : 0.0; }
+const Kind kinds[] = {Kind::Any, Kind::Opaque, Kind::OddAlpha, Kind::NotFinite};
+
+} // namespace
+
+TEST_CASE("Blending a group of layers by hand gives the bits of plain C++", "[kernels]")
+{
+    Random random(3);
+    int different = 0;
+    for (int round = 0; round < 2000; ++round) {
+        const int width = anyCount(random);
+        const Kind kind = kinds[round % 4];
+        const Stack stack(random, kind, 1 + static_cast<int>(below(random, d::BlendGroup::mostLayers)), width);
+        d::BlendGroup group;
+        group.isFirst = below(random, 2) == 0;
+        group.minTransmittance = anyLeast(random);
+        for (const dfb::Layer& layer : stack.layers)
+            group.colors[group.layers++] = layer.color;
+        // What is there already.
+        std::vector<double> rgba, transmittance;
+        for (int i = 0; i < width; ++i) {
+            transmittance.push_back(below(random, 2) ? 0.0 : static_cast<double>(uniform(random)));
+            for (int c = 0; c < 4; ++c)
+                rgba.push_back(static_cast<double>(uniform(random)));
+        }
+        auto rgbaPlain = rgba, transmittancePlain = transmittance;
+        const bool isSeen = d::blendGroup(rgba.data(), transmittance.data(), width, group);
+        const bool isSeenPlain =
+            group.minTransmittance > 0
+                ? d::blendGroupPlain<true>(rgbaPlain.data(), transmittancePlain.data(), width, group)
+                : d::blendGroupPlain<false>(rgbaPlain.data(), transmittancePlain.data(), width, group);
+        different += isSeen != isSeenPlain || !isSame(rgba, rgbaPlain) || !isSame(transmittance, transmittancePlain);
+        d::takeLayer(rgba.data(), transmittance.data(), width, stack.layers[0].color, group.minTransmittance);
+        d::takeLayerPlain(rgbaPlain.data(), transmittancePlain.data(), width, stack.layers[0].color,
+                          group.minTransmittance);
+        different += !isSame(rgba, rgbaPlain) || !isSame(transmittance, transmittancePlain);
+    }
+    CHECK(different == 0);
+}
+
+TEST_CASE("Layers in order are what over() makes of them one by one", "[kernels]")
+{
+    Random random(4);
+    int different = 0;
+    std::vector<int> scratch;
+    for (int round = 0; round < 1500; ++round) {
+        const int width = anyCount(random), x = static_cast<int>(below(random, 9));
+        const Stack stack(random, kinds[round % 3], anyCount(random), width); // all is finite
+        dfb::CompositeRow row, expected;
+        row.minTransmittance = anyLeast(random);
+        row.resize(x + width);
+        row.clear(0, x);
+        expected = row;
+        expected.clear(0, x + width);
+        dfb::blendInOrder(row, x, width, stack.layers, scratch);
+        for (const dfb::Layer& layer : stack.layers) {
+            dfb::over(expected, x, width, layer);
+            dfb::closeOpaque(expected, x, width);
+        }
+        for (dfb::CompositeRow* r : {&row, &expected})
+            for (double& t : r->transmittance)
+                t += 0.0; // behind an opaque pixel an alpha above 1 makes -0 of 0, if it is still looked at
+        different += !isSame(row.rgba, expected.rgba) || !isSame(row.transmittance, expected.transmittance)
+                     || row.depth != expected.depth;
+    }
+    CHECK(different == 0);
+}
+
+TEST_CASE("How far an order of depths holds: by hand as in plain C++", "[kernels]")
+{
+    Random random(5);
+    int different = 0;
+    for (int round = 0; round < 4000; ++round) {
+        const int width = anyCount(random), begin = static_cast<int>(below(random, static_cast<std::size_t>(width)));
+        const Stack stack(random, Kind::Any, 2 + static_cast<int>(below(random, 15)), width);
+        d::OrderedDepths order;
+        for (const dfb::Layer& layer : stack.layers) {
+            order.losesTies[order.layers] = below(random, 4) > 0 ? 0 : -1;
+            order.depths[order.layers++] = layer.depth;
+        }
+        if (round % 2 == 0) // and where most of it is in order
+            for (int i = 0; i < width; ++i)
+                for (int k = 0; k < order.layers; ++k)
+                    const_cast<float*>(order.depths[k])[i] = below(random, 500) ? static_cast<float>(k) : 0.5f;
+        const int end = d::firstOutOfOrder(order, begin, width);
+        different += end != d::firstOutOfOrderPlain(order, begin, width);
+        const auto isRight = [&](int x) {
+            for (int k = 0; k + 1 < order.layers; ++k) {
+                const float front = order.depths[k][x], back = order.depths[k + 1][x];
+                if (!(order.losesTies[k] ? front < back : front <= back))
+                    return false;
+            }
+            return true;
+        };
+        for (int x = begin; x < end; ++x)
+            different += !isRight(x);
+        different += end < width && isRight(end);
+    }
+    CHECK(different == 0);
+}
+
+TEST_CASE("Four pixels are sorted by depth, then index, by hand as in plain C++", "[kernels]")
+{
+    Random random(6);
+    int different = 0;
+    for (int n = 1; n <= d::SortNetwork::mostLayers; ++n)
+        for (int round = 0; round < 40; ++round) {
+            const Stack stack(random, Kind::Any, n, 4);
+            std::vector<const float*> depths;
+            for (const dfb::Layer& layer : stack.layers)
+                depths.push_back(layer.depth);
+            d::FourOrders orders, plain;
+            d::sortFour(depths.data(), d::SortNetwork::of(n), orders);
+            d::sortFourPlain(depths.data(), d::SortNetwork::of(n), plain);
+            std::vector<std::uint32_t> expected(depths.size());
+            for (std::size_t p = 0; p < 4; ++p) {
+                std::iota(expected.begin(), expected.end(), 0u);
+                std::stable_sort(expected.begin(), expected.end(),
+                                 [&](std::uint32_t a, std::uint32_t b) { return depths[a][p] < depths[b][p]; });
+                for (std::size_t k = 0; k < expected.size(); ++k)
+                    different += orders[k][p] != expected[k] || plain[k][p] != expected[k];
+            }
+        }
+    CHECK(different == 0);
+    // A NaN, which there ought not to be, is somewhere behind what is finite, and does no harm.
+    const float depths[3][4] = {{notANumber, 1, notANumber, 1}, {2, notANumber, 2, 2}, {1, 3, -infinity, notANumber}};
+    const float* const pointers[] = {depths[0], depths[1], depths[2]};
+    d::FourOrders orders, plain;
+    d::sortFour(pointers, d::SortNetwork::of(3), orders);
+    d::sortFourPlain(pointers, d::SortNetwork::of(3), plain);
+    CHECK(std::memcmp(orders, plain, 3 * sizeof orders[0]) == 0);
+    const std::uint32_t last[] = {0, 1, 0, 2};
+    CHECK(std::memcmp(orders[2], last, sizeof last) == 0);
+}
+
+TEST_CASE("Blending four pixels with an order each: by hand as in plain C++", "[kernels]")
+{
+    Random random(7);
+    int different = 0;
+    for (int round = 0; round < 1000; ++round) {
+        const int n = anyCount(random);
+        const Stack stack(random, kinds[round % 4], n, 4);
+        std::vector<const float*> colors, depths;
+        for (const dfb::Layer& layer : stack.layers) {
+            colors.push_back(layer.color);
+            depths.push_back(layer.depth);
+        }
+        d::FourOrders orders;
+        d::sortFourPlain(depths.data(), d::SortNetwork::of(n), orders);
+        std::vector<double> rgba(16, -1.0), t(4, -1.0), rgbaPlain = rgba, tPlain = t;
+        const double least = anyLeast(random);
+        d::blendFour(rgba.data(), t.data(), colors.data(), orders, n, least);
+        (least > 0 ? d::blendFourPlain<true> : d::blendFourPlain<false>)(rgbaPlain.data(), tPlain.data(), colors.data(),
+                                                                         orders, n, least);
+        different += !isSame(rgba, rgbaPlain) || !isSame(t, tPlain);
+    }
+    CHECK(different == 0);
+}
+
+TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixel by pixel", "[kernels]")
+{
+    Random random(8);
+    int different = 0, ties = 0;
+    std::vector<int> scratch;
+    for (int round = 0; round < 3000; ++round) {
+        const int width = anyCount(random), x = static_cast<int>(below(random, 9));
+        const int layerCount = round % 100 == 0 ? 150 : anyCount(random); // more than a network sorts, too
+        const Stack stack(random, kinds[round % 3], layerCount, width);
+        dfb::CompositeRow row, expected;
+        row.minTransmittance = anyLeast(random);
+        row.countTies = round % 5 == 0;
+        row.wantsDepth = round % 2 == 0;
+        row.resize(x + width);
+        row.clear(0, x);
+        expected = row;
+        expected.clear(0, x + width);
+        dfb::sortAndBlend(row, x, width, stack.layers, scratch, round % 4 < 2); // from other layers, mostly
+        if (round % 4 == 0) {
+            std::shuffle(scratch.begin(), scratch.end(), random);
+            dfb::sortAndBlend(row, x, width, stack.layers, scratch, true);
+        }
+        std::vector<std::size_t> order(stack.layers.size());
+        for (int i = 0; i < width; ++i) {
+            std::iota(order.begin(), order.end(), 0u);
+            std::stable_sort(order.begin(), order.end(), [&](std::size_t a, std::size_t b) {
+                return stack.layers[a].depth[i] < stack.layers[b].depth[i];
+            });
+            for (std::size_t k = 0; k < order.size(); ++k) {
+                dfb::over(expected, x + i, 1, stack.layers[order[k]].from(i));
+                dfb::closeOpaque(expected, x + i, 1);
+                const float depth = stack.layers[order[k]].depth[i];
+                if (row.countTies && k > 0 && depth == stack.layers[order[k - 1]].depth[i] && depth < infinity)
+                    expected.isUndefined[static_cast<std::size_t>(x + i)] = 1;
+            }
+        }
+        for (dfb::CompositeRow* r : {&row, &expected})
+            for (double& t : r->transmittance)
+                t += 0.0; // as above
+        ties += static_cast<int>(std::count(row.isUndefined.begin(), row.isUndefined.end(), 1));
+        different += !isSame(row.rgba, expected.rgba) || !isSame(row.transmittance, expected.transmittance)
+                     || row.isUndefined != expected.isUndefined || row.depth.size() != expected.depth.size()
+                     || std::memcmp(row.depth.data(), expected.depth.data(), row.depth.size() * sizeof(float)) != 0;
+    }
+    CHECK(different == 0);
+    CHECK(ties > 0);
+}
