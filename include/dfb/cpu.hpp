@@ -1,5 +1,5 @@
 // Cpu: loops that are compiled a second time for processors with AVX2, which is asked for at run time. Not for FMA: the
-// results are the same, bit for bit.
+// results are the same, bit for bit. DFB_AVX2_F16C and cpuHasF16c() are the same where halves are converted.
 //
 //   DFB_INLINE void body(...) { ... }
 //   DFB_AVX2 inline void bodyAvx2(...) { body(...); }
@@ -12,9 +12,12 @@
 #include <immintrin.h>
 #define DFB_HAS_AVX2_CLONES 1
 #define DFB_AVX2 __attribute__((target("avx2")))
+#define DFB_AVX2_F16C __attribute__((target("avx2,f16c")))
 #define DFB_INLINE inline __attribute__((always_inline))
+#include <cpuid.h>
 #else
 #define DFB_AVX2
+#define DFB_AVX2_F16C
 #define DFB_INLINE inline
 #endif
 
@@ -26,6 +29,21 @@ inline bool cpuHasAvx2() noexcept
     static const bool has = [] {
         __builtin_cpu_init();
         return __builtin_cpu_supports("avx2") != 0;
+    }();
+    return has;
+#else
+    return false;
+#endif
+}
+
+// Whether there is AVX2, and F16C as well: conversion of halves, which all such processors have, but not all
+// hypervisors show.
+inline bool cpuHasF16c() noexcept
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    static const bool has = [] { // Clang 14 knows no name for it
+        unsigned a = 0, b = 0, c = 0, d = 0;
+        return cpuHasAvx2() && __get_cpuid(1, &a, &b, &c, &d) != 0 && (c & bit_F16C) != 0;
     }();
     return has;
 #else

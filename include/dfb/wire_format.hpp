@@ -18,15 +18,13 @@
 // looks for pixels that are worse, also at the edges.
 #pragma once
 
-#include <dfb/version.hpp>
+#include <dfb/wire_codes.hpp>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <limits>
 
 namespace dfb {
 
@@ -75,55 +73,6 @@ inline std::size_t bytesOf(WireFormat format) noexcept
     return format == WireFormat::Float32 ? 4 : format == WireFormat::Unorm8 ? 1 : 2;
 }
 
-inline float floatOf(std::uint32_t bits) noexcept
-{
-    float value = 0;
-    std::memcpy(&value, &bits, sizeof value);
-    return value;
-}
-inline std::uint32_t bitsOf(float value) noexcept
-{
-    std::uint32_t bits = 0;
-    std::memcpy(&bits, &value, sizeof bits);
-    return bits;
-}
-
-// To the nearest binary16, ties to even; what is too large is infinity. NaN stays one.
-inline std::uint16_t toHalf(float value) noexcept
-{
-    const std::uint32_t bits = bitsOf(value), sign = bits >> 16 & 0x8000u, magnitude = bits & 0x7fffffffu;
-    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
-    const std::uint32_t small = bitsOf(floatOf(magnitude) + 0.5f) - 0x3f000000u;
-    const std::uint32_t normal = (magnitude + 0xc8000fffu + (magnitude >> 13 & 1u)) >> 13;
-    const std::uint32_t large = magnitude > 0x7f800000u ? 0x7e00u : 0x7c00u;
-    const std::uint32_t finite = magnitude < 0x38800000u ? small : normal;
-    return static_cast<std::uint16_t>(sign | (magnitude >= 0x47800000u ? large : finite));
-}
-
-inline float fromHalf(std::uint16_t half) noexcept
-{
-    const std::uint32_t sign = static_cast<std::uint32_t>(half & 0x8000u) << 16, rest = half & 0x7fffu;
-    const float finite = floatOf(rest << 13) * 0x1p112f; // exact
-    const std::uint32_t bits = rest >= 0x7c00u ? 0x7f800000u | rest << 13 : bitsOf(finite);
-    return floatOf(sign | bits);
-}
-
-// The same for numbers from 0 to 65504, in a form that can be vectorized.
-inline std::uint16_t positiveToHalf(float value) noexcept
-{
-    const auto bits = static_cast<std::int32_t>(bitsOf(value));
-    const auto small = static_cast<std::int32_t>(bitsOf(value + 0.5f) - 0x3f000000u);
-    const std::int32_t normal = (bits - 0x37fff001 + (bits >> 13 & 1)) >> 13;
-    return static_cast<std::uint16_t>(bits < 0x38800000 ? small : normal);
-}
-inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
-
-// To the nearest integer, ties to even, of a value within [0, 65535].
-inline std::uint32_t nearestInteger(float value) noexcept
-{
-    return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
-}
-
 // Converts colour and depth of one framebuffer's fragments.
 class WireCoder {
 public:
@@ -136,155 +85,71 @@ public:
 
     WireFormat depth() const noexcept { return depth_; }
 
-    // Whether pixels may travel in a format other than Float32. No branch, so that it can be vectorized.
+    // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept
     {
-        int out = 0;
-        for (int i = 0; i < count; ++i) {
-            const float alpha = rgba[4 * i + 3], most = maxColor_ * alpha;
-            for (int c = 0; c < 3; ++c)
-                out |= static_cast<int>(!(rgba[4 * i + c] >= 0.0f)) | static_cast<int>(!(rgba[4 * i + c] <= most));
-            out |= static_cast<int>(!(alpha >= 0.0f)) | static_cast<int>(!(alpha <= 1.0f));
-        }
-        return out == 0;
+        return cpuHasF16c() ? arePixelsInRangeAvx2(rgba, count, maxColor_) : arePixelsInRange(rgba, count, maxColor_);
     }
 
     // `count` pixels, in range unless the format is Float32; `out` gets 4 * bytesOf(format) bytes for each.
     void encodeColor(WireFormat format, const float* rgba, int count, std::byte* out) const
     {
+        const auto encode = [&](auto code, float colorScale, float alphaScale) {
+            using Code = decltype(code);
+            const WireScales by{colorScale, alphaScale};
+            cpuHasF16c() ? encodePixelsAvx2<Code>(rgba, count, by, out) : encodePixels<Code>(rgba, count, by, out);
+        };
         switch (format) {
         case WireFormat::Float32: std::memcpy(out, rgba, 4 * sizeof(float) * static_cast<std::size_t>(count)); return;
-        case WireFormat::Float16:
-            encode<std::uint16_t>(rgba, count, out, scale_, 0x1p15f, [](float v) { return positiveToHalf(v); });
-            return;
-        case WireFormat::Unorm16:
-            encode<std::uint16_t>(rgba, count, out, 65535.0f / maxColor_, 65535.0f,
-                                  [](float v) { return nearestInteger(v); });
-            return;
-        case WireFormat::Unorm8:
-            encode<std::uint8_t>(rgba, count, out, 255.0f / maxColor_, 255.0f,
-                                 [](float v) { return nearestInteger(v); });
-            return;
+        case WireFormat::Float16: encode(HalfCode(), scale_, 0x1p15f); return;
+        case WireFormat::Unorm16: encode(Unorm16Code(), 65535.0f / maxColor_, 65535.0f); return;
+        case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
         }
     }
     void decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
     {
+        const auto decode = [&](auto code, float colorScale, float alphaScale) {
+            using Code = decltype(code);
+            const auto pixels = static_cast<int>(count);
+            const WireScales by{colorScale, alphaScale};
+            cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba) : decodePixels<Code>(in, pixels, by, rgba);
+        };
         switch (format) {
         case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); return;
-        case WireFormat::Float16:
-            decode<std::uint16_t>(in, count, rgba, 1 / scale_, 0x1p-15f,
-                                  [](std::uint16_t v) { return positiveFromHalf(v); });
-            return;
-        case WireFormat::Unorm16:
-            decode<std::uint16_t>(in, count, rgba, maxColor_ / 65535.0f, 1 / 65535.0f,
-                                  [](std::uint16_t v) { return static_cast<float>(v); });
-            return;
-        case WireFormat::Unorm8:
-            decode<std::uint8_t>(in, count, rgba, maxColor_ / 255.0f, 1 / 255.0f,
-                                 [](std::uint8_t v) { return static_cast<float>(v); });
-            return;
+        case WireFormat::Float16: decode(HalfCode(), 1 / scale_, 0x1p-15f); return;
+        case WireFormat::Unorm16: decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f); return;
+        case WireFormat::Unorm8: decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f); return;
         }
     }
 
     // Not NaN. The order of two depths stays, or they become equal.
     void encodeDepth(WireFormat format, const float* depth, int count, std::byte* out) const
     {
+        const auto encode = [&](const auto& code) {
+            cpuHasF16c() ? encodeDepthsAvx2(depth, count, code, out) : encodeDepths(depth, count, code, out);
+        };
         switch (format) {
         case WireFormat::Float32: std::memcpy(out, depth, sizeof(float) * static_cast<std::size_t>(count)); return;
-        case WireFormat::Float16:
-            for (int i = 0; i < count; ++i)
-                put(out, i, toHalf(depth[i]));
-            return;
-        case WireFormat::Unorm16:
-            for (int i = 0; i < count; ++i)
-                put(out, i, static_cast<std::uint16_t>(depthCode(depth[i], 65534.0f)));
-            return;
-        case WireFormat::Unorm8:
-            for (int i = 0; i < count; ++i)
-                put(out, i, static_cast<std::uint8_t>(depthCode(depth[i], 254.0f)));
-            return;
+        case WireFormat::Float16: encode(HalfDepth()); return;
+        case WireFormat::Unorm16: encode(Unorm16Depth{near_, far_ - near_}); return;
+        case WireFormat::Unorm8: encode(Unorm8Depth{near_, far_ - near_}); return;
         }
     }
     void decodeDepth(WireFormat format, const std::byte* in, std::size_t count, float* depth) const
     {
+        const auto decode = [&](const auto& code) {
+            const auto values = static_cast<int>(count);
+            cpuHasF16c() ? decodeDepthsAvx2(in, values, code, depth) : decodeDepths(in, values, code, depth);
+        };
         switch (format) {
         case WireFormat::Float32: std::memcpy(depth, in, sizeof(float) * count); return;
-        case WireFormat::Float16:
-            for (std::size_t i = 0; i < count; ++i)
-                depth[i] = fromHalf(get<std::uint16_t>(in, i));
-            return;
-        case WireFormat::Unorm16:
-            for (std::size_t i = 0; i < count; ++i)
-                depth[i] = depthOf(get<std::uint16_t>(in, i), 65534.0f);
-            return;
-        case WireFormat::Unorm8:
-            for (std::size_t i = 0; i < count; ++i)
-                depth[i] = depthOf(get<std::uint8_t>(in, i), 254.0f);
-            return;
+        case WireFormat::Float16: decode(HalfDepth()); return;
+        case WireFormat::Unorm16: decode(Unorm16Depth{near_, far_ - near_}); return;
+        case WireFormat::Unorm8: decode(Unorm8Depth{near_, far_ - near_}); return;
         }
     }
 
 private:
-    template <class Code>
-    static void put(std::byte* out, int i, Code code) noexcept
-    {
-        std::memcpy(out + sizeof code * static_cast<std::size_t>(i), &code, sizeof code);
-    }
-    template <class Code>
-    static Code get(const std::byte* in, std::size_t i) noexcept
-    {
-        Code code = 0;
-        std::memcpy(&code, in + sizeof code * i, sizeof code);
-        return code;
-    }
-
-    // Colour and alpha have scales of their own.
-    template <class Code, class ToCode>
-    static void encode(const float* rgba, int count, std::byte* out, float colorScale, float alphaScale,
-                       const ToCode& toCode)
-    {
-        const float scales[4] = {colorScale, colorScale, colorScale, alphaScale};
-        Code codes[4 * block]; // bytes could alias what they are made of
-        for (int first = 0; first < count; first += block) {
-            const int size = std::min(block, count - first);
-            const float* from = rgba + 4 * first;
-            for (int i = 0; i < size; ++i)
-                for (int c = 0; c < 4; ++c)
-                    codes[4 * i + c] = static_cast<Code>(toCode(from[4 * i + c] * scales[c]));
-            std::memcpy(out + 4 * sizeof(Code) * static_cast<std::size_t>(first), codes,
-                        4 * sizeof(Code) * static_cast<std::size_t>(size));
-        }
-    }
-    template <class Code, class FromCode>
-    static void decode(const std::byte* in, std::size_t count, float* rgba, float colorScale, float alphaScale,
-                       const FromCode& fromCode)
-    {
-        const float scales[4] = {colorScale, colorScale, colorScale, alphaScale};
-        Code codes[4 * block];
-        for (std::size_t first = 0; first < count; first += block) {
-            const std::size_t size = std::min<std::size_t>(block, count - first);
-            std::memcpy(codes, in + 4 * sizeof(Code) * first, 4 * sizeof(Code) * size);
-            float* to = rgba + 4 * first;
-            for (std::size_t i = 0; i < size; ++i)
-                for (std::size_t c = 0; c < 4; ++c)
-                    to[4 * i + c] = fromCode(codes[4 * i + c]) * scales[c];
-        }
-    }
-    static constexpr int block = 64; // pixels
-
-    // 0 to `most`; infinity is most + 1.
-    std::uint32_t depthCode(float depth, float most) const noexcept
-    {
-        const float place = std::min(std::max((depth - near_) / (far_ - near_), 0.0f), 1.0f);
-        return depth == std::numeric_limits<float>::infinity() ? static_cast<std::uint32_t>(most) + 1
-                                                               : nearestInteger(place * most);
-    }
-    float depthOf(std::uint32_t code, float most) const noexcept
-    {
-        return code > static_cast<std::uint32_t>(most) ? std::numeric_limits<float>::infinity()
-                                                       : near_ + (far_ - near_) * (static_cast<float>(code) / most);
-    }
-
     WireFormat depth_ = WireFormat::Float32;
     float maxColor_ = 1, near_ = 0, far_ = 1;
     float scale_ = 0x1p14f; // Float16: a power of two that brings maxColor to [2^14, 2^15]

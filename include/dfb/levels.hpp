@@ -1,0 +1,377 @@
+// Levels: rows of linear values become 8-bit levels, linear or sRGB, rounded as if each were looked at alone and
+// exactly; and how far the farthest value was from where its level ends, so that more digits can be asked for.
+#pragma once
+
+#include <dfb/cpu.hpp>
+#include <dfb/double_double.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cassert>
+#include <cmath>
+#include <cstdint>
+#include <cstring>
+
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace dfb::detail {
+
+// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. The product is
+// rounded to double first, which brings values that should be ties, such as a mean of 1/6, back to them.
+inline std::uint8_t toUnorm8(double value) noexcept
+{
+    // No branches, so that it can be vectorized. The order of the comparisons makes NaN 0.
+    const double notBelow = value > 0.0 ? value : 0.0, clamped = notBelow < 1.0 ? notBelow : 1.0;
+    // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
+    const double shift = 4503599627370496.0;
+    return static_cast<std::uint8_t>(static_cast<int>((clamped * 255.0 + shift) - shift));
+}
+
+// The same for a value that is known to about 100 bits. What is nearer to a tie than that is one.
+inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
+{
+    if (!(value.high > 0.0))
+        return 0;
+    if (value.high >= 1.0 && value.high + value.low >= 1.0)
+        return 255;
+    const DoubleDouble scaled = value * DoubleDouble{255.0, 0.0};
+    const int below = static_cast<int>(scaled.high);
+    const DoubleDouble overTie = scaled + DoubleDouble{-below - 0.5, 0.0};
+    if (std::abs(overTie.high) <= 0x1p-90)
+        return static_cast<std::uint8_t>(below + below % 2);
+    return static_cast<std::uint8_t>(below + (overTie.high > 0 ? 1 : 0));
+}
+
+// srgbThresholds()[k] is the least double whose sRGB level is k + 1: the decision is a comparison and so exact, where
+// evaluating the curve would be off near every boundary.
+inline const std::array<double, 255>& srgbThresholds()
+{
+    static const std::array<double, 255> table = [] {
+        std::array<double, 255> t{};
+        for (int k = 0; k < 255; ++k) {
+            const long double s = (static_cast<long double>(k) + 0.5L) / 255.0L;
+            const long double exact = s <= 0.04045L ? s / 12.92L : std::pow((s + 0.055L) / 1.055L, 2.4L);
+            auto least = static_cast<double>(exact);
+            if (static_cast<long double>(least) < exact)
+                least = std::nextafter(least, 1.0);
+            t[static_cast<std::size_t>(k)] = least;
+        }
+        return t;
+    }();
+    return table;
+}
+
+// The same thresholds by the upper bits of the value: its exponent from 2^-13 on and 7 bits of the mantissa are its
+// cell. No cell has more than one threshold, and none is near a cell's edge, so that one comparison decides and the
+// cell's own threshold is the only one that the value can be near to. Of a table of 13 * 128 + 1 cells.
+class SrgbCells {
+public:
+    static constexpr std::uint32_t first = 114u << 7;  // the upper 16 bits of 2^-13, below the first threshold
+    static constexpr std::size_t count = 13 * 128 + 1; // the last one is that of 1
+
+    // What a cell has, in one word for gathering: the level at its start, plus 1, times 2^17; and the lower 16 bits of
+    // the least float that has the next one. `none` where that begins in a later cell.
+    static constexpr std::uint32_t none = 0x18000;
+
+    SrgbCells()
+    {
+        const auto& t = srgbThresholds();
+        std::copy(t.begin(), t.end(), thresholds_.begin());
+        thresholds_.back() = 2; // never reached nor near
+        std::size_t level = 0;
+        for (std::size_t cell = 0; cell < count; ++cell) {
+            cells_[cell] = static_cast<std::uint32_t>(level + 1) << 17 | none;
+            auto least = static_cast<float>(thresholds_[level]);
+            if (static_cast<double>(least) < thresholds_[level])
+                least = std::nextafter(least, 3.0f);
+            std::uint32_t bits = 0;
+            std::memcpy(&bits, &least, sizeof bits);
+            assert(bits >> 16 >= first + cell); // not two in the cell before
+            if (bits >> 16 != first + cell)
+                continue;
+            assert((bits & 0xffff) >= edge && (bits & 0xffff) <= 0x10000 - edge);
+            cells_[cell] = static_cast<std::uint32_t>(level + 1) << 17 | (bits & 0xffff);
+            ++level;
+        }
+        assert(level == 255);
+    }
+
+    // The level, and whether a value with an error of 2^-35 of itself could have another.
+    std::uint8_t levelOf(double linear, bool& isNear) const noexcept
+    {
+        // The order of the comparisons makes NaN 2^-13, whose level is 0.
+        const double notBelow = linear > 0x1p-13 ? linear : 0x1p-13, clamped = notBelow < 1.0 ? notBelow : 1.0;
+        std::uint64_t bits = 0;
+        std::memcpy(&bits, &clamped, sizeof bits);
+        const std::size_t start = (cells_[(bits >> 45) - (std::uint64_t{1023 - 13} << 7)] >> 17) - 1;
+        const double threshold = thresholds_[start];
+        isNear = std::abs(clamped - threshold) <= 0x1p-35 * std::max(clamped, threshold);
+        return static_cast<std::uint8_t>(start + (clamped >= threshold ? 1 : 0));
+    }
+
+    const std::uint32_t* data() const noexcept { return cells_.data(); }
+
+private:
+    static constexpr std::uint32_t edge = 8; // floats; what is looked for is nearer than 2
+
+    std::array<std::uint32_t, count> cells_{};
+    std::array<double, 256> thresholds_{};
+};
+
+inline const SrgbCells& srgbCells()
+{
+    static const SrgbCells cells;
+    return cells;
+}
+
+inline std::uint8_t toSrgb8(double linear) noexcept
+{
+    bool isNear = false;
+    return srgbCells().levelOf(linear, isNear);
+}
+
+// The linear value of so many half levels, to about 100 bits.
+inline DoubleDouble srgbInverse(int halves) noexcept
+{
+    const DoubleDouble s = DoubleDouble{static_cast<double>(halves), 0} / 510;
+    if (s.high < 0.04045)
+        return s * DoubleDouble{100, 0} / 1292;
+    const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
+    const DoubleDouble base3 = base * base * base, base12 = base3 * base3 * base3 * base3;
+    // t^5 = base^12: one step of Newton's from a double doubles the digits.
+    const DoubleDouble t{std::pow(base.high, 2.4), 0}, t2 = t * t, t4 = t2 * t2, t5 = t4 * t;
+    const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
+    return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
+}
+
+// Where level k ends and the next begins.
+inline DoubleDouble srgbBoundary(int k) noexcept { return srgbInverse(2 * k + 1); }
+
+// The sRGB level of a value that is known to about 100 bits.
+inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept
+{
+    int level = toSrgb8(linear.high);
+    const auto isAbove = [&](int k) { // the boundary after level k
+        const DoubleDouble boundary = srgbBoundary(k);
+        return (linear + DoubleDouble{-boundary.high, -boundary.low}).high >= 0;
+    };
+    if (level > 0 && !isAbove(level - 1))
+        --level;
+    else if (level < 255 && isAbove(level))
+        ++level;
+    return static_cast<std::uint8_t>(level);
+}
+
+#if defined(__SSE2__)
+// Of as many as there are whole eights, which it returns; the rest is for toUnorm8(). Compilers do not vectorize
+// comparisons that could trap.
+inline int toUnorm8Sse2(const double* values, int count, std::uint8_t* out, double& farthest) noexcept
+{
+    const double shift = 4503599627370496.0;
+    int i = 0;
+    const __m128d zero = _mm_setzero_pd(), one = _mm_set1_pd(1.0), scale = _mm_set1_pd(255.0);
+    const __m128d shifts = _mm_set1_pd(shift), noSign = _mm_castsi128_pd(_mm_set1_epi64x(0x7fffffffffffffff));
+    __m128d distance = zero;
+    const auto pair = [&](int at) {
+        // max and min give the second operand where the first is NaN.
+        const __m128d scaled = _mm_mul_pd(_mm_min_pd(_mm_max_pd(_mm_loadu_pd(values + at), zero), one), scale);
+        const __m128d shifted = _mm_add_pd(scaled, shifts);
+        distance = _mm_max_pd(distance, _mm_and_pd(_mm_sub_pd(scaled, _mm_sub_pd(shifted, shifts)), noSign));
+        return _mm_castpd_ps(shifted); // the integers are in the lower halves
+    };
+    const auto four = [&](int at) {
+        return _mm_castps_si128(_mm_shuffle_ps(pair(at), pair(at + 2), _MM_SHUFFLE(2, 0, 2, 0)));
+    };
+    for (; i + 8 <= count; i += 8) {
+        const __m128i words = _mm_packs_epi32(four(i), four(i + 4));
+        _mm_storel_epi64(reinterpret_cast<__m128i*>(out + i), _mm_packus_epi16(words, words));
+    }
+    farthest = std::max(_mm_cvtsd_f64(distance), _mm_cvtsd_f64(_mm_unpackhi_pd(distance, distance)));
+    return i;
+}
+
+// The same, four at a time.
+DFB_AVX2 inline int toUnorm8Avx2(const double* values, int count, std::uint8_t* out, double& farthest) noexcept
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256d zero = _mm256_setzero_pd(), one = _mm256_set1_pd(1.0), scale = _mm256_set1_pd(255.0);
+    const __m256d shifts = _mm256_set1_pd(4503599627370496.0);
+    const __m256d noSign = _mm256_castsi256_pd(_mm256_set1_epi64x(0x7fffffffffffffff));
+    __m256d distance = zero;
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        __m128i fours[2];
+        for (int half = 0; half < 2; ++half) {
+            const __m256d value = _mm256_loadu_pd(values + i + 4 * half);
+            const __m256d scaled = _mm256_mul_pd(_mm256_min_pd(_mm256_max_pd(value, zero), one), scale);
+            const __m256d rounded = _mm256_sub_pd(_mm256_add_pd(scaled, shifts), shifts);
+            distance = _mm256_max_pd(distance, _mm256_and_pd(_mm256_sub_pd(scaled, rounded), noSign));
+            fours[half] = _mm256_cvttpd_epi32(rounded);
+        }
+        const __m128i words = _mm_packs_epi32(fours[0], fours[1]);
+        _mm_storel_epi64(reinterpret_cast<__m128i*>(out + i), _mm_packus_epi16(words, words));
+    }
+    const __m128d two = _mm_max_pd(_mm256_castpd256_pd128(distance), _mm256_extractf128_pd(distance, 1));
+    farthest = std::max(_mm_cvtsd_f64(two), _mm_cvtsd_f64(_mm_unpackhi_pd(two, two)));
+    return i;
+#else
+    return toUnorm8Sse2(values, count, out, farthest);
+#endif
+}
+#endif
+
+// toUnorm8() of `count` values. Returns how far the farthest of 255 * value was from an integer, up to 1/2, which is a
+// tie.
+inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexcept
+{
+    const double shift = 4503599627370496.0; // as above
+    double farthest = 0;
+    int i = 0;
+#if defined(__SSE2__)
+    i = cpuHasAvx2() ? toUnorm8Avx2(values, count, out, farthest) : toUnorm8Sse2(values, count, out, farthest);
+#endif
+    for (; i < count; ++i) {
+        out[i] = toUnorm8(values[i]);
+        const double scaled = 255.0 * (values[i] > 0.0 ? std::min(values[i], 1.0) : 0.0);
+        farthest = std::max(farthest, std::abs(scaled - ((scaled + shift) - shift)));
+    }
+    return farthest;
+}
+
+// The same of float.
+inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexcept
+{
+    constexpr int block = 64;
+    double farthest = 0;
+    for (int first = 0; first < count; first += block) {
+        const int size = std::min(block, count - first);
+        double copy[block];
+        std::copy_n(values + first, size, copy);
+        farthest = std::max(farthest, toUnorm8(copy, size, out + first));
+    }
+    return farthest;
+}
+
+// The same of `count` pixels, with sRGB levels but for alpha. A colour that is near a threshold counts as a tie.
+template <class Real>
+double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
+{
+    constexpr int block = 64;
+    const SrgbCells& cells = srgbCells();
+    double farthest = 0;
+    for (int first = 0; first < count; first += block) {
+        const int size = std::min(block, count - first);
+        double alpha[block];
+        std::uint8_t levels[block];
+        for (int i = 0; i < size; ++i)
+            alpha[i] = rgba[4 * (first + i) + 3];
+        farthest = std::max(farthest, toUnorm8(alpha, size, levels));
+        bool anyNear = false;
+        for (int i = 0; i < size; ++i) {
+            for (int c = 0; c < 3; ++c) {
+                bool isNear = false;
+                out[4 * (first + i) + c] = cells.levelOf(rgba[4 * (first + i) + c], isNear);
+                anyNear |= isNear;
+            }
+            out[4 * (first + i) + 3] = levels[i];
+        }
+        farthest = anyNear ? 0.5 : farthest;
+    }
+    return farthest;
+}
+
+// Either, as the format asks for.
+template <bool IsSrgb, class Real>
+double toLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
+{
+    if constexpr (IsSrgb)
+        return toSrgb8(rgba, count, out);
+    else
+        return toUnorm8(rgba, 4 * count, out);
+}
+
+#if defined(DFB_HAS_AVX2_CLONES)
+DFB_AVX2 inline __m256 loadAsFloats(const float* values) noexcept { return _mm256_loadu_ps(values); }
+DFB_AVX2 inline __m256 loadAsFloats(const double* values) noexcept
+{
+    return _mm256_set_m128(_mm256_cvtpd_ps(_mm256_loadu_pd(values + 4)), _mm256_cvtpd_ps(_mm256_loadu_pd(values)));
+}
+
+// Of as many pixels as there are whole eights, which it returns; the rest is for toLevels(). Rounds in float: the value
+// is off by half an ulp, and so is the product, by 255 * 2^-25 + 2^-17 < 2^-16 together. Where that comes near enough
+// to a tie to matter, or a colour within 2 floats of an sRGB threshold, all eight go through toLevels(). `farthest` is
+// no less than that of toLevels(), and a tie for the same pixels; what is no tie may be up to 2^-15 farther.
+template <bool IsSrgb, class Real>
+DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out, double& farthest) noexcept
+{
+    const float off = 0x1p-16f;
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
+    const __m256 limit = _mm256_set1_ps(0.5f - 2 * off), low = _mm256_set1_ps(0x1p-13f);
+    // Without the sign; of alpha alone if that is what is linear.
+    const int noSign = 0x7fffffff, ofColor = IsSrgb ? 0 : noSign;
+    const __m256 distanceBits =
+        _mm256_castsi256_ps(_mm256_setr_epi32(ofColor, ofColor, ofColor, noSign, ofColor, ofColor, ofColor, noSign));
+    const __m256i inOrder = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+    const int* cells = nullptr;
+    if constexpr (IsSrgb)
+        cells = reinterpret_cast<const int*>(srgbCells().data());
+    __m256 all = zero;
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        __m256i levels[4], nearby = _mm256_setzero_si256();
+        __m256 distance = zero;
+        for (int part = 0; part < 4; ++part) {
+            // max and min give the second operand where the first is NaN.
+            const __m256 value = _mm256_min_ps(_mm256_max_ps(loadAsFloats(rgba + 4 * i + 8 * part), zero), one);
+            const __m256 scaled = _mm256_mul_ps(value, scale);
+            levels[part] = _mm256_cvtps_epi32(scaled);
+            const __m256 rest = _mm256_sub_ps(scaled, _mm256_cvtepi32_ps(levels[part])); // exact
+            distance = _mm256_max_ps(distance, _mm256_and_ps(rest, distanceBits));
+            if constexpr (IsSrgb) {
+                const __m256i bits = _mm256_castps_si256(_mm256_max_ps(value, low));
+                const __m256i cell = _mm256_sub_epi32(_mm256_srli_epi32(bits, 16),
+                                                      _mm256_set1_epi32(static_cast<int>(SrgbCells::first)));
+                const __m256i entry = _mm256_i32gather_epi32(cells, cell, 4);
+                const __m256i below = _mm256_sub_epi32(_mm256_and_si256(entry, _mm256_set1_epi32(0x1ffff)),
+                                                       _mm256_and_si256(bits, _mm256_set1_epi32(0xffff)));
+                const __m256i level =
+                    _mm256_add_epi32(_mm256_srli_epi32(entry, 17), _mm256_cmpgt_epi32(below, _mm256_setzero_si256()));
+                nearby = _mm256_or_si256(nearby, _mm256_cmpgt_epi32(_mm256_set1_epi32(2), _mm256_abs_epi32(below)));
+                levels[part] = _mm256_blend_epi32(level, levels[part], 0x88);
+            }
+        }
+        int unsure = _mm256_movemask_ps(_mm256_cmp_ps(distance, limit, _CMP_GT_OQ));
+        if constexpr (IsSrgb)
+            unsure |= _mm256_movemask_ps(_mm256_castsi256_ps(nearby)) & 0x77; // alpha has no such threshold
+        if (unsure != 0) {
+            farthest = std::max(farthest, toLevels<IsSrgb>(rgba + 4 * i, 8, out + 4 * i));
+            continue;
+        }
+        all = _mm256_max_ps(all, distance);
+        const __m256i bytes =
+            _mm256_packus_epi16(_mm256_packs_epi32(levels[0], levels[1]), _mm256_packs_epi32(levels[2], levels[3]));
+        _mm256_storeu_si256(reinterpret_cast<__m256i*>(out + 4 * i), _mm256_permutevar8x32_epi32(bytes, inOrder));
+    }
+    alignas(32) float most[8];
+    _mm256_store_ps(most, all);
+    farthest = std::max(farthest, static_cast<double>(*std::max_element(most, most + 8) + off));
+    return i;
+}
+#endif
+
+// Levels of `count` premultiplied RGBA pixels, as fast as the processor can. Returns what convertPixels() does.
+template <bool IsSrgb, class Real>
+double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
+{
+    double farthest = 0;
+    int done = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        done = toLevelsAvx2<IsSrgb>(rgba, count, out, farthest);
+#endif
+    return std::max(farthest, toLevels<IsSrgb>(rgba + 4 * done, count - done, out + 4 * done));
+}
+
+} // namespace dfb::detail

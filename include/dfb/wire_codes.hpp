@@ -1,0 +1,309 @@
+// WireCodes: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
+// Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
+#pragma once
+
+#include <dfb/cpu.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <type_traits>
+
+#if defined(DFB_HAS_AVX2_CLONES)
+#include <immintrin.h>
+#endif
+
+namespace dfb::detail {
+
+inline float floatOf(std::uint32_t bits) noexcept
+{
+    float value = 0;
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+}
+inline std::uint32_t bitsOf(float value) noexcept
+{
+    std::uint32_t bits = 0;
+    std::memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+// `condition` ? a : b. With masks, as compilers do not vectorize a choice of what is made of floats.
+inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) noexcept
+{
+    const std::uint32_t mask = 0u - static_cast<std::uint32_t>(condition);
+    return (a & mask) | (b & ~mask);
+}
+
+// To the nearest binary16, ties to even; what is too large is infinity. NaN stays one.
+inline std::uint16_t toHalf(float value) noexcept
+{
+    const std::uint32_t bits = bitsOf(value), sign = bits >> 16 & 0x8000u, magnitude = bits & 0x7fffffffu;
+    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
+    const std::uint32_t small = bitsOf(floatOf(magnitude) + 0.5f) - 0x3f000000u;
+    const std::uint32_t normal = (magnitude + 0xc8000fffu + (magnitude >> 13 & 1u)) >> 13;
+    const std::uint32_t large = choose(magnitude > 0x7f800000u, 0x7e00u, 0x7c00u);
+    const std::uint32_t finite = choose(magnitude < 0x38800000u, small, normal);
+    return static_cast<std::uint16_t>(sign | choose(magnitude >= 0x47800000u, large, finite));
+}
+
+inline float fromHalf(std::uint16_t half) noexcept
+{
+    const std::uint32_t sign = static_cast<std::uint32_t>(half & 0x8000u) << 16, rest = half & 0x7fffu;
+    const float finite = floatOf(rest << 13) * 0x1p112f; // exact
+    return floatOf(sign | choose(rest >= 0x7c00u, 0x7f800000u | rest << 13, bitsOf(finite)));
+}
+
+// The same for numbers from 0 to 65504, which takes less.
+inline std::uint16_t positiveToHalf(float value) noexcept
+{
+    const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
+    const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
+    return static_cast<std::uint16_t>(choose(static_cast<std::int32_t>(bits) < 0x38800000, small, normal));
+}
+inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
+
+// To the nearest integer, ties to even, of a value within [0, 65535].
+inline std::uint32_t nearestInteger(float value) noexcept
+{
+    return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
+}
+
+// How a scaled channel of a colour travels.
+struct HalfCode {
+    using Word = std::uint16_t;
+    static Word of(float value) noexcept { return positiveToHalf(value); }
+    static float valueOf(Word code) noexcept { return positiveFromHalf(code); }
+};
+template <class Unsigned>
+struct UnormCode {
+    using Word = Unsigned;
+    static Word of(float value) noexcept { return static_cast<Word>(nearestInteger(value)); }
+    static float valueOf(Word code) noexcept { return static_cast<float>(code); }
+};
+
+using Unorm16Code = UnormCode<std::uint16_t>;
+using Unorm8Code = UnormCode<std::uint8_t>;
+
+// How a depth travels.
+struct HalfDepth {
+    using Word = std::uint16_t;
+    Word of(float depth) const noexcept { return toHalf(depth); }
+    float depthOf(Word code) const noexcept { return fromHalf(code); }
+};
+// As a place between two depths, of which there are all but one code; that one is infinity.
+template <class Unsigned>
+struct UnormDepth {
+    using Word = Unsigned;
+    static constexpr std::uint32_t last = std::numeric_limits<Word>::max() - 1;
+    float first, range;
+
+    Word of(float depth) const noexcept
+    {
+        // Clamped as integers: bits of positive floats are in their order, and those of negative ones negative.
+        const auto place = static_cast<std::int32_t>(bitsOf((depth - first) / range));
+        const std::int32_t clamped = std::min(std::max(place, 0), 0x3f800000);
+        const std::uint32_t code =
+            nearestInteger(floatOf(static_cast<std::uint32_t>(clamped)) * static_cast<float>(last));
+        return static_cast<Word>(choose(bitsOf(depth) == 0x7f800000u, last + 1, code));
+    }
+    float depthOf(Word code) const noexcept
+    {
+        const float depth = first + range * (static_cast<float>(code) / static_cast<float>(last));
+        return floatOf(choose(code > last, 0x7f800000u, bitsOf(depth)));
+    }
+};
+
+using Unorm16Depth = UnormDepth<std::uint16_t>;
+using Unorm8Depth = UnormDepth<std::uint8_t>;
+
+// What the channels of a pixel are multiplied by.
+struct WireScales {
+    float color, alpha;
+};
+
+// Rows in plain C++. What bytes are made of or make goes through `words`: bytes could alias anything.
+constexpr int wireBlock = 256;
+
+template <class Code>
+DFB_INLINE void encodePixels(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
+{
+    const float scales[4] = {by.color, by.color, by.color, by.alpha};
+    typename Code::Word words[wireBlock];
+    for (int first = 0; first < 4 * count; first += wireBlock) {
+        const int size = std::min(wireBlock, 4 * count - first);
+        for (int i = 0; i < size; i += 4)
+            for (int c = 0; c < 4; ++c)
+                words[i + c] = Code::of(rgba[first + i + c] * scales[c]);
+        std::memcpy(out + sizeof words[0] * static_cast<std::size_t>(first), words,
+                    sizeof words[0] * static_cast<std::size_t>(size));
+    }
+}
+
+template <class Code>
+DFB_INLINE void decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+{
+    const float scales[4] = {by.color, by.color, by.color, by.alpha};
+    typename Code::Word words[wireBlock];
+    for (int first = 0; first < 4 * count; first += wireBlock) {
+        const int size = std::min(wireBlock, 4 * count - first);
+        std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
+                    sizeof words[0] * static_cast<std::size_t>(size));
+        for (int i = 0; i < size; i += 4)
+            for (int c = 0; c < 4; ++c)
+                rgba[first + i + c] = Code::valueOf(words[i + c]) * scales[c];
+    }
+}
+
+template <class Code>
+DFB_INLINE void encodeDepths(const float* depth, int count, const Code& code, std::byte* out) noexcept
+{
+    const Code local = code;
+    typename Code::Word words[wireBlock];
+    for (int first = 0; first < count; first += wireBlock) {
+        const int size = std::min(wireBlock, count - first);
+        for (int i = 0; i < size; ++i)
+            words[i] = local.of(depth[first + i]);
+        std::memcpy(out + sizeof words[0] * static_cast<std::size_t>(first), words,
+                    sizeof words[0] * static_cast<std::size_t>(size));
+    }
+}
+
+template <class Code>
+DFB_INLINE void decodeDepths(const std::byte* in, int count, const Code& code, float* depth) noexcept
+{
+    const Code local = code;
+    typename Code::Word words[wireBlock];
+    for (int first = 0; first < count; first += wireBlock) {
+        const int size = std::min(wireBlock, count - first);
+        std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
+                    sizeof words[0] * static_cast<std::size_t>(size));
+        for (int i = 0; i < size; ++i)
+            depth[first + i] = local.depthOf(words[i]);
+    }
+}
+
+// Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
+DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) noexcept
+{
+    int out = 0;
+    for (int i = 0; i < count; ++i) {
+        const float alpha = rgba[4 * i + 3], most = maxColor * alpha;
+        for (int c = 0; c < 3; ++c)
+            out |= static_cast<int>(!(rgba[4 * i + c] >= 0.0f)) | static_cast<int>(!(rgba[4 * i + c] <= most));
+        out |= static_cast<int>(!(alpha >= 0.0f)) | static_cast<int>(!(alpha <= 1.0f));
+    }
+    return out == 0;
+}
+
+// The same with AVX2 and F16C: as many at a time as there are whole blocks, and the rest as above.
+#if defined(DFB_HAS_AVX2_CLONES)
+constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
+DFB_AVX2_F16C inline __m256 wireVector(const WireScales& by) noexcept
+{
+    return _mm256_setr_ps(by.color, by.color, by.color, by.alpha, by.color, by.color, by.color, by.alpha);
+}
+#endif
+
+template <class Code>
+DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
+{
+    constexpr std::size_t wordBytes = sizeof(typename Code::Word);
+    int i = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 scales = wireVector(by), zero = _mm256_setzero_ps();
+    for (; i + 8 <= count; i += 8) {
+        __m256 scaled[4];
+        for (int part = 0; part < 4; ++part)
+            scaled[part] = _mm256_mul_ps(_mm256_loadu_ps(rgba + 4 * i + 8 * part), scales);
+        auto* to = reinterpret_cast<__m128i*>(out + 4 * wordBytes * static_cast<std::size_t>(i));
+        if constexpr (std::is_same_v<Code, HalfCode>) {
+            for (int part = 0; part < 4; ++part) // without the sign of -0
+                _mm_storeu_si128(to + part, _mm256_cvtps_ph(_mm256_max_ps(scaled[part], zero), toNearest));
+        } else {
+            __m256i codes[4];
+            for (int part = 0; part < 4; ++part)
+                codes[part] = _mm256_cvtps_epi32(scaled[part]);
+            const __m256i low = _mm256_packus_epi32(codes[0], codes[1]), high = _mm256_packus_epi32(codes[2], codes[3]);
+            auto* words = reinterpret_cast<__m256i*>(to);
+            if constexpr (wordBytes == 2) {
+                _mm256_storeu_si256(words, _mm256_permute4x64_epi64(low, 0xd8));
+                _mm256_storeu_si256(words + 1, _mm256_permute4x64_epi64(high, 0xd8));
+            } else {
+                const __m256i inOrder = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+                _mm256_storeu_si256(words, _mm256_permutevar8x32_epi32(_mm256_packus_epi16(low, high), inOrder));
+            }
+        }
+    }
+#endif
+    encodePixels<Code>(rgba + 4 * i, count - i, by, out + 4 * wordBytes * static_cast<std::size_t>(i));
+}
+
+template <class Code>
+DFB_AVX2_F16C inline void decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+{
+    constexpr std::size_t wordBytes = sizeof(typename Code::Word);
+    int i = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 scales = wireVector(by);
+    for (; i + 2 <= count; i += 2) {
+        const auto* from = reinterpret_cast<const __m128i*>(in + 4 * wordBytes * static_cast<std::size_t>(i));
+        __m256 values;
+        if constexpr (std::is_same_v<Code, HalfCode>)
+            values = _mm256_cvtph_ps(_mm_loadu_si128(from));
+        else if constexpr (wordBytes == 2)
+            values = _mm256_cvtepi32_ps(_mm256_cvtepu16_epi32(_mm_loadu_si128(from)));
+        else
+            values = _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(from)));
+        _mm256_storeu_ps(rgba + 4 * i, _mm256_mul_ps(values, scales));
+    }
+#endif
+    decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i);
+}
+
+template <class Code>
+DFB_AVX2_F16C inline void encodeDepthsAvx2(const float* depth, int count, const Code& code, std::byte* out) noexcept
+{
+    int i = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    if constexpr (std::is_same_v<Code, HalfDepth>)
+        for (; i + 8 <= count; i += 8)
+            _mm_storeu_si128(reinterpret_cast<__m128i*>(out + 2 * static_cast<std::size_t>(i)),
+                             _mm256_cvtps_ph(_mm256_loadu_ps(depth + i), toNearest));
+#endif
+    encodeDepths(depth + i, count - i, code, out + sizeof(typename Code::Word) * static_cast<std::size_t>(i));
+}
+
+template <class Code>
+DFB_AVX2_F16C inline void decodeDepthsAvx2(const std::byte* in, int count, const Code& code, float* depth) noexcept
+{
+    int i = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    if constexpr (std::is_same_v<Code, HalfDepth>)
+        for (; i + 8 <= count; i += 8)
+            _mm256_storeu_ps(depth + i, _mm256_cvtph_ps(_mm_loadu_si128(
+                                            reinterpret_cast<const __m128i*>(in + 2 * static_cast<std::size_t>(i)))));
+#endif
+    decodeDepths(in + sizeof(typename Code::Word) * static_cast<std::size_t>(i), count - i, code, depth + i);
+}
+
+DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept
+{
+    int i = 0, inRange = 0xff; // a bit for each lane
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), most = _mm256_set1_ps(maxColor);
+    __m256 in = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
+    for (; i + 2 <= count; i += 2) {
+        const __m256 value = _mm256_loadu_ps(rgba + 4 * i), alpha = _mm256_permute_ps(value, 0xff);
+        const __m256 limit = _mm256_blend_ps(_mm256_mul_ps(most, alpha), one, 0x88);
+        in = _mm256_and_ps(in, _mm256_and_ps(_mm256_cmp_ps(value, zero, _CMP_GE_OQ),
+                                             _mm256_cmp_ps(value, limit, _CMP_LE_OQ))); // false for NaN
+    }
+    inRange = _mm256_movemask_ps(in);
+#endif
+    return inRange == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
+}
+
+} // namespace dfb::detail
