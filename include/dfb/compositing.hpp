@@ -62,6 +62,7 @@ struct CompositeRow {
     bool countTies = false;                // equal depths make a pixel undefined
     double minTransmittance = 0;           // what lets less through counts as opaque
     bool wantsDepth = true;                // else `depth` is empty
+    bool wantsGaps = true;                 // else what no layer covers need not be cleared
 
     // Sizes it for `width` pixels, of which nothing is known then. `wanted`: of the auxiliary channels. `exactly`: in
     // twice the precision of double.
@@ -211,17 +212,17 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     }
 }
 
-// Composites a constant premultiplied colour under a whole row: the background, after all else.
-inline void overBackground(CompositeRow& row, const float (&rgba)[4])
+// Composites a constant premultiplied RGBA colour under pixels [begin, begin + count): the background, after all else.
+inline void overBackground(CompositeRow& row, int begin, int count, const float* rgba)
 {
-    const std::size_t width = row.transmittance.size();
-    for (std::size_t x = 0; x < row.aux.weight.size(); ++x)
+    const auto first = static_cast<std::size_t>(begin), end = first + static_cast<std::size_t>(count);
+    for (std::size_t x = first; x < end && !row.aux.weight.empty(); ++x)
         row.aux.weight[x] = row.rgba[4 * x + 3];
     if (rgba[0] == 0.0f && rgba[1] == 0.0f && rgba[2] == 0.0f && rgba[3] == 0.0f)
         return;
-    for (std::size_t x = 0; x < row.transmittanceLow.size(); ++x)
+    for (std::size_t x = first; x < end && !row.rgbaLow.empty(); ++x)
         detail::overExactly(row, x, rgba);
-    for (std::size_t x = 0; x < width && row.rgbaLow.empty(); ++x)
+    for (std::size_t x = first; x < end && row.rgbaLow.empty(); ++x)
         for (std::size_t c = 0; c < 4; ++c)
             row.rgba[4 * x + c] += row.transmittance[x] * static_cast<double>(rgba[c]);
 }

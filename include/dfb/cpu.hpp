@@ -8,6 +8,8 @@
 
 #include <dfb/version.hpp>
 
+#include <cstdint>
+
 #if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
 #include <immintrin.h>
 #define DFB_HAS_AVX2_CLONES 1
@@ -48,6 +50,19 @@ inline bool cpuHasF16c() noexcept
     return has;
 #else
     return false;
+#endif
+}
+
+// How many bits are below the lowest that is set; there is one.
+inline int zerosBelow(std::uint64_t bits) noexcept
+{
+#if defined(__GNUC__)
+    return __builtin_ctzll(bits);
+#else
+    int count = 0;
+    for (; !(bits & 1); bits >>= 1)
+        ++count;
+    return count;
 #endif
 }
 

@@ -2,10 +2,12 @@
 #pragma once
 
 #include <dfb/compositing.hpp>
+#include <dfb/cpu.hpp>
 #include <dfb/fragment.hpp>
 
 #include <algorithm>
 #include <cstddef>
+#include <cstdint>
 #include <vector>
 
 namespace dfb {
@@ -40,20 +42,23 @@ public:
                 cursor.next();
     }
 
-    // Composites the next row of all fragments into `row`, which has been sized for the region's width.
+    // Composites the next row of all fragments into `row`, which has been sized for the region's width. With
+    // row.wantsGaps false only what lies in runs() is there then.
     void nextRow(CompositeRow& row)
     {
+        runs_.clear();
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
         const bool isOneRun = takeRows(wantsAux) && !wantsAux;
         const int width = static_cast<int>(row.transmittance.size());
         if (active_.empty()) {
-            row.clear(0, width);
+            clearGap(row, 0, width);
         } else if (isOneRun) {
             const Span span = *active_.front().spans;
-            row.clear(0, span.x);
-            row.clear(span.x + span.count, width - span.x - span.count);
+            clearGap(row, 0, span.x);
+            clearGap(row, span.x + span.count, width);
+            runs_.push_back(span);
             layers_.resize(active_.size());
             for (std::size_t k = 0; k < layers_.size(); ++k)
                 layers_[k] = {active_[k].color, active_[k].depth, nullptr};
@@ -63,7 +68,18 @@ public:
         }
     }
 
+    // Of the last row, where there is anything: in order, not touching. What is between them is wide.
+    const std::vector<Span>& runs() const noexcept { return runs_; }
+
 private:
+    static constexpr int narrowGap = 32; // to composite nothing costs less than to begin a run
+
+    static void clearGap(CompositeRow& row, int begin, int end)
+    {
+        if (row.wantsGaps)
+            row.clear(begin, end - begin);
+    }
+
     // The rows of the fragments that have one. True if each is one run of pixels, the same in all.
     bool takeRows(bool wantsAux)
     {
@@ -87,17 +103,9 @@ private:
 
     void compositeRuns(CompositeRow& row, bool wantsAux)
     {
-        edges_.clear();
-        for (const FragmentRow& r : active_)
-            for (int i = 0; i < r.spanCount; ++i) {
-                edges_.push_back(r.spans[i].x);
-                edges_.push_back(r.spans[i].x + r.spans[i].count);
-            }
-        // Between two neighbouring edges the set of layers is constant.
-        std::sort(edges_.begin(), edges_.end());
-        edges_.erase(std::unique(edges_.begin(), edges_.end()), edges_.end());
-        row.clear(0, edges_.front());
-        row.clear(edges_.back(), static_cast<int>(row.transmittance.size()) - edges_.back());
+        findEdges(static_cast<int>(row.transmittance.size()));
+        clearGap(row, 0, edges_.front());
+        clearGap(row, edges_.back(), static_cast<int>(row.transmittance.size()));
         for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
             const int x0 = edges_[e], x1 = edges_[e + 1];
             layers_.clear();
@@ -121,11 +129,35 @@ private:
                     }
                 }
             }
-            if (layers_.empty())
-                row.clear(x0, x1 - x0);
+            if (layers_.empty()) {
+                if (row.wantsGaps || x1 - x0 < narrowGap)
+                    row.clear(x0, x1 - x0);
+                continue;
+            }
+            composite(row, x0, x1 - x0);
+            if (!runs_.empty() && x0 - (runs_.back().x + runs_.back().count) < narrowGap)
+                runs_.back().count = static_cast<std::uint16_t>(x1 - runs_.back().x);
             else
-                composite(row, x0, x1 - x0);
+                runs_.push_back({static_cast<std::uint16_t>(x0), static_cast<std::uint16_t>(x1 - x0)});
         }
+    }
+
+    // The places where spans begin or end: between two neighbouring ones the set of layers is constant.
+    void findEdges(int width)
+    {
+        isEdge_.assign(static_cast<std::size_t>(width / 64 + 1), 0);
+        const auto mark = [this](int x) { isEdge_[static_cast<std::size_t>(x / 64)] |= std::uint64_t{1} << x % 64; };
+        for (const FragmentRow& r : active_)
+            for (int i = 0; i < r.spanCount; ++i) {
+                mark(r.spans[i].x);
+                mark(r.spans[i].x + r.spans[i].count);
+            }
+        edges_.resize(static_cast<std::size_t>(width + 1));
+        int* next = edges_.data();
+        for (std::size_t word = 0; word < isEdge_.size(); ++word)
+            for (std::uint64_t bits = isEdge_[word]; bits != 0; bits &= bits - 1)
+                *next++ = static_cast<int>(64 * word) + detail::zerosBelow(bits);
+        edges_.resize(static_cast<std::size_t>(next - edges_.data()));
     }
 
     // layers_, which are `count` pixels each.
@@ -142,7 +174,9 @@ private:
     std::vector<FragmentCursor> cursors_;
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
+    std::vector<std::uint64_t> isEdge_;    // bit by bit
     std::vector<int> edges_;
+    std::vector<Span> runs_;
     std::vector<Layer> layers_;
     std::vector<int> order_;
 };

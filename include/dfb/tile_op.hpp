@@ -109,6 +109,30 @@ public:
         return farthest;
     }
 
+    // The same for pixels [x, x + count) of the row, of an image with colour and depth at most, and not dithered; every
+    // pixel must be set once.
+    double setPixels(int x, int y, int count, const double* rgba, const float* depth)
+    {
+        const std::size_t first = pixelAt(x, y);
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+            std::copy(depth, depth + count, out + first);
+        std::byte* color = to_.at[detail::Color];
+        return color ? convertPixels(rgba, count, format_, color + first * bytesPerPixel(format_)) : 0;
+    }
+    // The same with one colour, as it is stored: bytesPerPixel(format()) bytes. Depth becomes +infinity.
+    void fillPixels(int x, int y, int count, const std::byte* stored)
+    {
+        const std::size_t first = pixelAt(x, y), bytes = bytesPerPixel(format_);
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+            std::fill_n(out + first, count, std::numeric_limits<float>::infinity());
+        if (std::byte* out = to_.at[detail::Color]; out && count > 0) {
+            out += first * bytes;
+            std::memcpy(out, stored, bytes);
+            for (std::size_t done = 1, all = static_cast<std::size_t>(count); done < all; done *= 2)
+                std::memcpy(out + done * bytes, out, std::min(done, all - done) * bytes);
+        }
+    }
+
     // What setRow() has made of a row; null if the colour is not wanted.
     const std::byte* colorRow(int y) const noexcept
     {
@@ -124,6 +148,11 @@ public:
     }
 
 private:
+    std::size_t pixelAt(int x, int y) const
+    {
+        return static_cast<std::size_t>(y) * stride_ + static_cast<std::size_t>(x);
+    }
+
     Region region_;
     OutputFormat format_;
     detail::Planes to_;

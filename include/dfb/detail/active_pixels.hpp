@@ -59,19 +59,6 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
     return findActivePixels(rgba, count);
 }
 
-// How many bits below the lowest that is set; there is one.
-inline int zerosBelow(std::uint64_t bits)
-{
-#if defined(__GNUC__)
-    return __builtin_ctzll(bits);
-#else
-    int count = 0;
-    for (; !(bits & 1); bits >>= 1)
-        ++count;
-    return count;
-#endif
-}
-
 // Copies the colours of pixels. False if any is not finite, or an alpha not within [0, 1]. No branches, so that it can
 // be vectorized.
 DFB_INLINE bool copyAndCheckColors(const float* rgba, int count, float* out)

@@ -6,6 +6,7 @@
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -126,6 +127,64 @@ public:
     template <class PassDone>
     void compositePasses(const PassDone& passDone)
     {
+        Scratch& scratch = start();
+        const std::size_t passes = static_cast<std::size_t>(info_.passes);
+        const int width = info_.region.width();
+        const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
+        scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
+        for (int y = 0; y < info_.region.height(); ++y) {
+            std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
+            for (std::size_t pass = 0; pass < passes; ++pass) {
+                if (tracked_ != 0 || scratch.row.countTies) // of colour and depth nothing stays from the last row
+                    scratch.row.resize(width, tracked_);
+                scratch.compositors[pass].nextRow(scratch.row);
+                overBackground(scratch.row, 0, width, info_.background.data());
+                for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
+                    scratch.isUndefined[x] |= scratch.row.isUndefined[x];
+                passDone(y, static_cast<int>(pass), std::as_const(scratch.row));
+            }
+            undefinedPixels_ += std::count(scratch.isUndefined.begin(), scratch.isUndefined.end(), 1);
+        }
+        fragments_.clear();
+    }
+
+    // Writes the mean of the passes.
+    void finish(FinishedTile& out)
+    {
+        static thread_local PixelSums sums;
+        const int last = info_.passes - 1;
+        if (last == 0 && tracked_ == 0 && !out.isDithered() && !(info_.depthIsRounded && Rule != BlendRule::InOrder)) {
+            finishRuns(out);
+            return;
+        }
+        const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
+        compositePasses([&](int y, int pass, const CompositeRow& row) {
+            if (direct) {
+                roundExactly(out, y, out.setRow(y, row.rgba.data(), row.depth.data()));
+                return;
+            }
+            if (pass == 0)
+                sums.reset(static_cast<std::size_t>(out.width()), tracked_);
+            sums.add(0, row);
+            if (pass == last)
+                roundExactly(out, y, sums.write(out, y, 0, info_.passes));
+        });
+    }
+
+    // Pixels in which inputs of the last finished frame overlapped in depth.
+    std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
+
+private:
+    struct Scratch {
+        std::vector<const Fragment*> pointers;
+        std::vector<FragmentCompositor> compositors;
+        CompositeRow row;
+        std::vector<std::uint8_t> isUndefined;
+    };
+
+    // Brings the fragments into their order, and a compositor for each pass to their first row.
+    Scratch& start()
+    {
         static thread_local Scratch scratch; // so that a frame after the first allocates nothing
         std::sort(fragments_.begin(), fragments_.end(), [](const Fragment& a, const Fragment& b) {
             const TileHeader &x = a.header(), &y = b.header();
@@ -145,54 +204,40 @@ public:
                 scratch.pointers.push_back(&fragments_[next]);
             scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
         }
-        const float background[4] = {info_.background[0], info_.background[1], info_.background[2],
-                                     info_.background[3]};
-        const int width = info_.region.width();
         scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
+        scratch.row.wantsGaps = true;
         scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
         scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
-        scratch.row.resize(width, tracked_);
-        const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
-        scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
-        for (int y = 0; y < info_.region.height(); ++y) {
-            std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
-            for (std::size_t pass = 0; pass < passes; ++pass) {
-                if (tracked_ != 0 || scratch.row.countTies) // of colour and depth nothing stays from the last row
-                    scratch.row.resize(width, tracked_);
-                scratch.compositors[pass].nextRow(scratch.row);
-                overBackground(scratch.row, background);
-                for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
-                    scratch.isUndefined[x] |= scratch.row.isUndefined[x];
-                passDone(y, static_cast<int>(pass), std::as_const(scratch.row));
+        scratch.row.resize(info_.region.width(), tracked_);
+        return scratch;
+    }
+
+    // One pass, and no more than colour and depth: what no input covers is not composited.
+    void finishRuns(FinishedTile& out)
+    {
+        Scratch& scratch = start();
+        CompositeRow& row = scratch.row;
+        row.wantsGaps = false;
+        std::array<std::byte, 16> background;
+        if (out.format() != OutputFormat::None)
+            convertPixels(info_.background.data(), 1, out.format(), background.data());
+        for (int y = 0; y < out.height(); ++y) {
+            scratch.compositors.front().nextRow(row);
+            int x = 0;
+            double farthest = 0;
+            for (const Span& run : scratch.compositors.front().runs()) {
+                out.fillPixels(x, y, run.x - x, background.data());
+                overBackground(row, run.x, run.count, info_.background.data());
+                farthest = std::max(farthest, out.setPixels(run.x, y, run.count, row.rgba.data() + 4 * run.x,
+                                                            row.depth.data() + (row.wantsDepth ? run.x : 0)));
+                x = run.x + run.count;
             }
-            undefinedPixels_ += std::count(scratch.isUndefined.begin(), scratch.isUndefined.end(), 1);
+            out.fillPixels(x, y, out.width() - x, background.data());
+            roundExactly(out, y, farthest);
         }
         fragments_.clear();
     }
 
-    // Writes the mean of the passes.
-    void finish(FinishedTile& out)
-    {
-        static thread_local PixelSums sums;
-        const int last = info_.passes - 1;
-        const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
-        compositePasses([&](int y, int pass, const CompositeRow& row) {
-            if (direct) {
-                roundExactly(out, y, out.setRow(y, row.rgba.data(), row.depth.data()));
-                return;
-            }
-            if (pass == 0)
-                sums.reset(static_cast<std::size_t>(out.width()), tracked_);
-            sums.add(0, row);
-            if (pass == last)
-                roundExactly(out, y, sums.write(out, y, 0, info_.passes));
-        });
-    }
-
-    // Pixels in which inputs of the last finished frame overlapped in depth.
-    std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
-
-private:
     // Where double does not tell which 8-bit level is nearer, finds out. `farthest`: of setRow().
     void roundExactly(FinishedTile& out, int y, double farthest)
     {
@@ -212,8 +257,6 @@ private:
     std::vector<DoubleDouble> exactRow(int y)
     {
         const int width = info_.region.width();
-        const float background[4] = {info_.background[0], info_.background[1], info_.background[2],
-                                     info_.background[3]};
         std::vector<DoubleDouble> mean(4 * static_cast<std::size_t>(width));
         CompositeRow row;
         row.minTransmittance = static_cast<double>(info_.minTransmittance);
@@ -228,7 +271,7 @@ private:
             compositor.skipRows(y);
             row.resize(width, 0, true);
             compositor.nextRow(row);
-            overBackground(row, background);
+            overBackground(row, 0, width, info_.background.data());
             for (std::size_t i = 0; i < mean.size(); ++i)
                 mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
         }
@@ -236,13 +279,6 @@ private:
             value = value / info_.passes;
         return mean;
     }
-
-    struct Scratch {
-        std::vector<const Fragment*> pointers;
-        std::vector<FragmentCompositor> compositors;
-        CompositeRow row;
-        std::vector<std::uint8_t> isUndefined;
-    };
 
     TileInfo info_;
     ChannelMask tracked_ = 0;
