@@ -115,6 +115,27 @@ TEST_CASE("Blending a group of layers by hand gives the bits of plain C++", "[ke
     CHECK(different == 0);
 }
 
+TEST_CASE("A constant under pixels, and the nearest depths: by hand as in plain C++", "[kernels]")
+{
+    Random random(9);
+    int different = 0;
+    for (int round = 0; round < 1000; ++round) {
+        const int width = anyCount(random);
+        const Stack stack(random, kinds[round % 4], 2, width);
+        std::vector<double> rgba(stack.colors[0].end() - 4 * width, stack.colors[0].end()), plain = rgba, transmittance;
+        for (int i = 0; i < width; ++i)
+            transmittance.push_back(static_cast<double>(dfb::testing::anyAlpha(random)));
+        d::blendConstant(rgba.data(), transmittance.data(), width, stack.layers[1].color);
+        d::blendConstantPlain(plain.data(), transmittance.data(), width, stack.layers[1].color);
+        different += !isSame(rgba, plain);
+        std::vector<float> nearest(stack.depths[0].end() - width, stack.depths[0].end()), nearestPlain = nearest;
+        d::takeNearest(nearest.data(), width, stack.layers[1].color, stack.layers[1].depth);
+        d::takeNearestPlain(nearestPlain.data(), width, stack.layers[1].color, stack.layers[1].depth);
+        different += std::memcmp(nearest.data(), nearestPlain.data(), nearest.size() * sizeof(float)) != 0;
+    }
+    CHECK(different == 0);
+}
+
 TEST_CASE("Layers in order are what over() makes of them one by one", "[kernels]")
 {
     Random random(4);
