@@ -2,7 +2,7 @@
 // against over(), layer by layer and pixel by pixel.
 #include "catch.hpp"
 
-#include <dfb/compositing.hpp>
+#include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 
 #include <algorithm>
@@ -305,4 +305,26 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
     }
     CHECK(different == 0);
     CHECK(ties > 0);
+}
+
+TEST_CASE("An infinity behind what is opaque shows nothing of the tile before", "[kernels]")
+{
+    // Whether such a pixel becomes a NaN depends on which pixels are blended with it, and that on the order that layers
+    // had before. All rows are alike but the last, which leaves the other order; each input is composited twice.
+    dfb::testing::TileInputs<16> in;
+    for (std::uint32_t source = 0; source < 2; ++source) {
+        auto& tile = in.add(0, source);
+        for (int y = 0; y < 16; ++y)
+            for (int x = 0; x < 16; ++x) {
+                const bool isFront = (source == 1) == (x < 6 || y == 15);
+                float* rgba = tile.pixel(x, y);
+                rgba[0] = y < 15 && x == 6 && !isFront ? infinity : 0.25f;
+                rgba[3] = isFront && x >= 4 && x < 8 ? 1.0f : 0.5f;
+                tile.depth[16 * y + x] = isFront ? 1.0f : 2.0f;
+            }
+    }
+    const auto out =
+        dfb::testing::runTileOp<dfb::BasicAlphaBlend<16>>(in, in.order(), dfb::OutputFormat::RGBA32F, false);
+    const std::size_t rowBytes = 16 * 4 * sizeof(float);
+    CHECK(std::memcmp(out.color.data(), out.color.data() + rowBytes, rowBytes) == 0);
 }
