@@ -104,15 +104,6 @@ struct Layer {
 
 namespace detail {
 
-// The depths of a layer where its alpha counts, if they are nearer.
-inline void takeNearest(float* nearest, int count, const Layer& layer)
-{
-    for (int i = 0; i < count; ++i) {
-        const bool isNearer = layer.color[4 * i + 3] > 0.0f && layer.depth[i] < nearest[i];
-        nearest[i] = isNearer ? layer.depth[i] : nearest[i];
-    }
-}
-
 // Adds to a pixel of a row what is let through of `rgba`, in twice the precision, and darkens what is behind.
 inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
 {
@@ -148,7 +139,7 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         transmittance[i] = t * (1.0 - static_cast<double>(c[3]));
     }
     if (layer.depth && row.wantsDepth)
-        detail::takeNearest(row.depth.data() + x, count, layer);
+        detail::takeNearestPlain(row.depth.data() + x, count, layer.color, layer.depth); // often one pixel
 }
 
 // Makes those of `count` pixels from x on opaque that count as such. True if nothing of what is behind any of them can
@@ -222,9 +213,8 @@ inline void overBackground(CompositeRow& row, int begin, int count, const float*
         return;
     for (std::size_t x = first; x < end && !row.rgbaLow.empty(); ++x)
         detail::overExactly(row, x, rgba);
-    for (std::size_t x = first; x < end && row.rgbaLow.empty(); ++x)
-        for (std::size_t c = 0; c < 4; ++c)
-            row.rgba[4 * x + c] += row.transmittance[x] * static_cast<double>(rgba[c]);
+    if (row.rgbaLow.empty())
+        detail::blendConstant(row.rgba.data() + 4 * first, row.transmittance.data() + first, count, rgba);
 }
 
 namespace detail {
@@ -260,7 +250,7 @@ inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::
     std::fill_n(nearest, end - begin, std::numeric_limits<float>::infinity());
     for (const Layer& layer : layers) // of equal depths, such as 0 and -0, that of the first
         if (const Layer l = layer.from(begin); l.depth)
-            takeNearest(nearest, end - begin, l);
+            takeNearest(nearest, end - begin, l.color, l.depth);
 }
 
 // The same with all that a row may have.

@@ -30,6 +30,7 @@ public:
     void start(Iterator begin, Iterator end)
     {
         cursors_.clear();
+        order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         for (; begin != end; ++begin)
             if (!(*begin)->empty())
                 cursors_.emplace_back(**begin);

@@ -117,6 +117,23 @@ void blendFourPlain(double* rgba, double* transmittance, const float* const* col
     }
 }
 
+// One colour under all pixels, and nothing behind it any more.
+inline void blendConstantPlain(double* rgba, const double* transmittance, int count, const float* color)
+{
+    for (int i = 0; i < count; ++i)
+        for (int c = 0; c < 4; ++c)
+            rgba[4 * i + c] += transmittance[i] * static_cast<double>(color[c]);
+}
+
+// The depths of a layer where its alpha counts, if they are nearer.
+inline void takeNearestPlain(float* nearest, int count, const float* color, const float* depth)
+{
+    for (int i = 0; i < count; ++i) {
+        const bool isNearer = color[4 * i + 3] > 0.0f && depth[i] < nearest[i];
+        nearest[i] = isNearer ? depth[i] : nearest[i];
+    }
+}
+
 // ---- AVX2
 
 #if defined(DFB_HAS_AVX2_CLONES)
@@ -142,6 +159,29 @@ DFB_AVX2 inline void takeLayerAvx2(double* rgba, double* transmittance, int coun
         _mm256_storeu_pd(transmittance + i, t);
     }
     takeLayerPlain(rgba + 4 * inBlocks, transmittance + inBlocks, count % 4, color + 4 * inBlocks, minTransmittance);
+}
+
+DFB_AVX2 inline void blendConstantAvx2(double* rgba, const double* transmittance, int count, const float* color)
+{
+    const __m256d c = _mm256_cvtps_pd(_mm_loadu_ps(color));
+    for (std::ptrdiff_t i = 0; i < count; ++i) {
+        const __m256d added = _mm256_mul_pd(_mm256_broadcast_sd(transmittance + i), c);
+        _mm256_storeu_pd(rgba + 4 * i, _mm256_add_pd(_mm256_loadu_pd(rgba + 4 * i), added));
+    }
+}
+
+DFB_AVX2 inline void takeNearestAvx2(float* nearest, int count, const float* color, const float* depth)
+{
+    const std::ptrdiff_t inBlocks = count - count % 4;
+    for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
+        const float* c = color + 4 * i;
+        const __m128 ab = _mm_unpackhi_ps(_mm_loadu_ps(c), _mm_loadu_ps(c + 4)); // blue, blue, alpha, alpha
+        const __m128 cd = _mm_unpackhi_ps(_mm_loadu_ps(c + 8), _mm_loadu_ps(c + 12));
+        const __m128 alpha = _mm_movehl_ps(cd, ab), d = _mm_loadu_ps(depth + i), so = _mm_loadu_ps(nearest + i);
+        const __m128 isNearer = _mm_and_ps(_mm_cmpgt_ps(alpha, _mm_setzero_ps()), _mm_cmplt_ps(d, so));
+        _mm_storeu_ps(nearest + i, _mm_blendv_ps(so, d, isNearer));
+    }
+    takeNearestPlain(nearest + inBlocks, count % 4, color + 4 * inBlocks, depth + inBlocks);
 }
 
 // A pixel is one register, and so is what it lets through, four times.
@@ -280,6 +320,28 @@ inline void blendFour(double* rgba, double* transmittance, const float* const* c
 #endif
     (hasLeast ? blendFourPlain<true> : blendFourPlain<false>)(rgba, transmittance, colors, orders, layers,
                                                               minTransmittance);
+}
+
+inline void blendConstant(double* rgba, const double* transmittance, int count, const float* color)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        blendConstantAvx2(rgba, transmittance, count, color);
+        return;
+    }
+#endif
+    blendConstantPlain(rgba, transmittance, count, color);
+}
+
+inline void takeNearest(float* nearest, int count, const float* color, const float* depth)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        takeNearestAvx2(nearest, count, color, depth);
+        return;
+    }
+#endif
+    takeNearestPlain(nearest, count, color, depth);
 }
 
 } // namespace dfb::detail
