@@ -37,13 +37,13 @@ public:
     // The owner's own root (generation 0) has come, and what follows in generation 1 are exactly these
     // (source, part) pairs, each once. Used where the counts come from the senders' manifests; call it once, in
     // place of an arriving root. Throws as arrive() does, if what came before was not declared.
-    void declare(std::vector<std::pair<std::uint32_t, std::uint16_t>> inputs)
+    void declare(const std::vector<std::pair<std::uint32_t, std::uint16_t>>& inputs)
     {
-        std::sort(inputs.begin(), inputs.end());
-        const auto twice = std::adjacent_find(inputs.begin(), inputs.end());
-        if (twice != inputs.end())
+        declared_ = inputs; // into memory that it has already
+        std::sort(declared_.begin(), declared_.end());
+        const auto twice = std::adjacent_find(declared_.begin(), declared_.end());
+        if (twice != declared_.end())
             fail(ErrorKind::DuplicateInput, 1, twice->first, 1, 2, "declared twice");
-        declared_ = std::move(inputs);
         hasDeclaration_ = true;
         for (const Input& input : inputs_)
             if (input.generation == 1)

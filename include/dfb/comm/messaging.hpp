@@ -30,6 +30,7 @@ public:
     // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
     virtual void undecodable(int source, const ErrorInfo& error) = 0;
+    virtual void work(int) {} // what submitWork() was given
 
 protected:
     ~MessageHandler() = default;
@@ -169,10 +170,20 @@ public:
         }
         executor_->submit([this, task = std::move(task)] {
             task();
+            taskDone();
+        });
+    }
+
+    // The same for the handler's work(number); takes no memory.
+    void submitWork(int number)
+    {
+        {
             const std::lock_guard<std::mutex> lock(mutex_);
-            --tasks_;
-            if (isEnding_) // others wait for what tasks do, and are told
-                changed_.notify_all();
+            ++tasks_;
+        }
+        executor_->submit([this, number] {
+            handler_.work(number);
+            taskDone();
         });
     }
 
@@ -283,6 +294,14 @@ public:
     }
 
 private:
+    void taskDone()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        --tasks_;
+        if (isEnding_) // others wait for what tasks do, and are told
+            changed_.notify_all();
+    }
+
     void countSent(const Buffer& message)
     {
         bytesSent_ += static_cast<std::int64_t>(message.size());

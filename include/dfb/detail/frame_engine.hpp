@@ -192,7 +192,7 @@ public:
             messaging_->sendWithCredit(owner, std::move(message));
             waitForRoom();
         } else if (gate_.enter(tile.frame)) {
-            arrive(std::move(message), {});
+            arrive(std::move(message), -1);
             gate_.leave();
         }
     }
@@ -348,7 +348,7 @@ private:
         }
         if (hasCredit)
             messaging_->flow().consumed(source, byteCount);
-        guarded([&] { handle(source, header, std::move(message)); }, messageFrom(source));
+        guarded([&] { handle(source, header, std::move(message)); }, {}, source);
         gate_.leave();
     }
 
@@ -471,7 +471,7 @@ private:
         if (outcome_->failed())
             return;
         switch (kind) {
-        case MessageKind::Fragment: arrive(std::move(message), messageFrom(source)); break;
+        case MessageKind::Fragment: arrive(std::move(message), source); break;
         case MessageKind::Manifest:
             if (!wantsDeclaration_) {
                 ErrorInfo info;
@@ -539,33 +539,39 @@ private:
     // ---- tiles
 
     // `where` says what is known of the place.
-    void arrive(Buffer&& message, ErrorInfo where)
+    // `source`: -1 if it is this rank's own.
+    void arrive(Buffer&& message, int source)
     {
+        ErrorInfo where;
         guarded(
             [&] {
                 const int ready = pipeline_->arrive(std::move(message), where);
                 if (ready >= 0)
                     submitFinish(ready);
             },
-            where);
+            where, source);
     }
 
     void submitFinish(int tile)
     {
         gate_.enterAgain(); // we are inside
-        messaging_->submit([this, tile] {
-            ErrorInfo where;
-            where.tile = tile;
-            guarded(
-                [&] {
-                    if (outcome_->failed())
-                        return;
-                    pipeline_->finish(tile);
-                    tilesLess(1);
-                },
-                where);
-            gate_.leave();
-        });
+        messaging_->submitWork(tile);
+    }
+
+    // A tile that is complete.
+    void work(int tile) override
+    {
+        ErrorInfo where;
+        where.tile = tile;
+        guarded(
+            [&] {
+                if (outcome_->failed())
+                    return;
+                pipeline_->finish(tile);
+                tilesLess(1);
+            },
+            where);
+        gate_.leave();
     }
 
     // So many tiles less to wait for.
@@ -612,14 +618,18 @@ private:
 
     // ---- failure, verdict, end
 
-    // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then.
+    // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then, `source` whose
+    // message it was about, or -1.
     template <class Body>
-    void guarded(const Body& body, const ErrorInfo& where = {})
+    void guarded(const Body& body, const ErrorInfo& where = {}, int source = -1)
     {
         try {
             body();
         } catch (...) {
-            failWith(std::current_exception(), where);
+            ErrorInfo place = where;
+            if (source >= 0)
+                place.message = messageFrom(source).message;
+            failWith(std::current_exception(), place);
         }
     }
 

@@ -261,7 +261,8 @@ private:
     static void declareSlot(Slot& slot, const std::vector<ExpectedInput>* inputs)
     {
         slot.declared = true;
-        std::vector<std::pair<std::uint32_t, std::uint16_t>> names;
+        static thread_local std::vector<std::pair<std::uint32_t, std::uint16_t>> names;
+        names.clear();
         if (inputs)
             for (const ExpectedInput& input : *inputs)
                 names.emplace_back(input.source, input.part);
