@@ -73,8 +73,11 @@ bool goodFrame(Fb& fb, const Scene& s)
 // The ranks that are to blame in turn: the first, one in the middle, the last.
 std::vector<int> culprits()
 {
-    std::vector<int> ranks{0, sizeOf(MPI_COMM_WORLD) / 2, sizeOf(MPI_COMM_WORLD) - 1};
-    ranks.erase(std::unique(ranks.begin(), ranks.end()), ranks.end());
+    const int size = sizeOf(MPI_COMM_WORLD);
+    std::vector<int> ranks{0};
+    for (const int rank : {size / 2, size - 1})
+        if (rank != ranks.back())
+            ranks.push_back(rank);
     return ranks;
 }
 

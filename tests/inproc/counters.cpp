@@ -1,0 +1,165 @@
+// What a frame costs, in bytes, messages and allocations: counted, as a clock would have to be believed.
+#include "catch.hpp"
+
+#include <dfb/dfb.hpp>
+
+#include <algorithm>
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <cstdlib>
+#include <limits>
+#include <memory>
+#include <new>
+#include <vector>
+
+namespace {
+
+std::atomic<std::int64_t> allocations{0};
+
+void* allocate(std::size_t bytes, std::size_t alignment)
+{
+    ++allocations;
+    void* block = alignment > alignof(std::max_align_t)
+                      ? std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment)
+                      : std::malloc(bytes > 0 ? bytes : 1);
+    if (!block)
+        throw std::bad_alloc();
+    return block;
+}
+
+} // namespace
+
+// Those of the whole program.
+void* operator new(std::size_t bytes) { return allocate(bytes, 1); }
+void* operator new[](std::size_t bytes) { return allocate(bytes, 1); }
+void* operator new(std::size_t bytes, std::align_val_t a) { return allocate(bytes, static_cast<std::size_t>(a)); }
+void* operator new[](std::size_t bytes, std::align_val_t a) { return allocate(bytes, static_cast<std::size_t>(a)); }
+void operator delete(void* block) noexcept { std::free(block); }
+void operator delete[](void* block) noexcept { std::free(block); }
+void operator delete(void* block, std::size_t) noexcept { std::free(block); }
+void operator delete[](void* block, std::size_t) noexcept { std::free(block); }
+void operator delete(void* block, std::align_val_t) noexcept { std::free(block); }
+void operator delete[](void* block, std::align_val_t) noexcept { std::free(block); }
+void operator delete(void* block, std::size_t, std::align_val_t) noexcept { std::free(block); }
+void operator delete[](void* block, std::size_t, std::align_val_t) noexcept { std::free(block); }
+
+namespace {
+
+constexpr int ranks = 4, side = 512, tileSide = 64, tileCount = (side / tileSide) * (side / tileSide);
+
+// Every box covers the image.
+struct WholeImage {
+    dfb::Region project(const dfb::Box3&, int, int) const { return {0, 0, side, side}; }
+};
+
+struct Cost {
+    dfb::FrameReport report; // of the last frame
+    std::int64_t allocations = 0;
+};
+
+// Frames of the same picture: each rank has an image of which the first `rows` rows have something.
+template <class TileOp>
+Cost cost(int rows, bool declaresAgain = false, int frames = 4)
+{
+    Cost result;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config;
+        config.width = config.height = side;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        using Fb = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, dfb::InprocTransport>;
+        Fb fb(communicator, config);
+        dfb::World world;
+        const auto depth = static_cast<float>(fb.rank());
+        if (rows > 0)
+            world.add({static_cast<std::uint32_t>(fb.rank()), {{0, 0, depth}, {1, 1, depth + 1}}});
+        const std::size_t pixels = static_cast<std::size_t>(side) * side;
+        std::vector<float> rgba(4 * pixels, 0.0f), depths(pixels, std::numeric_limits<float>::infinity());
+        std::fill_n(rgba.begin(), 4 * side * rows, 0.25f);
+        for (std::size_t i = 0; i < static_cast<std::size_t>(side * rows); ++i) {
+            rgba[4 * i] = 0.25f * static_cast<float>(i % 7) / 7; // not constant
+            depths[i] = depth;
+        }
+        const auto find = dfb::inPlace([&](const dfb::Brick&, auto& view) {
+            const std::size_t first =
+                static_cast<std::size_t>(view.region.y0) * side + static_cast<std::size_t>(view.region.x0);
+            view.stride = side;
+            view.color = &rgba[4 * first];
+            view.depth = &depths[first];
+        });
+        const auto meet = [&] { fb.allReduce({0}, Fb::Reduce::Sum); };
+        for (int frame = 0; frame < frames; ++frame) {
+            meet();
+            const std::int64_t before = allocations;
+            meet();
+            dfb::FrameParams params;
+            params.declarationKey = declaresAgain ? 0 : 1;
+            const dfb::FrameReport report = dfb::renderDataParallel(fb, world, WholeImage(), find, params);
+            meet();
+            if (fb.isDisplayRank())
+                result = {report, allocations - before};
+            meet();
+        }
+    });
+    return result;
+}
+
+// What travels of `pixels` active pixels of all ranks to be composited: those whose owner is another rank.
+double expectedBytes(double rows, double bytesPerPixel)
+{
+    return (ranks - 1) * rows * side * bytesPerPixel  // each rank has all tiles, and owns one in four
+           + (ranks - 1.0) / ranks * side * rows * 4; // the finished ones, 8 bits a channel
+}
+
+} // namespace
+
+TEST_CASE("A frame sends its active pixels, and little else", "[counters]")
+{
+    // Rows by the tile, so that whole tiles are sent.
+    for (const int rows : {64, 256, 512}) {
+        const Cost sorted = cost<dfb::AlphaBlend>(rows), nearest = cost<dfb::DepthComposite>(rows);
+        INFO(rows << " rows: " << sorted.report.bytesSent << " bytes, expected at least " << expectedBytes(rows, 20));
+        for (const Cost& c : {sorted, nearest}) {
+            CHECK(static_cast<double>(c.report.bytesSent) >= expectedBytes(rows, 20));
+            CHECK(static_cast<double>(c.report.bytesSent)
+                  <= expectedBytes(rows, 20) * 1.01 + 64 * 3 * tileCount + 4096);
+        }
+    }
+    // Half a tile is a half, and rows that are not there cost nothing.
+    const double half = static_cast<double>(cost<dfb::AlphaBlend>(32).report.bytesSent),
+                 whole = static_cast<double>(cost<dfb::AlphaBlend>(64).report.bytesSent);
+    const double inputs = (ranks - 1) * 64.0 * side * 20;
+    CHECK(whole - half >= inputs * 0.49);
+}
+
+TEST_CASE("A frame of nothing costs next to nothing", "[counters]")
+{
+    const Cost full = cost<dfb::AlphaBlend>(side), empty = cost<dfb::AlphaBlend>(0);
+    INFO("bytes " << empty.report.bytesSent << " of " << full.report.bytesSent << ", messages "
+                  << empty.report.messagesSent << " of " << full.report.messagesSent);
+    CHECK(static_cast<double>(empty.report.bytesSent) <= 0.001 * static_cast<double>(full.report.bytesSent));
+    CHECK(empty.report.messagesSent <= 3 * (ranks - 1)); // of the verdict up and down, and that there are no tiles
+}
+
+TEST_CASE("The second frame with the same declaration sends no manifests", "[counters]")
+{
+    const Cost again = cost<dfb::AlphaBlend>(side, true), kept = cost<dfb::AlphaBlend>(side, false);
+    // Each rank to each other one, their answers, and that all have declared, up and down.
+    CHECK(again.report.messagesSent - kept.report.messagesSent >= 2 * ranks * (ranks - 1));
+}
+
+TEST_CASE("Messages: one for each input, a few for each rank", "[counters]")
+{
+    const Cost full = cost<dfb::AlphaBlend>(side);
+    const int inputs = tileCount * (ranks - 1);
+    INFO(full.report.messagesSent);
+    CHECK(full.report.messagesSent >= inputs);
+    CHECK(full.report.messagesSent <= inputs + 8 * ranks); // with credits, which depend on time
+}
+
+TEST_CASE("Allocations do not grow from frame to frame, and are fewer than two for each input", "[counters]")
+{
+    const Cost c = cost<dfb::AlphaBlend>(side, false, 8);
+    INFO(c.allocations);
+    CHECK(c.allocations < 2 * tileCount * ranks);
+}
