@@ -21,7 +21,7 @@ enum class Mode { Data, Image, Mixed };
 enum class Blending { Sort, Order, Nearest };
 enum class Balance { Cost, RoundRobin };
 enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
-enum class Compression { None, Snappy };
+enum class Compression { None, Snappy, Auto };
 enum class OwnerMap { Lattice, Linear, Hash };
 
 struct Options {
@@ -244,9 +244,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--no-shared-memory", noSharedMemory,
                  "Send all messages through MPI, also those between ranks of one node")
         ->group(how);
-    app.add_option("--compression", options.compression, "Of messages between ranks; default none")
-        ->transform(detail::choice({"none", "snappy"}))
-        ->option_text("none|snappy")
+    app.add_option("--compression", options.compression, "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
+                   "faster; default none")
+        ->transform(detail::choice({"none", "snappy", "auto"}))
+        ->option_text("none|snappy|auto")
         ->group(how);
     app.add_option("--wire", options.wire,
                    "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "

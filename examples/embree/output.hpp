@@ -151,6 +151,7 @@ struct FrameStats {
     double mergeErrorBound = 0;
     std::string wireColor; // the format of the colour on its way
     double wireErrorBound = 0;
+    bool compressed = false;
 };
 
 struct RunStats {
@@ -192,6 +193,7 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["merge_error_bound"] = frame.mergeErrorBound;
         entry["wire_color"] = frame.wireColor;
         entry["wire_error_bound"] = frame.wireErrorBound;
+        entry["compressed"] = frame.compressed;
         entry["tiles_rendered"] = frame.tilesRendered;
         entry["work_of_ranks"] = frame.workOfRanks;
         json["frames"].push_back(entry);

@@ -75,7 +75,9 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
                                                      : dfb::latticeOwner;
-    if (o.compression == Compression::Snappy) {
+    if (o.compression == Compression::Auto)
+        config.compression = dfb::CompressionMode::Auto;
+    if (o.compression != Compression::None) {
 #if defined(DFB_HAS_SNAPPY)
         config.codec = std::make_shared<dfb::SnappyCodec>();
 #else
@@ -442,6 +444,7 @@ private:
             s.mergeErrorBound = r.mergeErrorBound;
             s.wireColor = dfb::nameOf(r.wireColor);
             s.wireErrorBound = r.wireErrorBound;
+            s.compressed = r.compressed;
             for (const auto& ofRank : rendered) {
                 s.tilesRendered.push_back(static_cast<std::uint64_t>(ofRank[2 * i]));
                 s.workOfRanks.push_back(static_cast<std::uint64_t>(ofRank[2 * i + 1]));

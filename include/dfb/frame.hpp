@@ -22,6 +22,13 @@ enum class GatherMode : std::uint8_t {
     AtEnd    // when all tiles of a rank are finished
 };
 
+// Where a codec is used, if there is one.
+enum class CompressionMode : std::uint8_t {
+    Always,
+    Auto // between nodes, in frames in which that has turned out to be faster: a few frames with and without, then the
+         // better, and now and then a few of the other again; the same on all ranks
+};
+
 // What a framebuffer is made with. Everything but executor and progress must be the same on all ranks, which is
 // checked when it is made.
 struct FrameBufferConfig {
@@ -34,6 +41,7 @@ struct FrameBufferConfig {
     int framesInFlight = 1;               // the most that may be open at once; memory grows with it
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
+    CompressionMode compression = CompressionMode::Always;
     // How exactly inputs travel: a WireFormat, an ErrorBudget, or all of it. Finished tiles travel in `format`.
     WirePrecision wire{};
     // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
@@ -107,6 +115,7 @@ struct FrameReport {
     std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
+    bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     double wireErrorBound = 0; // all: how far a pixel may be off for WirePrecision and minTransmittance, from what came
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports

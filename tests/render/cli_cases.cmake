@@ -533,6 +533,7 @@ elseif(CASE STREQUAL "hash")
   expect_hash(${plain} ${START} ${scene} --compression none)
   if(SNAPPY)
     expect_hash(${plain} ${START} ${scene} --compression snappy)
+    expect_hash(${plain} ${START} ${scene} --compression auto)
   endif()
 
 elseif(CASE STREQUAL "modes")

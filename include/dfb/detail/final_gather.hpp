@@ -75,9 +75,11 @@ public:
     const Image& image() const noexcept { return image_; }
     bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
 
-    void newFrame(std::int64_t frame)
+    // `compresses`: whether the codec, if there is one, is used.
+    void newFrame(std::int64_t frame, bool compresses)
     {
         frame_ = frame;
+        compresses_ = compresses && settings_.codec;
         batch_.reset();
         tilesSent_ = 0;
         placed_.clear();
@@ -492,7 +494,7 @@ private:
         h.rawBytes = batch.used - prefix;
         Buffer message = std::move(batch.message);
         message.shrink(batch.used);
-        if (settings_.codec) {
+        if (compresses_) {
             Buffer packed = pool_->acquire(prefix + settings_.codec->bound(h.rawBytes));
             const std::size_t bytes =
                 settings_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
@@ -535,6 +537,7 @@ private:
     int rank_, rankCount_;
     Send send_;
     std::int64_t frame_ = 0;
+    bool compresses_ = false;
 
     mutable std::mutex mutex_;
     std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones

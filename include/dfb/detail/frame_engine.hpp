@@ -2,6 +2,7 @@
 // layer, the declarations and the verdict into frames.
 #pragma once
 
+#include <dfb/comm/compression_trial.hpp>
 #include <dfb/comm/messaging.hpp>
 #include <dfb/detail/frame_figures.hpp>
 #include <dfb/detail/frame_gate.hpp>
@@ -131,7 +132,8 @@ public:
         info.background = params.background;
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, params.maxLayers, tileData, pixelData);
+            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.displayRank) != nullptr,
+                                tileData, pixelData);
         } catch (...) {
             userError = std::current_exception();
         }
@@ -186,8 +188,8 @@ public:
         pipeline_->checkPlanes(tile);
         if (outcome_->failed())
             return;
-        Buffer message = pipeline_->encode(tile);
         const int owner = tileOwner(tile.tile);
+        Buffer message = pipeline_->encode(tile, codecFor(owner));
         if (owner != rank()) {
             messaging_->sendWithCredit(owner, std::move(message));
             waitForRoom();
@@ -266,6 +268,10 @@ public:
         const Verdict verdict = conclude();
         if (verdict.error)
             throw FrameError(*verdict.error);
+        const bool compressed =
+            config_.codec && (config_.compression == CompressionMode::Always || compressionTrial_.compresses());
+        if (config_.codec)
+            compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
         pipeline_->fillBackground();
         lastKey_ = params_.declarationKey;
         lastAccumulationId_ = params_.accumulationId;
@@ -278,6 +284,7 @@ public:
         report.compositingOverheadMs = report.totalMs - report.renderMs;
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
+        report.compressed = compressed;
         verdict.addTo(report);
         return report;
     }
@@ -331,6 +338,17 @@ private:
 
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
+
+    // What messages with pixels to that rank are compressed with in this frame, or null.
+    const Codec* codecFor(int other) const
+    {
+        if (other == rank())
+            return nullptr;
+        if (config_.compression == CompressionMode::Auto
+            && (!compressionTrial_.compresses() || messaging_->messenger().isSeenBy(other)))
+            return nullptr;
+        return config_.codec.get();
+    }
 
     // ---- messages
 
@@ -710,7 +728,8 @@ private:
                            figures_.addTo(v);
                            repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
-                                       static_cast<std::int64_t>(messaging_->flow().peakInboxBytes())};
+                                       static_cast<std::int64_t>(messaging_->flow().peakInboxBytes()),
+                                       std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
                            return v;
                        });
     }
@@ -809,6 +828,7 @@ private:
     std::uint64_t lastAccumulationId_ = 0;
     bool frameOpen_ = false, lastFailed_ = false;
     FrameFigures figures_;
+    CompressionTrial compressionTrial_;
     std::mutex strayMutex_;
     std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};

@@ -72,13 +72,14 @@ public:
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
-    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers,
+    // `compresses`: whether finished tiles are compressed.
+    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses,
                   const typename FrameDataOf<TileOp>::type& tileData,
                   const typename FrameDataOf<PixelOp>::type& pixelData)
     {
         nonFinite_ = alphaOutside_ = 0;
         reports_ = {};
-        gather_.newFrame(info.frame);
+        gather_.newFrame(info.frame, compresses);
         info.minTransmittance = config_.minTransmittance;
         info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
         table_.newFrame(info, plan, tileData);
@@ -137,15 +138,13 @@ public:
         return header;
     }
 
-    // The message for a tile that has been checked; compressed only if it travels.
+    // The message for a tile that has been checked. `codec` may be null.
     template <class AnyTile>
-    Buffer encode(const AnyTile& tile)
+    Buffer encode(const AnyTile& tile, const Codec* codec)
     {
         const FloatEnvironment floatEnvironment;
         InputFaults faults;
-        Buffer message =
-            encodeFragment(*pool_, tile, travelling(config_), address_,
-                           table_.isMine(tile.tile) ? nullptr : config_.codec.get(), coder_, wireColor_, faults);
+        Buffer message = encodeFragment(*pool_, tile, travelling(config_), address_, codec, coder_, wireColor_, faults);
         if (faults.nonFinite)
             nonFinite_ += static_cast<std::int64_t>(faults.nonFinite);
         if (faults.alphaOutside)

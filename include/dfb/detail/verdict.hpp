@@ -83,11 +83,12 @@ struct Verdict {
     // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
     // pixels with alpha outside [0, 1].
     std::array<std::int64_t, 8> sums{};
-    std::array<std::int64_t, 3> maxima{}; // peak memory in bytes, rendering in ns, peak of the inbox in bytes
-    double wireErrorBound = 0;            // a maximum
-    std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
-    std::vector<Figure> figures;          // by key; sums
-    std::vector<Figure> mergeErrors;      // by tile; sums
+    // Peak memory in bytes, rendering in ns, peak of the inbox in bytes, ns from begin() until all is done here.
+    std::array<std::int64_t, 4> maxima{};
+    double wireErrorBound = 0;       // a maximum
+    std::vector<Figure> tileErrors;  // by tile; no two ranks have the same
+    std::vector<Figure> figures;     // by key; sums
+    std::vector<Figure> mergeErrors; // by tile; sums
 
     std::vector<std::byte> bytes() const
     {
@@ -238,13 +239,14 @@ struct Agreement {
                           + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
                           + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux "
                           + text(c.aux) + ", display rank " + text(c.displayRank) + ", frames in flight "
-                          + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0) + ", gather "
-                          + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color)
-                          + ", error budget " + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor)
-                          + ", wire depth " + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to "
-                          + text(c.wire.depthFar) + ", least transmittance " + text(c.minTransmittance) + ", checksums "
-                          + text(c.checksums) + ", message pool " + text(c.messagePoolBytes) + ", owner map "
-                          + text(owners.value()) + ", dither " + text(c.dither)};
+                          + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0) + ", compression "
+                          + text(static_cast<int>(c.compression)) + ", gather " + text(static_cast<int>(c.gather))
+                          + ", wire colour " + nameOf(c.wire.color) + ", error budget " + text(c.wire.budget)
+                          + ", largest colour " + text(c.wire.maxColor) + ", wire depth " + nameOf(c.wire.depth)
+                          + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar) + ", least transmittance "
+                          + text(c.minTransmittance) + ", checksums " + text(c.checksums) + ", message pool "
+                          + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
+                          + text(c.dither)};
     }
 
     std::vector<std::byte> bytes() const
