@@ -51,7 +51,9 @@ void addAllDfb(std::vector<System>& systems, const std::shared_ptr<bench::Messen
     addOrdered("unorm16", {WireFormat::Unorm16});
     addOrdered("unorm8", {WireFormat::Unorm8});
 #if defined(DFB_HAS_SNAPPY)
-    addOrdered("float32, snappy", {WireFormat::Float32, std::make_shared<dfb::SnappyCodec>()});
+    const auto snappy = std::make_shared<dfb::SnappyCodec>();
+    addOrdered("float32, snappy", {WireFormat::Float32, snappy});
+    addOrdered("float32, snappy if faster", {WireFormat::Float32, snappy, 0, false, dfb::CompressionMode::Auto});
 #endif
 }
 

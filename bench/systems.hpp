@@ -108,6 +108,7 @@ struct DfbSettings {
     std::shared_ptr<const dfb::Codec> codec{};
     float minTransmittance = 0;
     bool isDefault = false;
+    dfb::CompressionMode compression = dfb::CompressionMode::Always;
 };
 
 // `inputs` must outlive the systems, here and below.
@@ -135,6 +136,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& mess
         c.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
         c.wire = settings.wire;
         c.codec = settings.codec;
+        c.compression = settings.compression;
         c.minTransmittance = settings.minTransmittance;
         System s;
         s.name = "dfb";
