@@ -1,9 +1,12 @@
 // Ranks and what they have in common. All but the first two are collective over MPI_COMM_WORLD.
 #pragma once
 
+#include <dfb/comm/node_memory.hpp>
+
 #include <mpi.h>
 
 #include <algorithm>
+#include <cstddef>
 #include <string>
 #include <vector>
 
@@ -28,4 +31,18 @@ inline bool sameEverywhere(const std::string& text)
     std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
     MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
     return text.compare(0, first.size() - 1, first.data()) == 0;
+}
+
+// Whether each rank sees memory of the next one; a system may not allow it.
+inline bool seesNextRank(MPI_Comm communicator)
+{
+    using Memory = dfb::detail::NodeMemory;
+    const auto mine = Memory::create();
+    const Memory::Address address = mine ? mine->address() : Memory::Address();
+    const int size = sizeOf(communicator), rank = rankIn(communicator);
+    std::vector<Memory::Address> all(static_cast<std::size_t>(size));
+    MPI_Allgather(&address, sizeof address, MPI_BYTE, all.data(), sizeof address, MPI_BYTE, communicator);
+    int sees = Memory::open(all[static_cast<std::size_t>((rank + 1) % size)]) != nullptr;
+    MPI_Allreduce(MPI_IN_PLACE, &sees, 1, MPI_INT, MPI_MIN, communicator);
+    return sees != 0;
 }
