@@ -54,7 +54,7 @@ struct FrameBufferConfig {
     std::shared_ptr<Executor> executor{}; // null: a ThreadExecutor with one thread per core
     // Of the messenger; a framebuffer that is given one goes by that one's.
     Progress progress = Progress::Thread;
-    bool checksums = false; // a CRC-32C in each message: whoever does not trust the network pays for it
+    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
 };
 
@@ -103,11 +103,13 @@ struct Figure {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    double totalMs = 0;                         // begin() to the return of end(), this rank
-    double renderMs = 0;                        // begin() to the call of end(), this rank
-    double compositingOverheadMs = 0;           // the call of end() to its return, this rank
-    double renderMsMax = 0;                     // all: the longest renderMs
-    std::int64_t bytesSent = 0;                 // all: message bytes to other ranks, without the transport's own
+    double totalMs = 0;               // begin() to the return of end(), this rank
+    double renderMs = 0;              // begin() to the call of end(), this rank
+    double compositingOverheadMs = 0; // the call of end() to its return, this rank
+    double renderMsMax = 0;           // all: the longest renderMs
+    // All: message bytes to other ranks, without the transport's own, and what owners have put into the image of the
+    // display rank themselves.
+    std::int64_t bytesSent = 0;
     std::int64_t messagesSent = 0;              // all
     std::int64_t tilesTotal = 0;                // in the image
     std::int64_t tilesTouched = 0;              // all: tiles that had an input
