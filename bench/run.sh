@@ -1,14 +1,14 @@
 #!/bin/sh
 # sh bench/run.sh [--quick]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs
-# bench_error_time on 4 and on 8 ranks, its table to README.md, and bench_compositing on 2, 4 and 8 ranks, its table to
-# bench/README.md; all figures to bench/results. 15 minutes, or 5.
+# bench_error_time on 4 and on 8 ranks, its table to README.md, and bench_compositing and bench_overlap on 2, 4 and 8
+# ranks, their tables to bench/README.md; all figures to bench/results. 15 minutes, or 5.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
-frames=41 compositing_frames=11
-[ "${1:-}" != --quick ] || frames=5 compositing_frames=3
+frames=41 compositing_frames=11 views=12
+[ "${1:-}" != --quick ] || frames=5 compositing_frames=3 views=4
 jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
 results=bench/results
@@ -16,10 +16,10 @@ results=bench/results
 sh cmake/install_packages.sh
 sh bench/get_icet.sh || [ $? -eq 3 ] # without IceT the others are measured
 cmake --preset release -DDFB_BUILD_BENCH=ON
-cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing
+cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing bench_overlap
 
 mkdir -p "$results"
-rm -f "$results"/error_time.* "$results"/compositing.*
+rm -f "$results"/error_time.* "$results"/compositing.* "$results"/overlap.*
 for ranks in 4 8; do
     mpiexec -n "$ranks" build/release/bench/bench_error_time --frames "$frames" --commit "$commit" \
         --json "$results/error_time.json" --svg "$results/error_time.$ranks" --table "$results/error_time.$ranks.md"
@@ -29,6 +29,11 @@ for ranks in 2 4 8; do
     mpiexec -n "$ranks" build/release/bench/bench_compositing --scene all --size 1024x1024 \
         --frames "$compositing_frames" --commit "$commit" \
         --json "$results/compositing.json" --table "$results/compositing.md"
+done
+
+for ranks in 2 4 8; do
+    mpiexec -n "$ranks" build/release/bench/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
+        --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
 done
 
 # between FILE NAME TABLE...: what FILE has between the marks of NAME is what was measured.
@@ -49,3 +54,4 @@ between() {
 }
 between README.md error_time "$results/error_time.4.md" "$results/error_time.8.md"
 between bench/README.md compositing "$results/compositing.md"
+between bench/README.md overlap "$results/overlap.md"
