@@ -110,7 +110,7 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         mayGoOn = true;
     });
     Scene impatient = s;
-    impatient.timeoutMs = 500;
+    impatient.timeoutMs = 2000; // by then rank 1 has long been at that tile
     const std::string text = scene::outcomeOf([&] { goodFrame(fb, impatient, report); });
     CHECK(scene::has(text, "timed out"));
     if (rank == 0) {

@@ -54,8 +54,10 @@ TEST_CASE("Nobody writes once the gate is closed", "[gather]")
     for (int t = 0; t < 3; ++t)
         writers.emplace_back([&, t] {
             while (!over) {
-                if (turn != t) // one at a time, as tiles are
+                if (turn != t) { // one at a time, as tiles are
+                    std::this_thread::yield();
                     continue;
+                }
                 if (const ImageWriter writer(gate, frame); writer) {
                     ++image;
                     ++written;
