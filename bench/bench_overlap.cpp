@@ -84,8 +84,13 @@ public:
                                                 static_cast<float>(z) / voxels});
     }
 
-    // Pixel (x, y) of the image: premultiplied RGBA.
-    void shade(const dfb::PerspectiveCamera& camera, int x, int y, int width, int height, float* rgba) const
+    // Pixel (x, y) of the image: premultiplied RGBA. Not inlined, so that all run the same code: where it was, it
+    // differed by a tenth in time.
+#if defined(__GNUC__)
+    __attribute__((noinline))
+#endif
+    void
+    shade(const dfb::PerspectiveCamera& camera, int x, int y, int width, int height, float* rgba) const
     {
         const Vec3 eye = camera.eye(), d = camera.direction(x + 0.5, y + 0.5, width, height);
         float first = 0, last = std::numeric_limits<float>::max();
