@@ -61,9 +61,9 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     dfb::FrameBufferConfig config;
     config.width = o.width;
     config.height = o.height;
-    config.format = wantsFloat(o)                                             ? dfb::OutputFormat::RGBA32F
-                    : !o.output.empty() || !o.depth.empty() || !o.aux.empty() ? dfb::OutputFormat::SRGBA8
-                                                                              : dfb::OutputFormat::None;
+    config.format = wantsFloat(o)                                                         ? dfb::OutputFormat::RGBA32F
+                    : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify ? dfb::OutputFormat::SRGBA8
+                                                                                          : dfb::OutputFormat::None;
     config.dither = o.dither;
     config.depth = !o.depth.empty();
     config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
