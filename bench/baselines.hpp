@@ -6,6 +6,7 @@
 #include <mpi.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <condition_variable>
 #include <cstddef>
@@ -258,6 +259,20 @@ inline bool readSize(const std::string& text, int& width, int& height)
     return std::sscanf(text.c_str(), "%dx%d", &width, &height) == 2 && width >= 16 && height >= 16;
 }
 
+// A reader of "1024x768,..." into `sizes`.
+inline std::function<bool(const std::string&)> readSizes(std::vector<std::array<int, 2>>& sizes)
+{
+    return [&sizes](const std::string& value) {
+        sizes.clear();
+        for (const std::string& part : partsOf(value, ',')) {
+            sizes.emplace_back();
+            if (!readSize(part, sizes.back()[0], sizes.back()[1]))
+                return false;
+        }
+        return !sizes.empty();
+    };
+}
+
 // Options with a value each. Their readers return false for one that makes no sense. Ends the program after --help, or
 // if it was called wrongly.
 inline void readOptions(int argc, char** argv, const char* usage,
@@ -279,6 +294,17 @@ inline std::function<bool(const std::string&)> readText(std::string& text)
         text = value;
         return true;
     };
+}
+
+// Calls `body(communicator)` between the beginning and the end of MPI.
+template <class Body>
+void withMpi(int argc, char** argv, const Body& body)
+{
+    int level = 0;
+    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
+    shortenNaps();
+    body(MPI_COMM_WORLD);
+    MPI_Finalize();
 }
 
 inline std::string environment(MPI_Comm comm)

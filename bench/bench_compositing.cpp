@@ -328,15 +328,6 @@ Options optionsOf(int argc, char** argv)
             return std::find(all.begin(), all.end(), name) != all.end();
         });
     };
-    const auto readSizes = [&o](const std::string& value) {
-        o.sizes.clear();
-        for (const std::string& part : bench::partsOf(value, ',')) {
-            o.sizes.emplace_back();
-            if (!bench::readSize(part, o.sizes.back()[0], o.sizes.back()[1]))
-                return false;
-        }
-        return !o.sizes.empty();
-    };
     const auto readScenes = [&](const std::string& value) {
         o.scenes = value == "all" ? bench::sceneNames() : bench::partsOf(value, ',');
         return isOneOf(o.scenes, bench::sceneNames());
@@ -350,7 +341,7 @@ Options optionsOf(int argc, char** argv)
         "usage: mpirun -n RANKS bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size WxH,...] "
         "[--frames N] [--systems dfb,icet,plain] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]",
         {{"--scene", readScenes},
-         {"--size", readSizes},
+         {"--size", bench::readSizes(o.sizes)},
          {"--systems", readSystems},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--only", bench::readText(o.only)},
@@ -365,14 +356,10 @@ Options optionsOf(int argc, char** argv)
 int main(int argc, char** argv)
 {
     const Options options = optionsOf(argc, argv);
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    bench::shortenNaps();
-    {
-        Bench bench(MPI_COMM_WORLD, options);
+    bench::withMpi(argc, argv, [&](MPI_Comm comm) {
+        Bench bench(comm, options);
         for (const auto& [width, height] : options.sizes)
             for (const std::string& scene : options.scenes)
                 bench.run(scene, width, height);
-    }
-    MPI_Finalize();
+    });
 }

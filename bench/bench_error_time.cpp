@@ -350,17 +350,13 @@ Options optionsOf(int argc, char** argv)
 int main(int argc, char** argv)
 {
     const Options options = optionsOf(argc, argv);
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    bench::shortenNaps();
-    {
-        Bench bench(MPI_COMM_WORLD, options);
+    bench::withMpi(argc, argv, [&](MPI_Comm comm) {
+        Bench bench(comm, options);
         bench.bricks();
         if (options.only.empty()) {
             bench.noise();
             bench.kernels();
         }
         bench.write();
-    }
-    MPI_Finalize();
+    });
 }

@@ -359,20 +359,11 @@ private:
 Options optionsOf(int argc, char** argv)
 {
     Options o;
-    const auto readSizes = [&o](const std::string& value) {
-        o.sizes.clear();
-        for (const std::string& part : bench::partsOf(value, ',')) {
-            o.sizes.emplace_back();
-            if (!bench::readSize(part, o.sizes.back()[0], o.sizes.back()[1]))
-                return false;
-        }
-        return !o.sizes.empty();
-    };
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_overlap [--size WxH,...] [--views N] [--json FILE] [--table FILE] "
         "[--commit ID] [--only TEXT]",
-        {{"--size", readSizes},
+        {{"--size", bench::readSizes(o.sizes)},
          {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
@@ -386,13 +377,9 @@ Options optionsOf(int argc, char** argv)
 int main(int argc, char** argv)
 {
     const Options options = optionsOf(argc, argv);
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
-    bench::shortenNaps();
-    {
-        Bench bench(MPI_COMM_WORLD, options);
+    bench::withMpi(argc, argv, [&](MPI_Comm comm) {
+        Bench bench(comm, options);
         for (const auto& [width, height] : options.sizes)
             bench.run(width, height);
-    }
-    MPI_Finalize();
+    });
 }
