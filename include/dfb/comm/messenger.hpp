@@ -87,7 +87,8 @@ class Messenger final : private TransportHandler {
 public:
     // Collective, like the destructor. Throws TransportError.
     explicit Messenger(const typename Transport::Communicator& communicator, MessengerOptions options = {})
-        : options_(options), pool_(MemoryPool::create(options.sharedMemory)), transport_(communicator, pool_, options.progress)
+        : options_(options), pool_(MemoryPool::create(options.sharedMemory)),
+          transport_(communicator, pool_, options.progress)
     {
         transport_.start(*this);
         if (transport_.needsPolling() && options_.progress == Progress::Thread)

@@ -83,7 +83,6 @@ public:
         batch_.reset();
         tilesSent_ = 0;
         placed_.clear();
-        placedBytes_ = 0;
         held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
@@ -150,7 +149,10 @@ public:
     std::int64_t placedBytes() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return placedBytes_;
+        std::size_t bytes = 0;
+        for (const int tile : placed_)
+            bytes += recordBytes(layout_.region(tile));
+        return static_cast<std::int64_t>(bytes);
     }
 
     // The frame is over: nobody writes into the image any more.
@@ -238,10 +240,8 @@ public:
         }
         bool send = false;
         if (place.writer) {
-            const std::size_t bytes = recordBytes(layout_.region(tile));
             const std::lock_guard<std::mutex> lock(mutex_);
             placed_.push_back(tile);
-            placedBytes_ += static_cast<std::int64_t>(bytes);
             ++tilesSent_;
             return; // and with `place` the writer leaves
         }
@@ -545,7 +545,6 @@ private:
     std::int64_t tilesSent_ = 0;
     SharedImage remote_;               // of the display rank, if this one sees it
     std::vector<std::int32_t> placed_; // tiles that are in it
-    std::int64_t placedBytes_ = 0;
 
     Image image_;
     Buffer gateMemory_;

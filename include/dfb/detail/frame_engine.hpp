@@ -268,8 +268,7 @@ public:
         const Verdict verdict = conclude();
         if (verdict.error)
             throw FrameError(*verdict.error);
-        const bool compressed =
-            config_.codec && (config_.compression == CompressionMode::Always || compressionTrial_.compresses());
+        const bool compressed = compresses();
         if (config_.codec)
             compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
         pipeline_->fillBackground();
@@ -339,15 +338,16 @@ private:
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
 
+    bool compresses() const
+    {
+        return config_.codec && (config_.compression == CompressionMode::Always || compressionTrial_.compresses());
+    }
+
     // What messages with pixels to that rank are compressed with in this frame, or null.
     const Codec* codecFor(int other) const
     {
-        if (other == rank())
-            return nullptr;
-        if (config_.compression == CompressionMode::Auto
-            && (!compressionTrial_.compresses() || messaging_->messenger().isSeenBy(other)))
-            return nullptr;
-        return config_.codec.get();
+        const bool isNear = config_.compression == CompressionMode::Auto && messaging_->messenger().isSeenBy(other);
+        return other == rank() || isNear || !compresses() ? nullptr : config_.codec.get();
     }
 
     // ---- messages
