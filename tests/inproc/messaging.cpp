@@ -749,7 +749,7 @@ struct Counter : dfb::BasicAlphaBlend<16> {
 TEST_CASE("With progress by the caller messages move in poll(), and not without it", "[messaging]")
 {
     for (const std::uint64_t seed : {1u, 2u, 3u}) {
-        std::promise<void> sent;
+        std::promise<void> begun, sent;
         int before = -1, after = -1;
         bool moved = false;
         std::vector<std::size_t> wrong;
@@ -765,7 +765,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                 {
                     auto frame = fb.begin(scene::paramsOf(s));
                     const auto tile = std::make_unique<FrameBuffer<Counter>::Tile>();
-                    if (fb.rank() == 1) {
+                    if (fb.rank() == 1) { // once rank 0's begin(), which moves messages, is done
+                        begun.get_future().wait_for(std::chrono::seconds(20));
                         for (const dfb::Brick& brick : s.bricks)
                             for (int index = 0; index < 28; ++index) {
                                 frame.start(*tile, index);
@@ -776,6 +777,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
                             }
                         sent.set_value();
                     } else {
+                        begun.set_value();
                         sent.get_future().wait_for(std::chrono::seconds(20));
                         std::promise<void> tasksDone; // the one worker does them in order
                         fb.executor().submit([&] { tasksDone.set_value(); });
