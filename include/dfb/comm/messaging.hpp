@@ -18,6 +18,7 @@
 #include <mutex>
 #include <optional>
 #include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -219,10 +220,11 @@ public:
     template <class Ready>
     bool wait(const Ready& ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
-        const typename Messenger<Transport>::Hurry hurry(*messenger_);
-        std::unique_lock<std::mutex> lock(mutex_);
         const auto over = [&] { return failed() || ready(); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
+        waitAwake(over);
+        const typename Messenger<Transport>::Hurry hurry(*messenger_);
+        std::unique_lock<std::mutex> lock(mutex_);
         if (!messenger_->needsCaller()) {
             while (!over() && !late()) {
                 const auto next = Clock::now() + std::chrono::milliseconds(2);
@@ -294,6 +296,29 @@ public:
     }
 
 private:
+    // For a moment a waiting thread does by itself what those do that would otherwise have to be woken, each of which
+    // may wait for a core then. Gives up when nothing has come for some time, or when others need the core.
+    template <class Over>
+    void waitAwake(const Over& over)
+    {
+        if (!messenger_->hasProgressThread())
+            return;
+        constexpr std::chrono::microseconds patience{200}, taken{50};
+        for (auto last = Clock::now(); !over();) {
+            const bool did = executor_->help() || messenger_->helpProgress();
+            const auto now = Clock::now();
+            if (did) {
+                last = now;
+                continue;
+            }
+            if (now - last > patience)
+                return;
+            std::this_thread::yield();
+            if (Clock::now() - now > taken)
+                return;
+        }
+    }
+
     void taskDone()
     {
         const std::lock_guard<std::mutex> lock(mutex_);

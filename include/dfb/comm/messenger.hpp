@@ -2,11 +2,11 @@
 // comes once and whole, and progress of the transport (section 3.2 of the paper).
 #pragma once
 
+#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/checksum.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
-#include <dfb/comm/byte_io.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -121,13 +121,7 @@ public:
 
     // Moves messages; true if any moved. With Progress::Thread there is no need to call it, and on a thread that may
     // not be in MPI it does nothing. Never blocks.
-    bool poll()
-    {
-        if (progress_.running() || !transport_.mayPoll())
-            return false;
-        const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
-        return lock.owns_lock() && transport_.poll();
-    }
+    bool poll() { return !progress_.running() && transport_.mayPoll() && progress_.tryPoll(); }
 
     // ---- for the objects that it serves
 
@@ -232,6 +226,10 @@ public:
     private:
         ProgressThread<Transport>& progress_;
     };
+
+    // For a thread that waits: moves messages in place of the progress thread, where there is one. True if any moved.
+    bool helpProgress() { return progress_.tryPoll(); }
+    bool hasProgressThread() const noexcept { return progress_.running(); }
 
     // Whether poll() is what the calling thread must do while it waits, and whether somebody else does so.
     bool needsCaller() const noexcept { return transport_.needsPolling() && !progress_.running(); }
@@ -366,7 +364,6 @@ private:
     const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
-    std::mutex pollMutex_;
     std::atomic<std::int64_t> duplicates_{0};
 
     mutable std::mutex peersMutex_;

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <mutex>
 #include <thread>
 
 #if defined(__linux__)
@@ -39,6 +40,13 @@ public:
     }
 
     bool running() const noexcept { return thread_.joinable(); }
+
+    // Polls on the calling thread, unless another one is doing so; true if anything moved. From any thread that may.
+    bool tryPoll()
+    {
+        const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
+        return lock.owns_lock() && transport_.poll();
+    }
 
     // Whether messages may come in: if not, and nothing waits to be sent, the thread sleeps. From any thread.
     void expectMessages(bool expect)
@@ -84,7 +92,7 @@ private:
 #endif
         auto last = Clock::now();
         while (!stop_) {
-            if (transport_.poll()) {
+            if (tryPoll()) {
                 last = Clock::now();
                 continue;
             }
@@ -96,6 +104,7 @@ private:
     }
 
     Transport& transport_;
+    std::mutex pollMutex_;
     std::atomic<bool> stop_{false}, expecting_{false};
     std::atomic<int> waiting_{0};
     std::thread thread_;
