@@ -426,7 +426,7 @@ TEST_CASE("A message pool below the largest message's fourfold is raised to it; 
         FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
         large = fb.config().messagePoolBytes;
     });
-    CHECK(large == 4 * dfb::detail::largestFragment(256, dfb::colorChannel | dfb::depthChannel));
+    CHECK(large == 4 * dfb::detail::largestFragment(256, 256, dfb::colorChannel | dfb::depthChannel));
 }
 
 TEST_CASE("A flood with progress by the caller: setTile() makes the progress that it waits for", "[messaging][flood]")

@@ -32,7 +32,7 @@ enum class MessageKind : std::uint8_t {
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb;
-    static constexpr std::uint8_t formatVersion = 3;
+    static constexpr std::uint8_t formatVersion = 4;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;

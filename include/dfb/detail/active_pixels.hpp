@@ -1,9 +1,9 @@
-// ActivePixels: what of a tile travels: the pixels with any colour channel that is not 0, as spans, and what they have
-// in the channels that are wanted, one after the other.
+// ActivePixels: what of a tile travels: the pixels with any colour channel that is not 0, as spans.
 #pragma once
 
 #include <dfb/cpu.hpp>
 #include <dfb/fragment.hpp>
+#include <dfb/wire_codes.hpp>
 
 #include <algorithm>
 #include <array>
@@ -59,9 +59,9 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
     return findActivePixels(rgba, count);
 }
 
-// Copies the colours of pixels. False if any is not finite, or an alpha not within [0, 1]. No branches, so that it can
-// be vectorized.
-DFB_INLINE bool copyAndCheckColors(const float* rgba, int count, float* out)
+// False if a colour is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
+template <bool Copies>
+DFB_INLINE bool checkColorsOrCopy(const float* rgba, int count, float* out)
 {
     constexpr float most = std::numeric_limits<float>::max();
     constexpr float low[8] = {-most, -most, -most, 0, -most, -most, -most, 0};
@@ -72,27 +72,45 @@ DFB_INLINE bool copyAndCheckColors(const float* rgba, int count, float* out)
     int bad[8] = {}, i = 0;
     for (; i + 8 <= 4 * count; i += 8)
         for (int c = 0; c < 8; ++c) {
-            out[i + c] = rgba[i + c];
+            if constexpr (Copies)
+                out[i + c] = rgba[i + c];
             bad[c] |= isOutside(rgba[i + c], c);
         }
     for (; i < 4 * count; ++i) {
-        out[i] = rgba[i];
+        if constexpr (Copies)
+            out[i] = rgba[i];
         bad[i % 4] |= isOutside(rgba[i], i % 4);
     }
     return (bad[0] | bad[1] | bad[2] | bad[3] | bad[4] | bad[5] | bad[6] | bad[7]) == 0;
 }
+inline bool copyAndCheckColors(const float* rgba, int count, float* out)
+{
+    return checkColorsOrCopy<true>(rgba, count, out);
+}
 DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
 {
-    return copyAndCheckColors(rgba, count, out);
+    return checkColorsOrCopy<true>(rgba, count, out);
+}
+inline bool checkColors(const float* rgba, int count) { return checkColorsOrCopy<false>(rgba, count, nullptr); }
+DFB_AVX2 inline bool checkColorsAvx2(const float* rgba, int count)
+{
+    return checkColorsOrCopy<false>(rgba, count, nullptr);
 }
 
-// The same for depths; false if any is NaN.
+// Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
+inline float canonicalDepth(float depth)
+{
+    const std::uint32_t bits = bitsOf(depth), some = bits == 0x80000000u ? 0u : bits;
+    return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
+}
+
+// Copies depths as they travel. False if any is NaN.
 DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
 {
     int isNan = 0;
     for (int i = 0; i < count; ++i) {
-        out[i] = depth[i];
-        isNan |= static_cast<int>(depth[i] != depth[i]);
+        isNan |= static_cast<int>((bitsOf(depth[i]) & 0x7fffffffu) > 0x7f800000u);
+        out[i] = canonicalDepth(depth[i]);
     }
     return isNan == 0;
 }
@@ -101,39 +119,91 @@ DFB_AVX2 inline bool copyAndCheckDepthsAvx2(const float* depth, int count, float
     return copyAndCheckDepths(depth, count, out);
 }
 
+// False if depths do not travel as they are.
+DFB_INLINE bool areCanonical(const float* depth, int count)
+{
+    int differs = 0;
+    for (int i = 0; i < count; ++i)
+        differs |= static_cast<int>(bitsOf(canonicalDepth(depth[i])) != bitsOf(depth[i]));
+    return differs == 0;
+}
+DFB_AVX2 inline bool areCanonicalAvx2(const float* depth, int count) { return areCanonical(depth, count); }
+
+// Copies `count` pixels of a channel, from place `first` of its plane on, as they travel. False if a colour is not
+// finite, an alpha not within [0, 1], or a depth NaN.
+inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::size_t first, int count, std::byte* out)
+{
+    const bool fast = cpuHasAvx2();
+    if (channel == Color) {
+        const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
+        return fast ? copyAndCheckColorsAvx2(rgba, count, floatsOf(out))
+                    : copyAndCheckColors(rgba, count, floatsOf(out));
+    }
+    if (channel == Depth) {
+        const float* depth = floatsOf(planes.at[Depth]) + first;
+        return fast ? copyAndCheckDepthsAvx2(depth, count, floatsOf(out))
+                    : copyAndCheckDepths(depth, count, floatsOf(out));
+    }
+    const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[channel]);
+    std::memcpy(out, planes.at[channel] + bytes * first, bytes * static_cast<std::size_t>(count));
+    return true;
+}
+
 // One per thread, to be used again and again. A pixel of colour 0 and alpha 0 contributes nothing, whatever its depth;
-// one with colour and alpha 0 is emission and does.
+// one with colour and alpha 0 is emission and does. What it is called with is a Tile or a TileView.
 struct ActivePixels {
     std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
     std::vector<Span> spans;
     int rowBegin = 0, rowEnd = 0;
     std::uint32_t pixels = 0;
 
-    // Of a Tile or a TileView. `channels` has colour, and the tile all of them. Each row is copied as soon as its spans
-    // are found: rows of a large image are far apart in memory, and so are read there once.
+    // `channels` has colour, and the tile all of them. Copies the colours, as they travel, to `colors`, which has room
+    // for all pixels of the tile, and the rest to where plane() says. Each row is copied as soon as its spans are
+    // found: rows of a large image are far apart in memory, and so are read there once.
     template <class TileType>
-    void gather(const TileType& tile, ChannelMask channels)
+    void gather(const TileType& tile, ChannelMask channels, float* colors)
+    {
+        const ConstPlanes planes = tile.planes();
+        const auto most =
+            static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
+        std::array<std::byte*, channelCount> to{reinterpret_cast<std::byte*>(colors)};
+        for (std::size_t c = Depth; c < channelCount; ++c)
+            if (hasChannel(channels, c)) {
+                planes_[c].resize(std::max(planes_[c].size(), most * static_cast<std::size_t>(channelWords[c])));
+                to[c] = reinterpret_cast<std::byte*>(planes_[c].data());
+            }
+        isClean_ = true;
+        find(tile, [&](std::size_t first, int count) {
+            for (std::size_t c = 0; c < channelCount; ++c)
+                if (hasChannel(channels, c)) {
+                    isClean_ &= copyAndCheck(planes, c, first, count, to[c]);
+                    to[c] += 4 * static_cast<std::size_t>(channelWords[c]) * static_cast<std::size_t>(count);
+                }
+        });
+    }
+    const std::byte* plane(std::size_t channel) const noexcept
+    {
+        return reinterpret_cast<const std::byte*>(planes_[channel].data());
+    }
+    // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
+    bool mayBeFaulty() const noexcept { return !isClean_; }
+
+    // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
+    template <class TileType, class F>
+    void find(const TileType& tile, const F& f)
     {
         rowCounts.clear();
         spans.clear();
         rowBegin = rowEnd = 0;
         pixels = 0;
-        channels_ = channels;
-        isClean_ = true;
-        const ConstPlanes planes = tile.planes();
         const int width = tile.region.width(), height = tile.pixel(0, 0) ? tile.region.height() : 0;
-        const std::size_t most = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (hasChannel(channels, c) && planes_[c].size() < most * static_cast<std::size_t>(channelWords[c]))
-                planes_[c].resize(most * static_cast<std::size_t>(channelWords[c]));
         for (int y = 0; y < height; ++y) {
-            const std::size_t before = spans.size();
-            const std::size_t first = static_cast<std::size_t>(y) * tile.rowStride();
+            const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.rowStride();
             if (y + 1 < height)
                 prefetch(tile.pixel(0, y + 1), width);
             findSpans(tile.pixel(0, y), width);
             for (std::size_t i = before; i < spans.size(); ++i) {
-                copy(planes, first + spans[i].x, spans[i].count);
+                f(begin + spans[i].x, static_cast<int>(spans[i].count));
                 pixels += spans[i].count;
             }
             const auto count = static_cast<std::uint16_t>(spans.size() - before);
@@ -147,31 +217,16 @@ struct ActivePixels {
         rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin));
     }
 
-    // What they have in a channel; null if it is not wanted.
-    const std::byte* plane(std::size_t channel) const noexcept
+    // The same for those that were found in `tile`.
+    template <class TileType, class F>
+    void forEachSpan(const TileType& tile, const F& f) const
     {
-        return hasChannel(channels_, channel) ? reinterpret_cast<const std::byte*>(planes_[channel].data()) : nullptr;
-    }
-
-    // All alike, bit for bit.
-    bool isConstant() const
-    {
-        for (std::size_t c = 0; c < channelCount && pixels > 0; ++c) {
-            const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-            if (const std::byte* p = plane(c); p && std::memcmp(p, p + bytes, bytes * (pixels - 1)) != 0)
-                return false;
+        const Span* span = spans.data();
+        for (std::size_t row = 0; row < rowCounts.size(); ++row) {
+            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * tile.rowStride();
+            for (int i = 0; i < rowCounts[row]; ++i, ++span)
+                f(begin + span->x, static_cast<int>(span->count));
         }
-        return true;
-    }
-
-    // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
-    bool mayBeFaulty() const noexcept { return !isClean_; }
-
-    // For `count` numbers.
-    float* scratch(std::size_t count)
-    {
-        scratch_.resize(count);
-        return scratch_.data();
     }
 
 private:
@@ -184,31 +239,6 @@ private:
 #else
         (void)row, (void)width;
 #endif
-    }
-
-    // The next `count` pixels, of each channel from its place `first` on.
-    void copy(const ConstPlanes& planes, std::size_t first, int count)
-    {
-        const bool fast = cpuHasAvx2();
-        const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
-        float* to = floatsAt(Color);
-        isClean_ &= fast ? copyAndCheckColorsAvx2(rgba, count, to) : copyAndCheckColors(rgba, count, to);
-        if (hasChannel(channels_, Depth)) {
-            const float* depth = floatsOf(planes.at[Depth]) + first;
-            isClean_ &= fast ? copyAndCheckDepthsAvx2(depth, count, floatsAt(Depth))
-                             : copyAndCheckDepths(depth, count, floatsAt(Depth));
-        }
-        if ((channels_ & ~(colorChannel | depthChannel)) == 0)
-            return;
-        for (std::size_t c = Normal; c < channelCount; ++c)
-            if (hasChannel(channels_, c)) {
-                const auto bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-                std::memcpy(floatsAt(c), planes.at[c] + bytes * first, bytes * static_cast<std::size_t>(count));
-            }
-    }
-    float* floatsAt(std::size_t channel) // of the next pixel
-    {
-        return planes_[channel].data() + static_cast<std::size_t>(channelWords[channel]) * pixels;
     }
 
     void findSpans(const float* row, int width)
@@ -233,10 +263,8 @@ private:
         }
     }
 
-    ChannelMask channels_ = 0;
     std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such
     bool isClean_ = true;
-    std::vector<float> scratch_;
 };
 
 } // namespace dfb::detail

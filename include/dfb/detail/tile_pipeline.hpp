@@ -43,7 +43,7 @@ public:
           gather_(pool_, table_.layout(),
                   {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd,
                    config.dither},
-                  rank == config.displayRank, rank, rankCount, std::move(sendToDisplay)),
+                  rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount), std::move(sendToDisplay)),
           coder_(config.wire)
     {
     }
@@ -62,7 +62,7 @@ public:
     // The most that one message with pixels can have.
     static std::size_t largestMessage(const FrameBufferConfig& config)
     {
-        return std::max(largestFragment(Tile::size, travelling(config)),
+        return std::max(largestFragment(Tile::size, Tile::size, travelling(config)),
                         FinalGather::largestMessage(Tile::size, config.format, imageChannels(config)));
     }
 
@@ -287,6 +287,15 @@ public:
     }
 
 private:
+    // For each rank, whether it has finished tiles to send to that one.
+    std::vector<bool> sendersTo(int displayRank, int rankCount) const
+    {
+        std::vector<bool> senders(static_cast<std::size_t>(rankCount));
+        for (int r = 0; r < rankCount; ++r)
+            senders[static_cast<std::size_t>(r)] = r != displayRank && table_.ownsTiles(r);
+        return senders;
+    }
+
     bool isLossy() const noexcept
     {
         return config_.wire.color != WireFormat::Float32 || config_.wire.budget > 0 || config_.minTransmittance > 0;

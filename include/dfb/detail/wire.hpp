@@ -1,7 +1,7 @@
 // Wire: the format of messages; a tile to bytes, and bytes to a fragment that is read in place.
 //
 // After the MessageHeader a fragment message goes on with a FragmentHeader and the payload:
-//   Sparse:    uint16 span counts of the rows [rowBegin, rowEnd) | spans | padding to 16 | planes
+//   Sparse:    planes | spans | uint16 span counts of the rows [rowBegin, rowEnd) | padding to 16
 //   Dense:     planes: all pixels of the region row by row
 //   Constant:  planes: one pixel
 //   Empty:     nothing
@@ -72,47 +72,29 @@ inline std::size_t planesBytes(const FragmentHeader& h, std::size_t pixels)
     return bytes;
 }
 
-// Splits the planes of a payload, or joins them again; what comes before, the table, is copied.
+// Splits the planes of a payload, or joins them again; what comes behind, the table, is copied.
 template <class Transform>
 void transformPlanes(const FragmentHeader& h, std::size_t tableBytes, std::size_t pixels, const std::byte* in,
                      std::byte* out, const Transform& transform)
 {
-    std::memcpy(out, in, tableBytes);
-    std::size_t at = tableBytes;
+    std::size_t at = 0;
     for (std::size_t c = 0; c < channelCount; ++c)
         if (hasChannel(h.channels, c)) {
             const std::size_t bytes = planeBytes(h, c, pixels);
             transform(in + at, bytes, bytesOf(formatOf(h, c)), static_cast<std::size_t>(channelWords[c]), out + at);
             at += bytes;
         }
+    std::memcpy(out + at, in + at, tableBytes);
 }
 
 // The most that a fragment message can have. No format is larger than Float32. A row's second span costs less than the
 // pixel that parts it from the first.
-inline std::size_t largestFragment(int tileSize, ChannelMask channels)
+inline std::size_t largestFragment(int width, int height, ChannelMask channels)
 {
-    const auto side = static_cast<std::size_t>(tileSize), pixels = side * side;
+    const auto rows = static_cast<std::size_t>(height), pixels = rows * static_cast<std::size_t>(width);
     const std::size_t perPixel = sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
     static_assert(sizeof(Span) <= 4 * sizeof(float));
-    return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * side) + pixels * perPixel;
-}
-
-// Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
-inline float canonicalDepth(float depth)
-{
-    const std::uint32_t bits = bitsOf(depth), some = bits == 0x80000000u ? 0u : bits;
-    return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
-}
-
-DFB_INLINE void canonicalize(const float* depth, int count, float* out)
-{
-    for (int i = 0; i < count; ++i)
-        out[i] = canonicalDepth(depth[i]);
-}
-DFB_AVX2 inline void canonicalizeAvx2(const float* depth, int count, float* out) { canonicalize(depth, count, out); }
-inline void canonicalDepths(const float* depth, int count, float* out)
-{
-    cpuHasAvx2() ? canonicalizeAvx2(depth, count, out) : canonicalize(depth, count, out);
+    return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * perPixel;
 }
 
 // What is wrong with the pixels of an input.
@@ -121,15 +103,22 @@ struct InputFaults {
     std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
 };
 
-// `depth` may be null. Each pixel counts `repeats` times.
-inline void countFaults(const float* rgba, const float* depth, int count, std::uint64_t repeats, InputFaults& faults)
+// `depth` may be null.
+inline void countFaults(const float* rgba, const float* depth, int count, InputFaults& faults)
 {
     for (int i = 0; i < count; ++i, rgba += 4) {
         const bool finite = std::isfinite(rgba[0]) && std::isfinite(rgba[1]) && std::isfinite(rgba[2])
                             && std::isfinite(rgba[3]) && !(depth && depth[i] != depth[i]);
-        faults.nonFinite += finite ? 0 : repeats;
-        faults.alphaOutside += finite && !(rgba[3] >= 0.0f && rgba[3] <= 1.0f) ? repeats : 0;
+        faults.nonFinite += finite ? 0 : 1;
+        faults.alphaOutside += finite && !(rgba[3] >= 0.0f && rgba[3] <= 1.0f) ? 1 : 0;
     }
+}
+
+// Whether all pixels of a plane are alike, bit for bit.
+inline bool isConstant(const std::byte* plane, std::size_t channel, std::size_t pixels)
+{
+    const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[channel]);
+    return std::memcmp(plane, plane + bytes, bytes * (pixels - 1)) == 0;
 }
 
 // Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
@@ -139,9 +128,19 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
                       const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
 {
     static thread_local ActivePixels active;
+    static thread_local std::vector<float> wide; // colours that are to be rounded
     const auto channels = static_cast<ChannelMask>((wanted & TileType::channels) | colorChannel);
-    active.gather(tile, channels);
     const int width = tile.region.width(), height = tile.region.height();
+    const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
+    // Colours that travel as they are go straight to their place in the message.
+    Buffer message =
+        pool.acquire(color == WireFormat::Float32 ? largestFragment(width, height, channels) : fragmentPrefix);
+    wide.resize(std::max(wide.size(), color == WireFormat::Float32 ? 0 : 4 * pixelCount));
+    float* rgba = color == WireFormat::Float32 ? floatsOf(message.data() + fragmentPrefix) : wide.data();
+    active.gather(tile, channels, rgba);
+    const auto planeOf = [&](std::size_t c) {
+        return c == Color ? reinterpret_cast<const std::byte*>(rgba) : active.plane(c);
+    };
 
     FragmentHeader h;
     h.tile = tile.tile;
@@ -155,58 +154,66 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     h.rowBegin = static_cast<std::uint16_t>(active.rowBegin);
     h.rowEnd = static_cast<std::uint16_t>(active.rowEnd);
     std::size_t stored = active.pixels, tableBytes = 0;
+    const std::size_t spanBytes = sizeof(Span) * active.spans.size();
+    const std::size_t countBytes = sizeof(std::uint16_t) * active.rowCounts.size();
     if (active.pixels == 0) {
         h.encoding = FragmentEncoding::Empty;
-    } else if (active.pixels == static_cast<std::uint32_t>(width * height)) {
-        h.encoding = active.isConstant() ? FragmentEncoding::Constant : FragmentEncoding::Dense;
-        if (h.encoding == FragmentEncoding::Constant)
-            stored = 1;
+    } else if (active.pixels == pixelCount) {
+        bool constant = true;
+        for (std::size_t c = 0; c < channelCount; ++c)
+            constant = constant && (!hasChannel(channels, c) || isConstant(planeOf(c), c, pixelCount));
+        h.encoding = constant ? FragmentEncoding::Constant : FragmentEncoding::Dense;
+        stored = constant ? 1 : stored;
     } else {
         h.encoding = FragmentEncoding::Sparse;
         h.spanCount = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
-        tableBytes = alignedTo16(sizeof(std::uint16_t) * active.rowCounts.size() + sizeof(Span) * active.spans.size());
+        tableBytes = alignedTo16(spanBytes + countBytes);
     }
     const auto count = static_cast<int>(stored);
-    const float* rgba = floatsOf(active.plane(Color));
-    const float* depth = floatsOf(active.plane(Depth));
     h.colorFormat = color != WireFormat::Float32 && coder.inRange(rgba, count) ? color : WireFormat::Float32;
     h.depthFormat = coder.depth();
     const std::size_t payload = tableBytes + planesBytes(h, stored);
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
+    if (active.mayBeFaulty())
+        active.forEachSpan(tile, [&](std::size_t first, int spanPixels) {
+            const ConstPlanes planes = tile.planes();
+            countFaults(floatsOf(planes.at[Color]) + 4 * first,
+                        hasChannel(channels, Depth) ? floatsOf(planes.at[Depth]) + first : nullptr, spanPixels, faults);
+        });
 
-    Buffer message = pool.acquire(fragmentPrefix + payload);
+    // A block that it would not fill is soon needed again.
+    if (4 * (fragmentPrefix + payload) < 3 * message.size() || message.size() < fragmentPrefix + payload) {
+        Buffer smaller = pool.acquire(fragmentPrefix + payload);
+        if (h.colorFormat == WireFormat::Float32)
+            std::memcpy(smaller.data() + fragmentPrefix, rgba, planeBytes(h, Color, stored));
+        message = std::move(smaller);
+    }
+    message.shrink(fragmentPrefix + payload);
     MessageHeader m;
     m.kind = MessageKind::Fragment;
     m.receiver = receiver;
     m.number = tile.frame;
-    std::byte* out = message.data() + fragmentPrefix;
-    if (h.encoding == FragmentEncoding::Sparse) {
-        const std::size_t countBytes = sizeof(std::uint16_t) * active.rowCounts.size();
-        const std::size_t spanBytes = sizeof(Span) * active.spans.size();
-        std::memcpy(out, active.rowCounts.data(), countBytes);
-        std::memcpy(out + countBytes, active.spans.data(), spanBytes);
-        std::memset(out + countBytes + spanBytes, 0, tableBytes - countBytes - spanBytes);
-    }
-    std::byte* to = out + tableBytes;
+    std::byte* const out = message.data() + fragmentPrefix;
+    std::byte* to = out;
     for (std::size_t c = 0; c < channelCount && stored > 0; ++c) {
         if (!hasChannel(channels, c))
             continue;
         const std::size_t bytes = planeBytes(h, c, stored);
-        std::memset(to + bytes - 4, 0, 4); // what fills it up
-        if (c == Color) {
+        if (formatOf(h, c) != WireFormat::Float32)
+            std::memset(to + bytes - 4, 0, 4); // what fills it up
+        if (c == Color && h.colorFormat != WireFormat::Float32)
             coder.encodeColor(h.colorFormat, rgba, count, to);
-        } else if (c == Depth) {
-            float* canonical = h.depthFormat == WireFormat::Float32 ? floatsOf(to) : active.scratch(stored);
-            canonicalDepths(depth, count, canonical);
-            if (h.depthFormat != WireFormat::Float32)
-                coder.encodeDepth(h.depthFormat, canonical, count, to);
-        } else {
-            std::memcpy(to, active.plane(c), bytes);
-        }
+        else if (c == Depth && h.depthFormat != WireFormat::Float32)
+            coder.encodeDepth(h.depthFormat, floatsOf(planeOf(Depth)), count, to);
+        else if (c != Color)
+            std::memcpy(to, planeOf(c), bytes);
         to += bytes;
     }
-    if (active.mayBeFaulty())
-        countFaults(rgba, depth, count, h.encoding == FragmentEncoding::Constant ? active.pixels : 1, faults);
+    if (h.encoding == FragmentEncoding::Sparse) {
+        std::memcpy(to, active.spans.data(), spanBytes);
+        std::memcpy(to + spanBytes, active.rowCounts.data(), countBytes);
+        std::memset(to + spanBytes + countBytes, 0, tableBytes - spanBytes - countBytes);
+    }
 
     if (codec && payload > 0) {
         static thread_local std::vector<std::byte> split;
@@ -244,9 +251,8 @@ inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t ta
     FragmentHeader wide = h;
     wide.colorFormat = wide.depthFormat = WireFormat::Float32;
     Buffer floats = pool.acquire(tableBytes + planesBytes(wide, pixels));
-    std::memcpy(floats.data(), body, tableBytes);
-    const std::byte* in = body + tableBytes;
-    std::byte* out = floats.data() + tableBytes;
+    const std::byte* in = body;
+    std::byte* out = floats.data();
     for (std::size_t c = 0; c < channelCount; ++c) {
         if (!hasChannel(h.channels, c))
             continue;
@@ -259,6 +265,7 @@ inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t ta
         in += planeBytes(h, c, pixels);
         out += planeBytes(wide, c, pixels);
     }
+    std::memcpy(out, in, tableBytes);
     return floats;
 }
 
@@ -355,8 +362,8 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     if (h.encoding == FragmentEncoding::Sparse) {
         parts.rowBegin = h.rowBegin;
         parts.rowEnd = h.rowEnd;
-        parts.rowSpanCounts = reinterpret_cast<const std::uint16_t*>(body);
-        parts.spans = reinterpret_cast<const Span*>(parts.rowSpanCounts + (h.rowEnd - h.rowBegin));
+        parts.spans = reinterpret_cast<const Span*>(body + pixelBytes * stored);
+        parts.rowSpanCounts = reinterpret_cast<const std::uint16_t*>(parts.spans + h.spanCount);
         const Span* span = parts.spans;
         std::uint32_t spans = 0, pixels = 0;
         for (int row = 0; row < h.rowEnd - h.rowBegin; ++row) {
@@ -373,7 +380,7 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
         if (spans != h.spanCount || pixels != h.activePixels)
             failMalformed("the spans do not add up to the active pixels", h.activePixels, pixels);
     }
-    ConstPlanes planes = planesAt(body + tableBytes, h.channels, stored);
+    ConstPlanes planes = planesAt(body, h.channels, stored);
     if (h.encoding == FragmentEncoding::Constant) {
         // One row that every row reads.
         const auto count = static_cast<std::size_t>(width);
