@@ -17,13 +17,14 @@ set(level_6 compositing.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp ti
 set(level_7 fragment_compositor.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
 set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
             detail/tile_table.hpp detail/verdict.hpp)
-set(level_9 detail/final_gather.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
+set(level_9 detail/finished_record.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
             testing/verified.hpp detail/frame_figures.hpp detail/outcome.hpp)
-set(level_10 detail/tile_pipeline.hpp testing/adversarial.hpp)
-set(level_11 detail/frame_engine.hpp)
-set(level_12 display_wall.hpp distributed_framebuffer.hpp)
-set(level_13 dfb.hpp)
-set(last_level 13)
+set(level_10 detail/final_gather.hpp testing/adversarial.hpp)
+set(level_11 detail/tile_pipeline.hpp)
+set(level_12 detail/frame_engine.hpp)
+set(level_13 display_wall.hpp distributed_framebuffer.hpp)
+set(level_14 dfb.hpp)
+set(last_level 14)
 
 # A dependency has one door.
 set(door_of_mpi comm/mpi_transport.hpp)

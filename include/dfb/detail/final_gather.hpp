@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/comm/compression.hpp>
+#include <dfb/detail/finished_record.hpp>
 #include <dfb/detail/image_gate.hpp>
 #include <dfb/detail/wire.hpp>
 #include <dfb/image.hpp>
@@ -42,28 +43,20 @@ public:
     using Settings = GatherSettings;
     using Send = std::function<void(Buffer&&)>; // to the display rank
 
-    struct Batch {
-        Buffer message;
-        std::size_t used = 0;
-        int writers = 0;
-        bool closed = false;
-    };
     // Where a finished tile goes.
-    struct Place {
-        Planes planes;
-        std::size_t stride = 0; // of rows, in pixels
-        std::shared_ptr<Batch> batch;
+    struct Place : FinishedPlanes {
+        Buffer own;         // of the planes, if they are to be sent
         ImageWriter writer; // into the image of another rank
     };
 
-    // `send`: to the display rank, batches and the count of them.
+    // `senders`: which ranks have finished tiles for the display rank. `send`: to it, batches and the count of tiles.
     FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay, int rank,
-                int rankCount, Send send)
+                std::vector<bool> senders, Send send)
         : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay), rank_(rank),
-          rankCount_(rankCount), send_(std::move(send))
+          senders_(std::move(senders)), send_(std::move(send)), record_(settings_.format, settings_.channels)
     {
         if (isDisplay_ && enabled())
-            tilesOf_ = std::vector<TilesOf>(static_cast<std::size_t>(rankCount_));
+            tilesOf_ = std::vector<TilesOf>(senders_.size());
         if (isDisplay_ && settings_.format != OutputFormat::None) {
             image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
@@ -87,9 +80,9 @@ public:
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
         ranksDone_ = 0;
-        for (TilesOf& t : tilesOf_) {
-            t.received = 0;
-            t.announced = -1;
+        for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
+            tilesOf_[r].received = 0;
+            tilesOf_[r].announced = senders_[r] ? -1 : 0;
         }
         for (auto& s : state_)
             if (s == TileState::Received)
@@ -136,7 +129,7 @@ public:
             static_cast<std::size_t>(layout_.width()) * static_cast<std::size_t>(layout_.height());
         for (std::size_t c = 0; c < channelCount; ++c)
             if (travels(c)) {
-                image.planes.at[c] = blockAt(places.planes[c], pixels * pixelBytes(c));
+                image.planes.at[c] = blockAt(places.planes[c], pixels * record_.pixelBytes(c));
                 all = all && image.planes.at[c];
             }
         if (!all)
@@ -151,7 +144,7 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         std::size_t bytes = 0;
         for (const int tile : placed_)
-            bytes += recordBytes(layout_.region(tile));
+            bytes += record_.mostBytes(pixelsIn(layout_.region(tile)));
         return static_cast<std::int64_t>(bytes);
     }
 
@@ -174,7 +167,7 @@ public:
     static std::size_t largestMessage(int tileSize, OutputFormat format, ChannelMask channels)
     {
         const auto pixels = static_cast<std::size_t>(tileSize) * static_cast<std::size_t>(tileSize);
-        return std::max(batchBytes, prefix + recordBytes(pixels, format, channels));
+        return std::max(batchBytes, prefix + FinishedRecord(format, channels).mostBytes(pixels));
     }
 
     // Room for a finished tile. write() it, then commit().
@@ -192,41 +185,17 @@ public:
                 place.writer = std::move(writer);
                 return place;
             }
-        const auto width = static_cast<std::size_t>(region.width());
-        const std::size_t bytes = recordBytes(region);
-        std::shared_ptr<Batch> full;
-        std::size_t offset = 0;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (batch_ && batch_->used + bytes > batch_->message.size()) {
-                batch_->closed = true;
-                if (batch_->writers == 0)
-                    full = batch_;
-                batch_.reset();
-            }
-            if (!batch_) {
-                batch_ = std::make_shared<Batch>();
-                batch_->message = pool_->acquire(std::max(batchBytes, prefix + bytes));
-                batch_->used = prefix;
-            }
-            place.batch = batch_;
-            offset = batch_->used;
-            batch_->used += bytes;
-            ++batch_->writers;
-        }
-        if (full)
-            sendBatch(*full);
-        std::byte* record = place.batch->message.data() + offset;
-        const auto tileIndex = static_cast<std::int32_t>(tile);
-        std::memset(record, 0, recordPrefix);
-        std::memcpy(record, &tileIndex, sizeof tileIndex);
-        std::byte* plane = record + recordPrefix;
+        std::size_t bytes = 0;
+        for (std::size_t c = 0; c < channelCount; ++c)
+            bytes += alignedTo16(record_.pixelBytes(c) * pixelsIn(region));
+        place.own = pool_->acquire(bytes);
+        std::byte* plane = place.own.data();
         for (std::size_t c = 0; c < channelCount; ++c)
             if (travels(c)) {
                 place.planes.at[c] = plane;
-                plane += alignedTo16(pixelBytes(c) * pixelsIn(region));
+                plane += alignedTo16(record_.pixelBytes(c) * pixelsIn(region));
             }
-        place.stride = width;
+        place.stride = static_cast<std::size_t>(region.width());
         return place;
     }
 
@@ -238,26 +207,51 @@ public:
             state_[static_cast<std::size_t>(tile)] = TileState::Received;
             return;
         }
-        bool send = false;
         if (place.writer) {
             const std::lock_guard<std::mutex> lock(mutex_);
             placed_.push_back(tile);
             ++tilesSent_;
             return; // and with `place` the writer leaves
         }
+        static thread_local FinishedRecord::Plan plan;
+        record_.plan(tile, layout_.region(tile), place, compresses_, plan);
+        std::shared_ptr<Batch> batch, full;
+        std::byte* record = nullptr;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
+            if (batch_ && batch_->used + plan.bytes() > batch_->message.size()) {
+                batch_->closed = true;
+                if (batch_->writers == 0)
+                    full = batch_;
+                batch_.reset();
+            }
+            if (!batch_) {
+                batch_ = std::make_shared<Batch>();
+                batch_->message = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
+                batch_->used = prefix;
+            }
+            batch = batch_;
+            record = batch->message.data() + batch->used;
+            batch->used += plan.bytes();
+            ++batch->writers;
             ++tilesSent_;
-            send = --place.batch->writers == 0 && place.batch->closed;
         }
-        if (send)
-            sendBatch(*place.batch);
+        if (full)
+            sendBatch(*full);
+        record_.write(plan, record);
+        bool isLast = false;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            isLast = --batch->writers == 0 && batch->closed;
+        }
+        if (isLast)
+            sendBatch(*batch);
     }
 
     // All tiles of this rank are committed: sends the rest, and how many there were.
     void flush()
     {
-        if (!enabled() || isDisplay_)
+        if (!enabled() || !senders_[static_cast<std::size_t>(rank_)])
             return;
         std::shared_ptr<Batch> last;
         std::vector<Buffer> held;
@@ -305,17 +299,10 @@ public:
             left = h.rawBytes;
         }
         while (left > 0) {
-            if (left < recordPrefix)
-                failMalformed("a finished tile is too short");
-            const auto tile = loadAs<std::int32_t>(in);
-            if (tile < 0 || tile >= layout_.tileCount())
-                failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
-            const Region region = layout_.region(tile);
-            const std::size_t bytes = recordBytes(region);
-            if (left < bytes)
-                failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes),
-                              static_cast<std::int64_t>(left));
-            store(tile, region, in + recordPrefix);
+            const std::size_t bytes = record_.read(in, left, layout_, [this](int tile, const Region& region) {
+                receiveOnce(tile);
+                return inImage(image_.planesAt(0), region);
+            });
             in += bytes;
             left -= bytes;
             ++tilesOf_[static_cast<std::size_t>(source)].received;
@@ -340,7 +327,9 @@ public:
             ++tilesOf_[static_cast<std::size_t>(source)].received;
             ++tilesReceived_;
         }
-        tilesOf_[static_cast<std::size_t>(source)].announced = count;
+        std::int64_t expected = -1;
+        if (count < 0 || !tilesOf_[static_cast<std::size_t>(source)].announced.compare_exchange_strong(expected, count))
+            failMalformed("a count of tiles that can not be", -1, count);
         tilesAnnounced_ += count;
         ++ranksDone_; // after the count: who sees all ranks done sees all counts
     }
@@ -348,10 +337,11 @@ public:
     // All tiles of the other ranks are in the image.
     bool complete() const
     {
-        return !isDisplay_ || !enabled() || (ranksDone_ == rankCount_ - 1 && tilesReceived_ == tilesAnnounced_);
+        return !isDisplay_ || !enabled() || (ranksDone_ == senderCount() && tilesReceived_ == tilesAnnounced_);
     }
 
-    // How many of the other ranks' tiles have come completely, and in words whose have not.
+    // How many ranks have tiles for this one, how many of these have said how many, and in words whose have not come.
+    int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
     int ranksDone() const noexcept { return ranksDone_; }
     std::string missing() const
     {
@@ -402,6 +392,13 @@ public:
 
 private:
     enum class TileState : std::uint8_t { Undefined, Background, Old, Received };
+    // A message that is being filled.
+    struct Batch {
+        Buffer message;
+        std::size_t used = 0;
+        int writers = 0;
+        bool closed = false;
+    };
     struct TilesOf {
         std::atomic<std::int64_t> received{0}, announced{-1};
         TilesOf() = default;
@@ -413,34 +410,16 @@ private:
         std::uint32_t reserved = 0;
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
-    static constexpr std::size_t recordPrefix = 16;
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
     bool travels(std::size_t channel) const { return hasChannel(settings_.channels | colorChannel, channel); }
-    std::size_t pixelBytes(std::size_t channel) const { return pixelBytes(channel, settings_.format); }
-    static std::size_t pixelBytes(std::size_t channel, OutputFormat format)
-    {
-        return channel == Color ? bytesPerPixel(format) : 4 * static_cast<std::size_t>(channelWords[channel]);
-    }
     static std::size_t pixelsIn(const Region& region)
     {
         return static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
     }
-    static std::size_t recordBytes(std::size_t pixels, OutputFormat format, ChannelMask channels)
-    {
-        std::size_t bytes = recordPrefix;
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (hasChannel(channels | colorChannel, c))
-                bytes += alignedTo16(pixels * pixelBytes(c, format));
-        return bytes;
-    }
-    std::size_t recordBytes(const Region& region) const
-    {
-        return recordBytes(pixelsIn(region), settings_.format, settings_.channels);
-    }
     std::size_t maxBatchBytes() const
     {
-        return std::max(batchBytes, recordBytes({0, 0, layout_.tileSize(), layout_.tileSize()}));
+        return std::max(batchBytes, record_.mostBytes(pixelsIn({0, 0, layout_.tileSize(), layout_.tileSize()})));
     }
 
     // `planes`: of the whole image.
@@ -452,7 +431,7 @@ private:
             static_cast<std::size_t>(region.y0) * place.stride + static_cast<std::size_t>(region.x0);
         for (std::size_t c = 0; c < channelCount; ++c)
             if (planes.at[c])
-                place.planes.at[c] = planes.at[c] + first * pixelBytes(c);
+                place.planes.at[c] = planes.at[c] + first * record_.pixelBytes(c);
         return place;
     }
 
@@ -470,21 +449,6 @@ private:
             info.tile = tile;
             info.message = "a finished tile came twice";
             throw Error(std::move(info));
-        }
-    }
-
-    void store(int tile, const Region& region, const std::byte* pixels)
-    {
-        receiveOnce(tile);
-        const Place place = inImage(image_.planesAt(0), region);
-        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
-        for (std::size_t c = 0; c < channelCount; ++c) {
-            if (!place.planes.at[c])
-                continue;
-            const std::size_t rowBytes = width * pixelBytes(c), stride = place.stride * pixelBytes(c);
-            for (std::size_t y = 0; y < height; ++y)
-                std::memcpy(place.planes.at[c] + y * stride, pixels + y * rowBytes, rowBytes);
-            pixels += alignedTo16(rowBytes * height);
         }
     }
 
@@ -534,8 +498,10 @@ private:
     TileLayout layout_;
     Settings settings_;
     bool isDisplay_;
-    int rank_, rankCount_;
+    int rank_;
+    std::vector<bool> senders_; // of finished tiles, rank by rank
     Send send_;
+    const FinishedRecord record_;
     std::int64_t frame_ = 0;
     bool compresses_ = false;
 

@@ -8,6 +8,7 @@
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
 
+#include <algorithm>
 #include <array>
 #include <atomic>
 #include <cstddef>
@@ -80,6 +81,8 @@ public:
     int owner(int tile) const noexcept { return owners_[static_cast<std::size_t>(tile)]; }
     bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
     const std::vector<int>& owned() const noexcept { return owned_; }
+    // Whether a rank owns any tile.
+    bool ownsTiles(int rank) const { return std::find(owners_.begin(), owners_.end(), rank) != owners_.end(); }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
     // `info` is what all tiles have in common. No other member may be running.
