@@ -9,6 +9,7 @@
 #include <dfb/ops/pixel_ops.hpp>
 
 #include <algorithm>
+#include <any>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
@@ -72,6 +73,10 @@ public:
         // Throws InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
         bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
+
+        // For a rendering loop to keep what it has declared its inputs from: it stays there as long as the declaration
+        // holds (see FrameParams::declarationKey) and is empty in the first frame of each.
+        std::any& declaredFrom() const noexcept { return engine_->declaredFrom(); }
 
         // As FrameParams::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
         void expectLayers(int layers) { engine_->expectLayers(layers); }

@@ -79,7 +79,8 @@ struct FrameParams {
     // True: each rank says with Frame::declare() what it will send, and owners count on that.
     bool declared = false;
     // Not 0 and the same as in the last frame, which succeeded: what was declared then still holds, and declare() must
-    // not be called. Change it when bricks or camera change.
+    // not be called, nor is it looked up again which tiles the bricks project to. Change it when bricks or camera
+    // change.
     std::uint64_t declarationKey = 0;
     // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws

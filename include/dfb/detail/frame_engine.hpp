@@ -13,6 +13,7 @@
 #include <dfb/frame.hpp>
 
 #include <algorithm>
+#include <any>
 #include <atomic>
 #include <chrono>
 #include <cstddef>
@@ -120,8 +121,10 @@ public:
         params_ = params;
         lastKey_ = 0;
         wantsDeclaration_ = params.declared && !reuse;
-        if (!reuse)
+        if (!reuse) {
             manifests_.reset();
+            declaredFrom_.reset();
+        }
 
         TileInfo info;
         info.rank = rank();
@@ -254,6 +257,8 @@ public:
         if (manifests.empty())
             enterAllDeclared();
     }
+
+    std::any& declaredFrom() noexcept { return declaredFrom_; }
 
     void abort(const std::exception_ptr& reason) { failWith(reason); }
 
@@ -690,7 +695,7 @@ private:
         } else if (!pipeline_->gather().complete()) {
             info.emplace();
             info->message = pipeline_->gather().missing();
-            info->expected = size() - 1;
+            info->expected = pipeline_->gather().senderCount();
             info->got = pipeline_->gather().ranksDone();
         } else {
             info.emplace();
@@ -818,6 +823,7 @@ private:
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
     ManifestExchange manifests_;
+    std::any declaredFrom_; // see Frame
     JobShare jobs_;
 
     // The frame.

@@ -25,7 +25,7 @@ template <class FrameBuffer, class Camera, class RenderBrick>
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+    const auto& pairs = detail::foundOnce(frame, [&] { return visibleTiles(world, camera, fb.layout()); });
     if (frame.wantsDeclaration())
         frame.declare(inputsOf(world, pairs));
     const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });

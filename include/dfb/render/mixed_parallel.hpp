@@ -234,7 +234,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.guard([&] {
-        const std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
+        const auto& pairs = detail::foundOnce(frame, [&] { return visibleTiles(world, camera, fb.layout()); });
         frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
         const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
         if (frame.wantsDeclaration()) {

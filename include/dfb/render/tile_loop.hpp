@@ -3,6 +3,7 @@
 #pragma once
 
 #include <algorithm>
+#include <any>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
@@ -26,8 +27,8 @@ struct InPlace {
 };
 
 // For any loop in place of what renders, where the pixels are there already, as in an image that a rank has made by
-// itself: `find` gets a TileView in place of a Tile, and says where the pixels of view.region are. Nothing is copied into a
-// tile.
+// itself: `find` gets a TileView in place of a Tile, and says where the pixels of view.region are. Nothing is copied
+// into a tile.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -45,6 +46,19 @@ template <class FrameBuffer, class Find>
 struct TileOf<FrameBuffer, InPlace<Find>> {
     using Type = typename FrameBuffer::TileView;
 };
+
+// What find() gives: called once for each declaration of inputs, not in the frames that go by the last one.
+template <class Frame, class Find>
+const auto& foundOnce(const Frame& frame, const Find& find)
+{
+    struct Found { // a type for each place that this is called at: loops do not take each other's
+        decltype(find()) value;
+    };
+    auto* found = std::any_cast<std::shared_ptr<Found>>(&frame.declaredFrom());
+    if (!found)
+        found = &frame.declaredFrom().template emplace<std::shared_ptr<Found>>(new Found{find()});
+    return (*found)->value;
+}
 
 // A job for each pass of each of some items, numbered item by item.
 class PassJobs {
