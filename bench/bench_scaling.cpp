@@ -126,7 +126,8 @@ std::vector<Input> inputsOf(const bench::PartialImage& image, const dfb::TileLay
 struct Expected {
     // What a rank sends: in every frame, and beside that in a frame whose bricks or camera are new.
     MessageCount fragments, finished, done, verdict, manifests, acks, consensus;
-    std::int64_t mostCredits = 0; // requests for credit and answers
+    std::int64_t mostCredits = 0, mostCreditsIn = 0; // requests for credit and answers; and those that it takes
+    bool asksForCredit = false;
     std::int64_t tiles = 0, activePixels = 0;
     std::int64_t inPixels = 0, inMessages = 0, inBytes = 0; // of fragments of others
     std::int64_t poolBytes = 0;                             // the most that its pool may hold
@@ -207,8 +208,12 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         }
         for (const auto& [other, count] : to) {
             const std::int64_t requests = count.bytes > allowance ? count.messages : 0;
+            const std::int64_t answers = requests + std::min(count.messages, 2 * count.bytes / allowance);
             e.mostCredits += requests;
-            at(other).mostCredits += requests + std::min(count.messages, 2 * count.bytes / allowance);
+            e.mostCreditsIn += answers;
+            e.asksForCredit = e.asksForCredit || requests > 0;
+            at(other).mostCredits += answers;
+            at(other).mostCreditsIn += requests;
         }
         for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1) // those below it in the tree
             if (rank + bit < ranks) {
@@ -341,20 +346,26 @@ double dfbMs(const Network& n, const std::vector<Expected>& ranks, const PixelCo
 {
     double inputs = 0;
     Work display;
+    bool asksForCredit = false;
     for (const Expected& e : ranks) {
+        const bool isDisplay = &e == &ranks.front();
         Work w;
         w.out = static_cast<double>(e.fragments.messages);
         w.outBytes = static_cast<double>(e.fragments.bytes);
         w.in = static_cast<double>(e.inMessages);
         w.inBytes = static_cast<double>(e.inBytes);
+        Work& withCredit = isDisplay ? display : w; // which gives most of it to finished tiles
+        withCredit.out += static_cast<double>(e.mostCredits);
+        withCredit.in += static_cast<double>(e.mostCreditsIn);
+        asksForCredit = asksForCredit || e.asksForCredit;
         // Half of it where it is encoded, half where it is blended.
         w.cpu = 1e-3 * costs.dfbNs / 2 * static_cast<double>(e.activePixels + e.inPixels);
         inputs = std::max(inputs, phase(n, w));
         display.in += static_cast<double>(e.finished.messages + e.done.messages);
         display.inBytes += static_cast<double>(e.finished.bytes + e.done.bytes);
     }
-    const double levels = std::ceil(std::log2(static_cast<double>(ranks.size())));
-    return 1e-3 * (inputs + phase(n, display) + 2 * levels * (n.latency + 2 * n.overhead));
+    const double hop = n.latency + 2 * n.overhead, levels = std::ceil(std::log2(static_cast<double>(ranks.size())));
+    return 1e-3 * (inputs + phase(n, display) + 2 * levels * hop + (asksForCredit ? 2 * hop : 0));
 }
 
 // Radix-k as in radix_k.hpp: rows are shared out, viewports are sent without their depth, as the order is known. The
