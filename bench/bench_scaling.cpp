@@ -594,8 +594,8 @@ private:
         const std::vector<Network> networks{o_.rig, o_.hpc};
         for (const Network& network : networks) {
             tables.emplace_back(std::vector<std::string>{"ranks", "dfb [ms]", "binary swap", "radix-4", "radix-8"});
-            for (const std::string& system : systems)
-                lines.push_back({system + ", " + network.name, {}, network.name == "rig"});
+            for (std::size_t i = 0; i < systems.size(); ++i)
+                lines.push_back({systems[i] + ", " + network.name, {}, i, network.name == "rig"});
         }
         const dfb::TileLayout layout(width(), height(), tileSize);
         for (int ranks = 2; ranks <= (o_.quick ? 1024 : 16384); ranks *= 2) {

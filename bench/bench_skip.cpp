@@ -413,7 +413,7 @@ private:
     {
         bench::Table table({"active [%]", "ms", "bytes", "messages", "bytes, of full [%]", "messages", "time"});
         std::vector<double> pixels, bytes;
-        bench::PlotLine bytesLine{"bytes, % of a full frame", {}}, timeLine{"time, % of a full frame", {}};
+        bench::PlotLine bytesLine{"bytes", {}, 0}, timeLine{"time", {}, 1};
         FrameCost full;
         for (const double percent : {100.0, 50.0, 25.0, 10.0, 1.0, 0.0}) {
             const Picture picture(width(), height(), percent / 100);

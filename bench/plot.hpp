@@ -16,6 +16,7 @@ namespace bench {
 struct PlotLine {
     std::string name;
     std::vector<std::pair<double, double>> points;
+    std::size_t colour = 0;
     bool isDashed = false;
 };
 
@@ -50,7 +51,7 @@ inline void writePlot(const std::string& path, const std::string& title, const s
     };
     const auto number = [](double v) {
         char text[32];
-        std::snprintf(text, sizeof text, "%.4g", v);
+        std::snprintf(text, sizeof text, "%.6g", v);
         return std::string(text);
     };
     const auto marks = [&](double low, double high, bool powersOfTwo) {
@@ -80,7 +81,7 @@ inline void writePlot(const std::string& path, const std::string& title, const s
     label(20, top - 10, yLabel, "");
     static const char* const colours[] = {"#0a58a8", "#c03020", "#2a8a30", "#8040a0", "#b07000", "#555555"};
     for (std::size_t i = 0; i < lines.size(); ++i) {
-        const char* colour = colours[i % (sizeof colours / sizeof *colours)];
+        const char* colour = colours[lines[i].colour % (sizeof colours / sizeof *colours)];
         svg << "<polyline fill=\"none\" stroke=\"" << colour << "\" stroke-width=\"2\""
             << (lines[i].isDashed ? " stroke-dasharray=\"6 4\"" : "") << " points=\"";
         for (const auto& [x, y] : lines[i].points)
