@@ -1,7 +1,7 @@
 // What the benchmarks compare with: MPI called plainly.
 #pragma once
 
-#include "figures.hpp"
+#include "options.hpp"
 
 #include <mpi.h>
 
@@ -243,58 +243,6 @@ struct Arguments {
 
     bool wants(char part) const { return only.empty() || only.find(part) != std::string::npos; }
 };
-
-inline std::vector<std::string> partsOf(const std::string& text, char separator)
-{
-    std::istringstream stream(text);
-    std::vector<std::string> parts;
-    for (std::string part; std::getline(stream, part, separator);)
-        parts.push_back(part);
-    return parts;
-}
-
-// "1024x768"; false if it is none, or smaller than 16.
-inline bool readSize(const std::string& text, int& width, int& height)
-{
-    return std::sscanf(text.c_str(), "%dx%d", &width, &height) == 2 && width >= 16 && height >= 16;
-}
-
-// A reader of "1024x768,..." into `sizes`.
-inline std::function<bool(const std::string&)> readSizes(std::vector<std::array<int, 2>>& sizes)
-{
-    return [&sizes](const std::string& value) {
-        sizes.clear();
-        for (const std::string& part : partsOf(value, ',')) {
-            sizes.emplace_back();
-            if (!readSize(part, sizes.back()[0], sizes.back()[1]))
-                return false;
-        }
-        return !sizes.empty();
-    };
-}
-
-// Options with a value each. Their readers return false for one that makes no sense. Ends the program after --help, or
-// if it was called wrongly.
-inline void readOptions(int argc, char** argv, const char* usage,
-                        const std::map<std::string, std::function<bool(const std::string&)>>& readers)
-{
-    for (int i = 1; i < argc; i += 2) {
-        const std::string name = argv[i];
-        const auto reader = readers.find(name);
-        if (reader != readers.end() && i + 1 < argc && reader->second(argv[i + 1]))
-            continue;
-        std::printf("%s\n", usage);
-        std::exit(name == "--help" ? 0 : 2);
-    }
-}
-// A reader that keeps the text.
-inline std::function<bool(const std::string&)> readText(std::string& text)
-{
-    return [&text](const std::string& value) {
-        text = value;
-        return true;
-    };
-}
 
 // Calls `body(communicator)` between the beginning and the end of MPI.
 template <class Body>

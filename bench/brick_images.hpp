@@ -2,8 +2,6 @@
 // one: each rank has one brick of a cube, seen from obliquely above, as a ray marcher would have rendered it.
 #pragma once
 
-#include "baselines.hpp"
-
 #include <dfb/testing/reference.hpp>
 
 #include <algorithm>
@@ -19,10 +17,17 @@
 namespace bench {
 
 struct PartialImage {
-    int width = 0, height = 0;
+    int width = 0, height = 0;     // of the pixels that are stored
+    int left = 0, top = 0;         // where they are in the image
     std::array<int, 4> viewport{}; // x, y, width, height of what may have pixels
-    std::vector<float> rgba;       // premultiplied, of the whole image; 4 a pixel
+    std::vector<float> rgba;       // premultiplied, 4 a pixel
     std::vector<float> depth;      // infinite where there is nothing
+
+    // Of a pixel of the image, which must be stored.
+    std::size_t indexOf(int x, int y) const
+    {
+        return static_cast<std::size_t>(y - top) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x - left);
+    }
 };
 
 // What an image should be, in every rowStep-th of its rows from the first on.
@@ -59,9 +64,10 @@ public:
         const std::size_t pixels = static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_);
         image.rgba.assign(4 * pixels, 0.0f);
         image.depth.assign(pixels, std::numeric_limits<float>::infinity());
+        const auto [left, top, columns, rows] = boundsOf(rank);
         int x0 = width_, y0 = height_, x1 = 0, y1 = 0;
-        for (int y = 0; y < height_; ++y)
-            for (int x = 0; x < width_; ++x) {
+        for (int y = top; y < top + rows; ++y)
+            for (int x = left; x < left + columns; ++x) {
                 const std::size_t i =
                     static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x);
                 if (!shade(rank, x, y, &image.rgba[4 * i], image.depth[i]))
@@ -72,6 +78,26 @@ public:
         if (x1 > x0)
             image.viewport = viewportOf({x0, y0, x1 - x0, y1 - y0});
         return image;
+    }
+
+    // The same with only those pixels stored that are in the tiles of this size that the viewport meets; it is that
+    // within which the rank can have any. For many ranks at once, or one after the other in the same memory.
+    void renderPart(int rank, int tileSize, PartialImage& image) const
+    {
+        image.viewport = viewportOf(boundsOf(rank));
+        const auto [x0, y0, columns, rows] = image.viewport;
+        image.left = x0 / tileSize * tileSize;
+        image.top = y0 / tileSize * tileSize;
+        image.width = std::min((x0 + columns + tileSize - 1) / tileSize * tileSize, width_) - image.left;
+        image.height = std::min((y0 + rows + tileSize - 1) / tileSize * tileSize, height_) - image.top;
+        const std::size_t pixels = static_cast<std::size_t>(image.width) * static_cast<std::size_t>(image.height);
+        image.rgba.assign(4 * pixels, 0.0f);
+        image.depth.assign(pixels, std::numeric_limits<float>::infinity());
+        for (int y = y0; y < y0 + rows; ++y)
+            for (int x = x0; x < x0 + columns; ++x) {
+                const std::size_t i = image.indexOf(x, y);
+                shade(rank, x, y, &image.rgba[4 * i], image.depth[i]);
+            }
     }
 
     // What the images of all ranks make together; slow. It holds none of these images, only the rows it is asked for.
@@ -113,6 +139,12 @@ protected:
     {
         return {3.4 * (x + 0.5 - 0.5 * width_) / height_, 3.4 * (0.5 * height_ - y - 0.5) / height_};
     }
+    // The pixel that such a position is in, or is next to if it is outside the image.
+    std::array<int, 2> pixelAt(double u, double v) const
+    {
+        return {std::clamp(static_cast<int>(std::floor(u * height_ / 3.4 + 0.5 * width_)), 0, width_ - 1),
+                std::clamp(static_cast<int>(std::floor(0.5 * height_ - v * height_ / 3.4)), 0, height_ - 1)};
+    }
     // A rank's colour at a position, premultiplied.
     static void paint(int rank, double u, double v, double alpha, float* rgba)
     {
@@ -125,24 +157,14 @@ protected:
 private:
     // What a rank has in a pixel: premultiplied, and its depth; false, and nothing written, if it has nothing.
     virtual bool shade(int rank, int x, int y, float* rgba, float& depth) const = 0;
+    // Outside of this rectangle (x, y, width, height) it has nothing.
+    virtual std::array<int, 4> boundsOf(int) const { return {0, 0, width_, height_}; }
     // The part of the image in which a renderer would look for pixels, given that in which there are any.
     virtual std::array<int, 4> viewportOf(const std::array<int, 4>& used) const { return used; }
 
     int width_, height_;
     std::vector<int> order_, place_; // front to back; and where each rank is in that
 };
-
-// Of all ranks, of what this one has. Collective.
-inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
-{
-    int size = 1;
-    MPI_Comm_size(comm, &size);
-    std::vector<std::array<int, 4>> all(static_cast<std::size_t>(size));
-    MPI_Request request = MPI_REQUEST_NULL;
-    MPI_Iallgather(image.viewport.data(), 4, MPI_INT, all.data(), 4, MPI_INT, comm, &request);
-    napThrough(request);
-    return all;
-}
 
 class BrickScene : public Scene {
 public:
@@ -189,6 +211,24 @@ private:
         for (std::size_t a = 0; a < 3; ++a)
             depth += forward()[a] * (lower(rank, a) + 1.0 / cells_[a]);
         return depth;
+    }
+
+    // Around the brick's corners.
+    std::array<int, 4> boundsOf(int rank) const override
+    {
+        int x0 = width(), y0 = height(), x1 = 0, y1 = 0;
+        for (int corner = 0; corner < 8; ++corner) {
+            double u = 0, v = 0;
+            for (std::size_t a = 0; a < 3; ++a) {
+                const double at = lower(rank, a) + (corner >> a & 1 ? 2.0 / cells_[a] : 0);
+                u += at * right()[a];
+                v += at * up()[a];
+            }
+            const auto [x, y] = pixelAt(u, v);
+            x0 = std::min(x0, x), x1 = std::max(x1, x + 1);
+            y0 = std::min(y0, y), y1 = std::max(y1, y + 1);
+        }
+        return {x0, y0, x1 - x0, y1 - y0};
     }
 
     // The part of the ray within the brick absorbs and glows; false if there is none.

@@ -7,6 +7,8 @@
 #include <cstddef>
 #include <cstdio>
 #include <ctime>
+#include <fstream>
+#include <stdexcept>
 #include <string>
 #include <utility>
 #include <vector>
@@ -87,24 +89,37 @@ public:
 
     void print(const std::string& title) const
     {
+        std::printf("\n%s\n%s", title.c_str(), text().c_str());
+        std::fflush(stdout);
+    }
+
+    std::string text() const
+    {
         std::vector<std::size_t> widths(rows_.front().size());
         for (const auto& row : rows_)
             for (std::size_t i = 0; i < row.size(); ++i)
                 widths[i] = std::max(widths[i], lettersOf(row[i]));
-        std::printf("\n%s\n", title.c_str());
+        std::string out;
         for (std::size_t r = 0; r < rows_.size(); ++r) {
             for (std::size_t i = 0; i < rows_[r].size(); ++i) {
                 const std::string space(widths[i] - lettersOf(rows_[r][i]), ' ');
-                std::printf(i == 0 ? "| %s%s |" : " %s%s |", i == 0 ? rows_[r][i].c_str() : space.c_str(),
-                            i == 0 ? space.c_str() : rows_[r][i].c_str());
+                out += (i == 0 ? "| " + rows_[r][i] + space : ' ' + space + rows_[r][i]) + " |";
             }
-            std::printf("\n");
-            if (r == 0)
-                for (std::size_t i = 0; i < widths.size(); ++i)
-                    std::printf("%s%s%s%s", i == 0 ? "|" : "", std::string(widths[i] + 1, '-').c_str(),
-                                i == 0 ? "-|" : ":|", i + 1 == widths.size() ? "\n" : "");
+            out += '\n';
+            for (std::size_t i = 0; r == 0 && i < widths.size(); ++i)
+                out += (i == 0 ? "|" : "") + std::string(widths[i] + 1, '-') + (i == 0 ? "-|" : ":|");
+            out += r == 0 ? "\n" : "";
         }
-        std::fflush(stdout);
+        return out;
+    }
+
+    // Behind what the file has.
+    void appendTo(const std::string& path, const std::string& title) const
+    {
+        std::ofstream file(path, std::ios::app);
+        file << '\n' << title << "\n\n" << text();
+        if (!file.flush())
+            throw std::runtime_error("can not write " + path);
     }
 
 private:

@@ -24,18 +24,19 @@ struct Result {
     int levels = 0;              // by which an 8-bit value is off at most
     double peakMemoryBytes = -1; // of the rank with the most; below 0: not known
     std::string commit;
+    std::string more{}; // further keys: , "key": value
 
     std::string json() const
     {
-        char text[1024];
+        char text[2048];
         std::snprintf(text, sizeof text,
                       R"({"bench": "%s", "system": "%s", "config": "%s", "scene": "%s", "ranks": %d, "width": %d, )"
                       R"("height": %d, "median_ms": %.4f, "mad_ms": %.4f, "cpu_ms": %.3f, "bytes": %.0f, )"
                       R"("messages": %.0f, "max_err": %.6g, "rmse": %.6g, "lsb_max": %d, "peak_memory_bytes": %.0f, )"
-                      R"("commit": "%s"})",
+                      R"("commit": "%s"%s})",
                       bench.c_str(), system.c_str(), config.c_str(), scene.c_str(), ranks, width, height, ms.median,
                       ms.deviation, cpuMs.median, bytes, messages, maxError, rmse, levels, peakMemoryBytes,
-                      commit.c_str());
+                      commit.c_str(), more.c_str());
         return text;
     }
 };

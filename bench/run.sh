@@ -2,13 +2,14 @@
 # sh bench/run.sh [--quick]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs
 # bench_error_time on 4 and on 8 ranks, its table to README.md, and bench_compositing and bench_overlap on 2, 4 and 8
-# ranks, their tables to bench/README.md; all figures to bench/results. 15 minutes, or 5.
+# ranks, bench_scaling and bench_skip, their tables to bench/README.md; all figures to bench/results. 17 minutes, or 6.
+# The exit status is 1 if what the last two count is not what it should be.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
-frames=41 compositing_frames=11 views=12
-[ "${1:-}" != --quick ] || frames=5 compositing_frames=3 views=4
+frames=41 compositing_frames=11 views=12 skip_size=4096x4096 quick=
+[ "${1:-}" != --quick ] || frames=5 compositing_frames=3 views=4 skip_size=1024x1024 quick=--quick
 jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
 results=bench/results
@@ -16,10 +17,11 @@ results=bench/results
 sh cmake/install_packages.sh
 sh bench/get_icet.sh || [ $? -eq 3 ] # without IceT the others are measured
 cmake --preset release -DDFB_BUILD_BENCH=ON
-cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing bench_overlap
+cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing bench_overlap \
+    bench_scaling bench_skip
 
 mkdir -p "$results"
-rm -f "$results"/error_time.* "$results"/compositing.* "$results"/overlap.*
+rm -f "$results"/error_time.* "$results"/compositing.* "$results"/overlap.* "$results"/scaling.* "$results"/skip.*
 for ranks in 4 8; do
     mpiexec -n "$ranks" build/release/bench/bench_error_time --frames "$frames" --commit "$commit" \
         --json "$results/error_time.json" --svg "$results/error_time.$ranks" --table "$results/error_time.$ranks.md"
@@ -35,6 +37,12 @@ for ranks in 2 4 8; do
     mpiexec -n "$ranks" build/release/bench/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
         --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
 done
+
+status=0
+build/release/bench/bench_scaling $quick --commit "$commit" --json "$results/scaling.json" \
+    --svg "$results/scaling.svg" --table "$results/scaling.md" || status=1
+build/release/bench/bench_skip $quick --size "$skip_size" --commit "$commit" --json "$results/skip.json" \
+    --svg "$results/skip.svg" --table "$results/skip.md" || status=1
 
 # between FILE NAME TABLE...: what FILE has between the marks of NAME is what was measured.
 between() {
@@ -55,3 +63,6 @@ between() {
 between README.md error_time "$results/error_time.4.md" "$results/error_time.8.md"
 between bench/README.md compositing "$results/compositing.md"
 between bench/README.md overlap "$results/overlap.md"
+between bench/README.md scaling "$results/scaling.md"
+between bench/README.md skip "$results/skip.md"
+exit "$status"

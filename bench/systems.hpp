@@ -29,6 +29,18 @@ namespace bench {
 
 using Messenger = dfb::Messenger<dfb::MpiTransport>;
 
+// Of all ranks, of what this one has. Collective.
+inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
+{
+    int size = 1;
+    MPI_Comm_size(comm, &size);
+    std::vector<std::array<int, 4>> all(static_cast<std::size_t>(size));
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallgather(image.viewport.data(), 4, MPI_INT, all.data(), 4, MPI_INT, comm, &request);
+    napThrough(request);
+    return all;
+}
+
 // What an image is made of.
 struct Inputs {
     Inputs(MPI_Comm communicator, const Scene& scene, int rank)

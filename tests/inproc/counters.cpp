@@ -155,6 +155,77 @@ TEST_CASE("A frame sends its active pixels, and little else", "[counters]")
     CHECK(whole - half >= inputs * 0.49);
 }
 
+TEST_CASE("Bytes grow with the active pixels, along a line", "[counters]")
+{
+    std::vector<std::int64_t> bytes;
+    for (const int rows : {64, 192, 320, 448})
+        bytes.push_back(cost<dfb::AlphaBlend>(rows).report.bytesSent);
+    for (std::size_t i = 2; i < bytes.size(); ++i) {
+        const std::int64_t bend = (bytes[i] - bytes[i - 1]) - (bytes[i - 1] - bytes[i - 2]);
+        INFO(bend << " bytes more than the step before");
+        CHECK(std::abs(bend) <= ranks * 64); // headers of batches of finished tiles
+    }
+}
+
+TEST_CASE("A channel that nobody asks for adds no byte", "[counters]")
+{
+    using WithMore = dfb::BasicAlphaBlend<64, dfb::colorChannel | dfb::depthChannel | dfb::imageAuxChannels>;
+    CHECK(cost<WithMore>(256).report.bytesSent == cost<dfb::AlphaBlend>(256).report.bytesSent);
+}
+
+TEST_CASE("A tile that has converged is not rendered, and nothing of it travels", "[counters]")
+{
+    std::vector<dfb::FrameReport> reports;
+    std::atomic<std::int64_t> calls{0}, wrongCalls{0};
+    std::vector<std::int64_t> callsOf;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config;
+        config.width = config.height = side;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        using Fb = dfb::DistributedFrameBuffer<dfb::Progressive<dfb::AlphaBlend>, dfb::NoPixelOp, dfb::InprocTransport>;
+        Fb fb(communicator, config);
+        dfb::World world;
+        world.add({static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {1, 1, 1}}});
+        int taken = 0;
+        for (const int step : {1, 2, 0}) { // all tiles, every second one, none
+            dfb::FrameParams params;
+            params.declarationKey = params.accumulationId = 1;
+            std::vector<dfb::TileSamples> plan(tileCount);
+            for (std::size_t t = 0; t < plan.size(); ++t)
+                plan[t] = {step == 1 || t % 2 == 0 ? taken : 2,
+                           step > 0 && t % static_cast<std::size_t>(step) == 0 ? 2 : 0};
+            taken += 2;
+            params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(plan);
+            const dfb::FrameReport report = dfb::renderDataParallel(
+                fb, world, WholeImage(),
+                [&](const dfb::Brick& brick, auto& tile) {
+                    ++calls;
+                    wrongCalls += plan[static_cast<std::size_t>(tile.tile)].count == 0;
+                    tile.forEachPixel([&](int x, int, float* rgba, float& depth) {
+                        rgba[0] = rgba[3] = 0.25f + 0.01f * static_cast<float>(x % 7);
+                        depth = static_cast<float>(brick.id);
+                    });
+                },
+                params);
+            fb.allReduce({0}, Fb::Reduce::Sum);
+            if (fb.isDisplayRank()) {
+                reports.push_back(report);
+                callsOf.push_back(calls);
+                calls = 0;
+            }
+            fb.allReduce({0}, Fb::Reduce::Sum);
+        }
+    });
+    constexpr std::int64_t inputs = 2 * tileCount * (ranks - 1); // of a frame, to other ranks
+    CHECK(wrongCalls == 0);
+    CHECK(callsOf == std::vector<std::int64_t>{2 * tileCount * ranks, tileCount * ranks, 0});
+    INFO(reports[1].messagesSent << ", " << reports[2].messagesSent << " messages");
+    CHECK(reports[1].messagesSent >= inputs / 2);
+    CHECK(reports[1].messagesSent <= inputs / 2 + 8 * ranks);
+    CHECK(reports[2].messagesSent <= 3 * (ranks - 1));
+    CHECK(reports[2].bytesSent <= 3 * (ranks - 1) * 1024); // the verdict has an error of each tile that was finished
+}
+
 TEST_CASE("A frame of nothing costs next to nothing", "[counters]")
 {
     const Cost full = cost<dfb::AlphaBlend>(side), empty = cost<dfb::AlphaBlend>(0);

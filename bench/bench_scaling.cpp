@@ -1,0 +1,721 @@
+// What a rank sends and keeps when there are 2 to 1024 of them: messages and bytes of each rank and frame, counted on
+// ranks that are threads of this process, beside the formulas of bench/README.md, of which they must not differ; then
+// an estimate of a frame's time on up to 16,384 ranks in the LogGP model, beside binary swap and radix-k. No MPI.
+//   bench_scaling [--ranks 2,4,...] [--size 2048x2048] [--scenes bricks,discs] [--frames 3] [--quick]
+//   [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
+// `bricks`: each rank one brick of a cube, whose image is the smaller the more ranks there are. `discs`: each rank a
+// disc that is as large whatever their number. L, o and g are in us, G in ns a byte. The exit status is 1 if a count is
+// not that of its formula.
+#include "counted_transport.hpp"
+#include "options.hpp"
+#include "plot.hpp"
+#include "results.hpp"
+#include "scenes.hpp"
+
+#include <dfb/distributed_framebuffer.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/render/data_parallel.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <functional>
+#include <map>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using bench::Kind;
+using bench::MessageCount;
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, bench::CountedTransport>;
+
+constexpr int tileSize = dfb::AlphaBlend::tileSize;
+constexpr std::int64_t bytesPerInput = 20; // float32 colour and depth of a pixel
+constexpr std::int64_t bytesPerOutput = 4; // 8 bits a channel
+
+// The pixels of each rank: half as many as four tiles have, wherever they lie.
+class DiscScene : public bench::Scene {
+public:
+    DiscScene(int ranks, int width, int height) : Scene(ranks, width, height) {}
+
+private:
+    static constexpr double radius = 0.8 * tileSize;
+
+    std::array<double, 2> centreOf(int rank) const
+    {
+        const double i = rank + 1; // a low-discrepancy sequence, so that all parts of the image have as many
+        const double u = i * 0.7548776662466927, v = i * 0.5698402909980532;
+        return {radius + (u - std::floor(u)) * (width() - 2 * radius),
+                radius + (v - std::floor(v)) * (height() - 2 * radius)};
+    }
+    bool shade(int rank, int x, int y, float* rgba, float& depth) const override
+    {
+        const auto centre = centreOf(rank);
+        if (std::hypot(x + 0.5 - centre[0], y + 0.5 - centre[1]) > radius)
+            return false;
+        const auto [u, v] = positionOf(x, y);
+        paint(rank, u, v, 0.5, rgba);
+        depth = static_cast<float>(placeOf(rank));
+        return true;
+    }
+    std::array<int, 4> boundsOf(int rank) const override
+    {
+        const auto centre = centreOf(rank);
+        const int x0 = std::max(0, static_cast<int>(centre[0] - radius)),
+                  y0 = std::max(0, static_cast<int>(centre[1] - radius));
+        const int side = static_cast<int>(2 * radius) + 2;
+        return {x0, y0, std::min(side, width() - x0), std::min(side, height() - y0)};
+    }
+};
+
+std::unique_ptr<bench::Scene> sceneOf(const std::string& name, int ranks, int width, int height)
+{
+    if (name == "discs")
+        return std::make_unique<DiscScene>(ranks, width, height);
+    return bench::makeScene(name, ranks, width, height);
+}
+
+// ---- the formulas, see bench/README.md
+
+std::int64_t alignedTo16(std::int64_t bytes) { return (bytes + 15) / 16 * 16; }
+
+// What a rank has for one tile.
+struct Input {
+    int tile = 0;
+    std::int64_t activePixels = 0, bytes = 0; // bytes of the message
+};
+
+std::vector<Input> inputsOf(const bench::PartialImage& image, const dfb::TileLayout& layout)
+{
+    std::vector<Input> inputs;
+    const auto& v = image.viewport;
+    const dfb::Region viewport{v[0], v[1], v[0] + v[2], v[1] + v[3]}, tiles = layout.tilesIn(viewport);
+    for (int row = tiles.y0; row < tiles.y1; ++row)
+        for (int column = tiles.x0; column < tiles.x1; ++column) {
+            Input input;
+            input.tile = layout.tileAt(column, row);
+            const dfb::Region whole = layout.region(input.tile), part = intersection(whole, viewport);
+            std::int64_t spans = 0, first = -1, last = -1;
+            for (int y = part.y0; y < part.y1; ++y) {
+                bool before = false;
+                for (int x = part.x0; x < part.x1; ++x) {
+                    const bool isActive = image.rgba[4 * image.indexOf(x, y) + 3] > 0;
+                    spans += isActive && !before;
+                    input.activePixels += isActive;
+                    before = isActive;
+                    if (isActive) {
+                        first = first < 0 ? y : first;
+                        last = y;
+                    }
+                }
+            }
+            const std::int64_t pixels = static_cast<std::int64_t>(whole.width()) * whole.height();
+            input.bytes = 64 + bytesPerInput * input.activePixels;
+            if (input.activePixels > 0 && input.activePixels < pixels)
+                input.bytes += alignedTo16(2 * (last - first + 1) + 4 * spans);
+            inputs.push_back(input);
+        }
+    return inputs;
+}
+
+struct Expected {
+    // What a rank sends: in every frame, and beside that in a frame whose bricks or camera are new.
+    MessageCount fragments, finished, done, verdict, manifests, acks, consensus;
+    std::int64_t mostCredits = 0, mostCreditsIn = 0; // requests for credit and answers; and those that it takes
+    bool asksForCredit = false;
+    std::int64_t tiles = 0, activePixels = 0;
+    std::int64_t inPixels = 0, inMessages = 0, inBytes = 0; // of fragments of others
+    std::int64_t poolBytes = 0;                             // the most that its pool may hold
+
+    MessageCount everyFrame() const
+    {
+        MessageCount sum = fragments;
+        for (const MessageCount* more : {&finished, &done, &verdict})
+            sum += *more;
+        return sum;
+    }
+};
+
+// As blocks of the memory pool are: powers of 2, and the middles between them.
+std::int64_t blockOf(std::int64_t bytes)
+{
+    std::int64_t block = 64;
+    while (block < bytes)
+        block = block * 3 / 2 >= bytes ? block * 3 / 2 : block * 2;
+    return block;
+}
+
+std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, const dfb::TileLayout& layout,
+                                 std::size_t messagePoolBytes)
+{
+    const auto ranks = static_cast<int>(inputs.size());
+    std::vector<Expected> all(inputs.size());
+    const auto at = [&](int rank) -> Expected& { return all[static_cast<std::size_t>(rank)]; };
+    std::vector<int> owners(static_cast<std::size_t>(layout.tileCount()));
+    for (int tile = 0; tile < layout.tileCount(); ++tile)
+        owners[static_cast<std::size_t>(tile)] = dfb::latticeOwner(tile, layout, ranks);
+    // Finished tiles; a tile of which nobody has a pixel is background, which does not travel.
+    std::vector<bool> isTouched(owners.size());
+    for (const std::vector<Input>& some : inputs)
+        for (const Input& input : some)
+            if (input.activePixels > 0)
+                isTouched[static_cast<std::size_t>(input.tile)] = true;
+    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40;
+    constexpr std::int64_t record = 16 + bytesPerOutput * tileSize * tileSize;
+    constexpr std::int64_t perBatch = (batchBytes - batchPrefix) / record;
+    std::vector<std::int64_t> finished(inputs.size());
+    for (std::size_t tile = 0; tile < owners.size(); ++tile)
+        finished[static_cast<std::size_t>(owners[tile])] += isTouched[tile];
+
+    const std::int64_t allowance = static_cast<std::int64_t>(messagePoolBytes) / 2 / (ranks - 1);
+    for (int rank = 0; rank < ranks; ++rank) {
+        Expected& e = at(rank);
+        std::map<int, MessageCount> to; // messages that need credit
+        for (const Input& input : inputs[static_cast<std::size_t>(rank)]) {
+            const int owner = owners[static_cast<std::size_t>(input.tile)];
+            ++e.tiles;
+            e.activePixels += input.activePixels;
+            e.poolBytes += blockOf(input.bytes);
+            if (owner == rank)
+                continue;
+            to[owner].add(input.bytes);
+            e.fragments.add(input.bytes);
+            at(owner).inPixels += input.activePixels;
+            at(owner).inBytes += input.bytes;
+            ++at(owner).inMessages;
+        }
+        for (const auto& [owner, count] : to) {
+            e.manifests.add(24 + 10 * count.messages);
+            at(owner).acks.add(24);
+        }
+        if (rank != 0) { // the display rank
+            const std::int64_t tiles = finished[static_cast<std::size_t>(rank)];
+            const std::int64_t batches = (tiles + perBatch - 1) / perBatch;
+            e.finished.add(batches * batchPrefix + tiles * record, batches);
+            if (batches > 0)
+                to[0] += e.finished;
+            e.poolBytes += batches * batchBytes;
+            e.done.add(32);
+            e.verdict.add(153);
+            e.consensus.add(28);
+        } else {
+            e.poolBytes += blockOf(bytesPerOutput * layout.width() * layout.height());
+        }
+        for (const auto& [other, count] : to) {
+            const std::int64_t requests = count.bytes > allowance ? count.messages : 0;
+            const std::int64_t answers = requests + std::min(count.messages, 2 * count.bytes / allowance);
+            e.mostCredits += requests;
+            e.mostCreditsIn += answers;
+            e.asksForCredit = e.asksForCredit || requests > 0;
+            at(other).mostCredits += answers;
+            at(other).mostCreditsIn += requests;
+        }
+        for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1) // those below it in the tree
+            if (rank + bit < ranks) {
+                e.verdict.add(153);
+                e.consensus.add(28);
+            }
+        e.poolBytes += 64 << 10; // what is small, in blocks
+    }
+    return all;
+}
+
+// ---- what is counted
+
+struct Counted {
+    MessageCount fragments, finished, done, reductions, manifests, acks, credits, all, received;
+    std::int64_t poolBytes = 0;
+
+    static Counted of(const bench::Traffic& sent, const bench::Traffic& received)
+    {
+        Counted c;
+        c.fragments = sent.of({Kind::Fragment});
+        c.finished = sent.of({Kind::FinishedTiles});
+        c.done = sent.of({Kind::TilesDone});
+        c.reductions = sent.of({Kind::ReduceUp, Kind::ReduceDown});
+        c.manifests = sent.of({Kind::Manifest});
+        c.acks = sent.of({Kind::ManifestAck});
+        c.credits = sent.of({Kind::CreditRequest, Kind::Credit});
+        c.all = sent.all();
+        c.received = received.all();
+        return c;
+    }
+};
+
+struct Measured {
+    std::vector<Counted> first, last; // of each rank: a frame with new bricks, and one with the same again
+    std::vector<double> ms, cpuMs;
+    dfb::FrameReport report;
+};
+
+// The boxes of bricks are in pixels.
+struct PixelCamera {
+    dfb::Region project(const dfb::Box3& box, int, int) const
+    {
+        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
+                static_cast<int>(box.upper.y)};
+    }
+};
+
+Measured measure(const std::vector<bench::PartialImage>& images, int width, int height, int frames)
+{
+    const auto ranks = static_cast<int>(images.size());
+    const auto counters = std::make_shared<bench::Counters>(ranks);
+    Measured result;
+    result.first.resize(images.size());
+    result.last.resize(images.size());
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        const auto rank = static_cast<std::size_t>(communicator.rank());
+        const bench::PartialImage& image = images[rank];
+        const auto messenger = std::make_shared<dfb::Messenger<bench::CountedTransport>>(
+            bench::CountedTransport::Communicator{communicator, counters});
+        dfb::FrameBufferConfig config;
+        config.width = width;
+        config.height = height;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        FrameBuffer fb(messenger, config);
+        dfb::World world;
+        const auto& v = image.viewport;
+        world.add({static_cast<std::uint32_t>(rank),
+                   {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
+                    {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
+        const auto find = dfb::inPlace([&image](const dfb::Brick&, auto& view) {
+            const std::size_t first = image.indexOf(view.region.x0, view.region.y0);
+            view.stride = static_cast<std::size_t>(image.width);
+            view.color = &image.rgba[4 * first];
+            view.depth = &image.depth[first];
+        });
+        for (int frame = 0; frame < frames; ++frame) {
+            counters->meet();
+            counters->sent[rank].reset();
+            counters->received[rank].reset();
+            counters->meet();
+            const double start = bench::now(), cpu = bench::processCpuSeconds();
+            dfb::FrameParams params;
+            params.declarationKey = 1;
+            const dfb::FrameReport report = dfb::renderDataParallel(fb, world, PixelCamera(), find, params);
+            counters->meet();
+            if (rank == 0) {
+                result.report = report;
+                result.ms.push_back(1e3 * (bench::now() - start));
+                result.cpuMs.push_back(1e3 * (bench::processCpuSeconds() - cpu));
+            }
+            Counted& counted = (frame == 0 ? result.first : result.last)[rank];
+            counted = Counted::of(counters->sent[rank], counters->received[rank]);
+            counted.poolBytes = static_cast<std::int64_t>(messenger->pool()->peakBytes());
+        }
+        counters->meet();
+    });
+    return result;
+}
+
+// ---- the LogGP model, see bench/README.md
+
+// Times in us.
+struct Network {
+    std::string name;
+    double latency, overhead, gap, perByte;
+};
+
+// What a rank does in a phase that all go through.
+struct Work {
+    double out = 0, in = 0, outBytes = 0, inBytes = 0, cpu = 0;
+};
+
+// Until the slowest has sent and taken all.
+double phase(const Network& n, const Work& w)
+{
+    if (w.out + w.in == 0)
+        return w.cpu;
+    return n.latency
+           + std::max({n.overhead * (w.out + w.in) + w.cpu, n.gap * std::max(w.out, w.in),
+                       n.perByte * std::max(w.outBytes, w.inBytes)});
+}
+
+struct PixelCosts {
+    double dfbNs = 0, plainNs = 0; // of an active pixel of an input: all that is done with it, on both sides together
+};
+
+// In ms.
+double dfbMs(const Network& n, const std::vector<Expected>& ranks, const PixelCosts& costs)
+{
+    double inputs = 0;
+    Work display;
+    bool asksForCredit = false;
+    for (const Expected& e : ranks) {
+        const bool isDisplay = &e == &ranks.front();
+        Work w;
+        w.out = static_cast<double>(e.fragments.messages);
+        w.outBytes = static_cast<double>(e.fragments.bytes);
+        w.in = static_cast<double>(e.inMessages);
+        w.inBytes = static_cast<double>(e.inBytes);
+        Work& withCredit = isDisplay ? display : w; // which gives most of it to finished tiles
+        withCredit.out += static_cast<double>(e.mostCredits);
+        withCredit.in += static_cast<double>(e.mostCreditsIn);
+        asksForCredit = asksForCredit || e.asksForCredit;
+        // Half of it where it is encoded, half where it is blended.
+        w.cpu = 1e-3 * costs.dfbNs / 2 * static_cast<double>(e.activePixels + e.inPixels);
+        inputs = std::max(inputs, phase(n, w));
+        display.in += static_cast<double>(e.finished.messages + e.done.messages);
+        display.inBytes += static_cast<double>(e.finished.bytes + e.done.bytes);
+    }
+    const double hop = n.latency + 2 * n.overhead, levels = std::ceil(std::log2(static_cast<double>(ranks.size())));
+    return 1e-3 * (inputs + phase(n, display) + 2 * levels * hop + (asksForCredit ? 2 * hop : 0));
+}
+
+// Radix-k as in radix_k.hpp: rows are shared out, viewports are sent without their depth, as the order is known. The
+// image goes to rank 0 along a binomial tree.
+double radixMs(const Network& n, const std::vector<std::array<int, 4>>& viewports, const std::vector<int>& order,
+               int width, int height, int most, const PixelCosts& costs)
+{
+    using Box = std::array<double, 4>; // x0, y0, x1, y1
+    const std::size_t ranks = order.size();
+    std::vector<Box> boxes, slices(ranks, Box{0, 0, static_cast<double>(width), static_cast<double>(height)});
+    for (const int rank : order) {
+        const auto& v = viewports[static_cast<std::size_t>(rank)];
+        boxes.push_back({1.0 * v[0], 1.0 * v[1], 1.0 * v[0] + v[2], 1.0 * v[1] + v[3]});
+    }
+    const auto share = [](Box slice, double i, double k) {
+        const double rows = slice[3] - slice[1];
+        return Box{slice[0], slice[1] + rows * i / k, slice[2], slice[1] + rows * (i + 1) / k};
+    };
+    const auto pixelsOf = [](const Box& a, const Box& b) {
+        return std::max(0.0, std::min(a[2], b[2]) - std::max(a[0], b[0]))
+               * std::max(0.0, std::min(a[3], b[3]) - std::max(a[1], b[1]));
+    };
+    double us = 0;
+    for (std::size_t stride = 1; stride < ranks;) {
+        auto k = std::min(static_cast<std::size_t>(most), ranks / stride);
+        double slowest = 0;
+        std::vector<Box> next(slices);
+        for (std::size_t own = 0; own < ranks; ++own) {
+            const std::size_t me = own / stride % k, first = own - me * stride;
+            const Box mine = share(slices[own], static_cast<double>(me), static_cast<double>(k));
+            Work w;
+            for (std::size_t i = 0; i < k; ++i) {
+                const double in = pixelsOf(boxes[(first + i * stride) / stride], mine);
+                const double out =
+                    pixelsOf(boxes[own / stride], share(slices[own], static_cast<double>(i), static_cast<double>(k)));
+                w.cpu += 1e-3 * costs.plainNs / 2 * (in + out);
+                if (i == me)
+                    continue;
+                w.in += in > 0, w.inBytes += 16 * in;
+                w.out += out > 0, w.outBytes += 16 * out;
+            }
+            slowest = std::max(slowest, phase(n, w));
+            next[own] = mine;
+        }
+        us += slowest;
+        slices = std::move(next);
+        stride *= k;
+        std::vector<Box> joined; // what `stride` ranks next to each other have
+        for (std::size_t g = 0; g < boxes.size(); g += k) {
+            Box all = boxes[g];
+            for (std::size_t i = g + 1; i < g + k; ++i) {
+                if (boxes[i][2] <= boxes[i][0])
+                    continue;
+                all = {std::min(all[0], boxes[i][0]), std::min(all[1], boxes[i][1]), std::max(all[2], boxes[i][2]),
+                       std::max(all[3], boxes[i][3])};
+            }
+            joined.push_back(all);
+        }
+        boxes = std::move(joined);
+    }
+    const double levels = std::ceil(std::log2(static_cast<double>(ranks)));
+    us += levels * (n.latency + 2 * n.overhead) + n.perByte * bytesPerOutput * width * height;
+    return 1e-3 * us;
+}
+
+// ---- the program
+
+struct Options {
+    std::vector<int> ranks;
+    std::vector<std::array<int, 2>> sizes;
+    std::vector<std::string> scenes{"bricks", "discs"};
+    int frames = 3;
+    bool quick = false;
+    // As measured between 4 hosts as network namespaces of one machine, 1 Gbit/s, 50 us.
+    Network rig{"rig", 53, 14.4, 26, 8.5e-3};
+    // Those that the scripts of ATLAHS (github.com/spcl/atlahs) give to LogGOPSim for links of 200 Gbit/s.
+    Network hpc{"hpc", 3.7, 0.2, 0.005, 0.04e-3};
+    // CPU time of bench_compositing, 4 ranks, bricks, to 8 bit, by the pixels that are worked on: float32, and radix-k.
+    PixelCosts costs{13, 7};
+    std::string json, svg, table, commit;
+};
+
+class Bench {
+public:
+    explicit Bench(Options options) : o_(std::move(options)) {}
+
+    int run()
+    {
+        for (const std::string& scene : o_.scenes)
+            count(scene);
+        estimate();
+        if (!o_.json.empty())
+            bench::appendJson(o_.json, results_);
+        std::printf("\n%s\n", failures_ == 0 ? "All counts are those of the formulas."
+                                             : "SOME COUNTS ARE NOT THOSE OF THE FORMULAS.");
+        return failures_ == 0 ? 0 : 1;
+    }
+
+private:
+    int width() const { return o_.sizes.front()[0]; }
+    int height() const { return o_.sizes.front()[1]; }
+
+    template <class Get>
+    static std::pair<double, double> medianAndMost(std::size_t count, const Get& get)
+    {
+        std::vector<double> values;
+        for (std::size_t i = 0; i < count; ++i)
+            values.push_back(static_cast<double>(get(i)));
+        const double most = *std::max_element(values.begin(), values.end());
+        return {bench::medianOf(values), most};
+    }
+
+    void check(bool fine, int ranks, const std::string& what, std::int64_t measured, std::int64_t expected)
+    {
+        if (fine)
+            return;
+        ++failures_;
+        std::printf("NOT AS THE FORMULA SAYS: %d ranks, %s: %lld, expected %lld\n", ranks, what.c_str(),
+                    static_cast<long long>(measured), static_cast<long long>(expected));
+    }
+
+    void checkCounts(int ranks, const Counted& c, const Expected& e, bool isNew)
+    {
+        const auto same = [&](const char* what, const MessageCount& is, const MessageCount& should) {
+            check(is.messages == should.messages, ranks, std::string(what) + ", messages", is.messages,
+                  should.messages);
+            check(is.bytes == should.bytes, ranks, std::string(what) + ", bytes", is.bytes, should.bytes);
+        };
+        MessageCount reductions = e.verdict;
+        if (isNew)
+            reductions += e.consensus;
+        same("inputs", c.fragments, e.fragments);
+        same("finished tiles", c.finished, e.finished);
+        same("counts of finished tiles", c.done, e.done);
+        same("reductions", c.reductions, reductions);
+        same("manifests", c.manifests, isNew ? e.manifests : MessageCount());
+        same("their answers", c.acks, isNew ? e.acks : MessageCount());
+        check(c.credits.messages <= e.mostCredits, ranks, "credit, messages", c.credits.messages, e.mostCredits);
+        check(c.poolBytes <= e.poolBytes, ranks, "bytes of the pool", c.poolBytes, e.poolBytes);
+    }
+
+    void count(const std::string& sceneName)
+    {
+        bench::Table sent({"ranks", "tiles", "active pixels", "messages", "most", "kB", "most", "off the formulas [%]",
+                           "credit, all ranks", "at most", "new bricks: messages", "most", "memory [MB]", "most",
+                           "rank 0 takes", "ms"});
+        for (const int ranks : o_.ranks) {
+            const auto scene = sceneOf(sceneName, ranks, width(), height());
+            const dfb::TileLayout layout(width(), height(), tileSize);
+            std::vector<bench::PartialImage> images(static_cast<std::size_t>(ranks));
+            std::vector<std::vector<Input>> inputs;
+            for (int rank = 0; rank < ranks; ++rank) {
+                bench::PartialImage& image = images[static_cast<std::size_t>(rank)];
+                scene->renderPart(rank, tileSize, image);
+                inputs.push_back(inputsOf(image, layout));
+            }
+            const std::vector<Expected> expected =
+                expectedOf(inputs, layout, dfb::FrameBufferConfig().messagePoolBytes);
+            const Measured m = measure(images, width(), height(), std::max(2, o_.frames));
+            MessageCount all, formula, credits;
+            std::int64_t mostCredits = 0;
+            for (std::size_t r = 0; r < images.size(); ++r) {
+                checkCounts(ranks, m.first[r], expected[r], true);
+                checkCounts(ranks, m.last[r], expected[r], false);
+                all += m.last[r].all;
+                credits += m.last[r].credits;
+                formula += expected[r].everyFrame();
+                mostCredits += expected[r].mostCredits;
+            }
+            // The report of a frame has what was sent before each rank entered the verdict: not the messages of that.
+            const std::int64_t unreported = all.messages - 2 * (ranks - 1) - m.report.messagesSent;
+            check(unreported >= 0 && unreported <= credits.messages, ranks, "messages that no report has", unreported,
+                  0);
+            const auto text = [](double v) { return bench::text(v); };
+            const auto whole = [](double v) { return std::to_string(static_cast<std::int64_t>(v)); };
+            const std::size_t n = images.size();
+            const auto tiles = medianAndMost(n, [&](std::size_t r) { return expected[r].tiles; });
+            const auto pixels = medianAndMost(n, [&](std::size_t r) { return expected[r].activePixels; });
+            const auto messages = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.messages; });
+            const auto bytes = medianAndMost(n, [&](std::size_t r) { return m.last[r].all.bytes; });
+            const auto fresh = medianAndMost(n, [&](std::size_t r) { return m.first[r].all.messages; });
+            const auto memory = medianAndMost(n, [&](std::size_t r) { return m.last[r].poolBytes; });
+            const double off =
+                100.0 * static_cast<double>(all.bytes - formula.bytes) / static_cast<double>(formula.bytes);
+            sent.add({std::to_string(ranks), whole(tiles.first), whole(pixels.first), whole(messages.first),
+                      whole(messages.second), text(bytes.first / 1e3), text(bytes.second / 1e3), text(off),
+                      std::to_string(credits.messages), std::to_string(mostCredits), whole(fresh.first),
+                      whole(fresh.second), text(memory.first / 1e6), text(memory.second / 1e6),
+                      std::to_string(m.last[0].received.messages), text(bench::figureOf(m.ms).median)});
+            std::fprintf(stderr, "%s, %d ranks: %.1f ms a frame\n", sceneName.c_str(), ranks,
+                         bench::figureOf(m.ms).median);
+            bench::Result r;
+            r.bench = "scaling";
+            r.system = "dfb";
+            r.config = "counted, a frame";
+            r.scene = sceneName;
+            r.ranks = ranks;
+            r.width = width(), r.height = height();
+            r.ms = bench::figureOf(m.ms);
+            r.cpuMs = bench::figureOf(m.cpuMs);
+            r.bytes = static_cast<double>(all.bytes);
+            r.messages = static_cast<double>(all.messages);
+            r.peakMemoryBytes = memory.second;
+            r.commit = o_.commit;
+            char more[512];
+            std::snprintf(more, sizeof more,
+                          R"(, "tiles_median": %.0f, "active_pixels_median": %.0f, "messages_median": %.0f, )"
+                          R"("messages_max": %.0f, "bytes_median": %.0f, "bytes_max": %.0f, "formula_bytes": %lld, )"
+                          R"("credit_messages": %lld, "peak_memory_median": %.0f, "display_messages_in": %lld)",
+                          tiles.first, pixels.first, messages.first, messages.second, bytes.first, bytes.second,
+                          static_cast<long long>(formula.bytes), static_cast<long long>(credits.messages), memory.first,
+                          static_cast<long long>(m.last[0].received.messages));
+            r.more = more;
+            results_.push_back(std::move(r));
+        }
+        const std::string title = sceneName + ", " + std::to_string(width()) + 'x' + std::to_string(height())
+                                  + ": what a rank sends in a frame; the median of the ranks, and the rank with most";
+        print(sent, title);
+    }
+
+    void estimate()
+    {
+        const std::vector<std::string> systems{"dfb", "binary swap", "radix-4", "radix-8"};
+        std::vector<bench::PlotLine> lines;
+        std::vector<bench::Table> tables;
+        const std::vector<Network> networks{o_.rig, o_.hpc};
+        for (const Network& network : networks) {
+            tables.emplace_back(std::vector<std::string>{"ranks", "dfb [ms]", "binary swap", "radix-4", "radix-8"});
+            for (std::size_t i = 0; i < systems.size(); ++i)
+                lines.push_back({systems[i] + ", " + network.name, {}, i, network.name == "rig"});
+        }
+        const dfb::TileLayout layout(width(), height(), tileSize);
+        for (int ranks = 2; ranks <= (o_.quick ? 1024 : 16384); ranks *= 2) {
+            const auto scene = sceneOf("bricks", ranks, width(), height());
+            std::vector<std::vector<Input>> inputs;
+            std::vector<std::array<int, 4>> viewports;
+            bench::PartialImage image;
+            for (int rank = 0; rank < ranks; ++rank) {
+                scene->renderPart(rank, tileSize, image);
+                inputs.push_back(inputsOf(image, layout));
+                viewports.push_back(image.viewport);
+            }
+            const std::vector<Expected> expected =
+                expectedOf(inputs, layout, dfb::FrameBufferConfig().messagePoolBytes);
+            for (std::size_t n = 0; n < networks.size(); ++n) {
+                std::vector<double> ms{dfbMs(networks[n], expected, o_.costs)};
+                for (const int most : {2, 4, 8})
+                    ms.push_back(radixMs(networks[n], viewports, scene->order(), width(), height(), most, o_.costs));
+                std::vector<std::string> row{std::to_string(ranks)};
+                for (std::size_t s = 0; s < systems.size(); ++s) {
+                    row.push_back(bench::text(ms[s]));
+                    lines[n * systems.size() + s].points.emplace_back(ranks, ms[s]);
+                    bench::Result r;
+                    r.bench = "scaling";
+                    r.system = systems[s];
+                    r.config = "LogGP, " + networks[n].name;
+                    r.scene = "bricks";
+                    r.ranks = ranks;
+                    r.width = width(), r.height = height();
+                    r.ms.median = ms[s];
+                    r.commit = o_.commit;
+                    results_.push_back(std::move(r));
+                }
+                tables[n].add(std::move(row));
+            }
+        }
+        for (std::size_t n = 0; n < networks.size(); ++n) {
+            char title[256];
+            std::snprintf(
+                title, sizeof title,
+                "LogGP, %s: L %g us, o %g us, g %g us, G %g ns a byte; %.2f and %.2f ns a pixel; bricks, %dx%d",
+                networks[n].name.c_str(), networks[n].latency, networks[n].overhead, networks[n].gap,
+                1e3 * networks[n].perByte, o_.costs.dfbNs, o_.costs.plainNs, width(), height());
+            print(tables[n], title);
+        }
+        if (!o_.svg.empty())
+            bench::writePlot(o_.svg, "A frame in the LogGP model, bricks", "ranks", "ms", lines, true);
+    }
+
+    void print(const bench::Table& table, const std::string& title) const
+    {
+        table.print(title);
+        if (!o_.table.empty())
+            table.appendTo(o_.table, title);
+    }
+
+    Options o_;
+    int failures_ = 0;
+    std::vector<bench::Result> results_;
+};
+
+// "L,o,g,G"
+std::function<bool(const std::string&)> readNetwork(Network& n)
+{
+    return [&n](const std::string& value) {
+        double nsPerByte = 0;
+        if (std::sscanf(value.c_str(), "%lf,%lf,%lf,%lf", &n.latency, &n.overhead, &n.gap, &nsPerByte) != 4)
+            return false;
+        n.perByte = 1e-3 * nsPerByte;
+        return true;
+    };
+}
+
+Options optionsOf(int argc, char** argv)
+{
+    Options o;
+    const auto readRanks = [&](const std::string& value) {
+        o.ranks.clear();
+        for (const std::string& part : bench::partsOf(value, ','))
+            o.ranks.push_back(std::atoi(part.c_str()));
+        return !o.ranks.empty()
+               && std::all_of(o.ranks.begin(), o.ranks.end(), [](int n) { return n >= 2 && n <= 4096; });
+    };
+    const auto readScenes = [&](const std::string& value) {
+        o.scenes = bench::partsOf(value, ',');
+        return std::all_of(o.scenes.begin(), o.scenes.end(),
+                           [](const std::string& name) { return name == "bricks" || name == "discs"; });
+    };
+    const auto readSize = [&](const std::string& value) {
+        return bench::readSizes(o.sizes)(value) && o.sizes.size() == 1 && o.sizes[0][0] % tileSize == 0
+               && o.sizes[0][1] % tileSize == 0; // so that all tiles are as large
+    };
+    bench::readOptions(
+        argc, argv,
+        "usage: bench_scaling [--ranks 2,4,...] [--size WxH, multiples of 64] [--scenes bricks,discs] [--frames N] "
+        "[--quick] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] "
+        "[--commit ID]",
+        {{"--ranks", readRanks},
+         {"--size", readSize},
+         {"--scenes", readScenes},
+         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--rig", readNetwork(o.rig)},
+         {"--hpc", readNetwork(o.hpc)},
+         {"--pixel-ns",
+          [&o](const std::string& value) {
+              return std::sscanf(value.c_str(), "%lf,%lf", &o.costs.dfbNs, &o.costs.plainNs) == 2;
+          }},
+         {"--json", bench::readText(o.json)},
+         {"--svg", bench::readText(o.svg)},
+         {"--table", bench::readText(o.table)},
+         {"--commit", bench::readText(o.commit)}},
+        {{"--quick", &o.quick}});
+    if (o.ranks.empty())
+        o.ranks =
+            o.quick ? std::vector<int>{2, 8, 64, 256} : std::vector<int>{2, 4, 8, 16, 32, 64, 128, 256, 512, 1024};
+    if (o.sizes.empty())
+        o.sizes = {o.quick ? std::array<int, 2>{1024, 1024} : std::array<int, 2>{2048, 2048}};
+    return o;
+}
+
+} // namespace
+
+int main(int argc, char** argv) { return Bench(optionsOf(argc, argv)).run(); }

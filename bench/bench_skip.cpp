@@ -1,0 +1,599 @@
+// What a frame does not do: what it costs as less of the image is active, and which work is left out altogether. Each
+// claim is a line: what was measured, its limit, and whether it holds. 4 ranks are threads of this process; no MPI.
+//   bench_skip [--size 1024x1024] [--frames 11] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
+//   bench_skip --frames-of full|empty [--frames N] [--size ...]     N frames of that and nothing else, for profilers
+// The exit status is 1 if a claim of counts does not hold. Times are shown, as a machine may have other work.
+#include "counted_transport.hpp"
+#include "options.hpp"
+#include "plot.hpp"
+#include "results.hpp"
+
+#include <dfb/distributed_framebuffer.hpp>
+#include <dfb/ops/progressive.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/render/data_parallel.hpp>
+#include <dfb/render/sampling.hpp>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cmath>
+#include <cstdio>
+#include <cstdlib>
+#include <functional>
+#include <limits>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace {
+
+using bench::Figure;
+using bench::Kind;
+using bench::MessageCount;
+
+constexpr int ranks = 4;
+
+// ---- the images: all ranks have the same pixels, a square in the middle, at depths of their own
+
+class Picture {
+public:
+    // `share`: of the image's pixels that are active.
+    Picture(int width, int height, double share, float alpha = 0.25f) : width_(width)
+    {
+        const double side = std::sqrt(share);
+        const auto columns = static_cast<int>(std::lround(width * side)),
+                   rows = static_cast<int>(std::lround(height * side));
+        region_.x0 = (width - columns) / 2, region_.x1 = region_.x0 + columns;
+        region_.y0 = (height - rows) / 2, region_.y1 = region_.y0 + rows;
+        const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
+        rgba_.assign(4 * pixels, 0.0f);
+        for (int y = region_.y0; y < region_.y1; ++y)
+            for (int x = region_.x0; x < region_.x1; ++x) {
+                float* const rgba = &rgba_[4 * indexOf(x, y)];
+                rgba[0] = 0.03f * static_cast<float>((x + 3 * y) % 7); // not constant
+                rgba[1] = rgba[2] = rgba[3] = alpha;
+            }
+        for (int rank = 0; rank < ranks; ++rank)
+            depths_.emplace_back(pixels, static_cast<float>(rank));
+    }
+
+    const dfb::Region& region() const { return region_; }
+    double activePixels() const { return static_cast<double>(region_.width()) * region_.height(); }
+
+    // `zeros`: for channels beside colour and depth, as many as the image has pixels, times 3.
+    template <class View>
+    void show(int rank, View& view, const std::vector<float>& zeros) const
+    {
+        const std::size_t first = indexOf(view.region.x0, view.region.y0);
+        view.stride = static_cast<std::size_t>(width_);
+        view.color = &rgba_[4 * first];
+        view.depth = &depths_[static_cast<std::size_t>(rank)][first];
+        if (!zeros.empty())
+            view.normal = view.albedo = zeros.data();
+    }
+
+private:
+    std::size_t indexOf(int x, int y) const
+    {
+        return static_cast<std::size_t>(y) * static_cast<std::size_t>(width_) + static_cast<std::size_t>(x);
+    }
+
+    int width_;
+    dfb::Region region_;
+    std::vector<float> rgba_;
+    std::vector<std::vector<float>> depths_; // of each rank
+};
+
+// The boxes of bricks are in pixels. Counts how often it is asked.
+struct CountingCamera {
+    std::atomic<std::int64_t>* asked;
+
+    dfb::Region project(const dfb::Box3& box, int, int) const
+    {
+        ++*asked;
+        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
+                static_cast<int>(box.upper.y)};
+    }
+};
+
+dfb::World worldOf(int rank, const dfb::Region& region)
+{
+    dfb::World world;
+    if (!region.empty())
+        world.add({static_cast<std::uint32_t>(rank),
+                   {{static_cast<float>(region.x0), static_cast<float>(region.y0), 0},
+                    {static_cast<float>(region.x1), static_cast<float>(region.y1), 1}}});
+    return world;
+}
+
+// ---- frames
+
+// Of all ranks.
+struct FrameCost {
+    MessageCount all, inputs, manifests;
+    Figure ms;
+    std::int64_t firstAsked = 0, asked = 0; // of the camera, in the first frame and in the last
+};
+
+struct Settings {
+    int width = 0, height = 0, frames = 0;
+    bool knowsBounds = true; // a renderer knows where it has pixels; else it has a look at every tile
+    dfb::ChannelMask aux = 0;
+};
+
+MessageCount countOf(const bench::Counters& counters, std::initializer_list<Kind> kinds)
+{
+    MessageCount sum;
+    for (const bench::Traffic& traffic : counters.sent)
+        sum += traffic.of(kinds);
+    return sum;
+}
+
+void reset(bench::Counters& counters)
+{
+    for (bench::Traffic& traffic : counters.sent)
+        traffic.reset();
+}
+
+// The same picture in each frame, which is said to the framebuffer.
+template <class TileOp>
+FrameCost framesOf(const Picture& picture, const Settings& s)
+{
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, bench::CountedTransport>;
+    const auto counters = std::make_shared<bench::Counters>(ranks);
+    std::atomic<std::int64_t> asked{0};
+    std::vector<double> ms;
+    const std::vector<float> zeros(
+        s.aux != 0 ? 3 * static_cast<std::size_t>(s.width) * static_cast<std::size_t>(s.height) : 0, 0.0f);
+    FrameCost cost;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        const int rank = communicator.rank();
+        dfb::FrameBufferConfig config;
+        config.width = s.width;
+        config.height = s.height;
+        config.aux = s.aux;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
+        const dfb::World world = worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
+        const auto find = dfb::inPlace([&](const dfb::Brick&, auto& view) { picture.show(rank, view, zeros); });
+        for (int frame = 0; frame < s.frames; ++frame) {
+            counters->meet();
+            if (rank == 0) {
+                reset(*counters);
+                if (frame == 1)
+                    cost.firstAsked = asked;
+                asked = 0;
+            }
+            counters->meet();
+            const double start = bench::now();
+            dfb::FrameParams params;
+            params.maxLayers = ranks;
+            if constexpr (TileOp::rule == dfb::BlendRule::InOrder) {
+                // As a list, front to back.
+                auto open = fb.begin(params);
+                const dfb::Region tiles = fb.layout().tilesIn(picture.region());
+                typename FrameBuffer::TileView view;
+                for (int tile = 0; tile < fb.layout().tileCount(); ++tile) {
+                    const int column = fb.layout().column(tile), row = fb.layout().row(tile);
+                    const bool isMine = tiles.contains(column, row);
+                    if (!isMine && fb.tileOwner(tile) != rank)
+                        continue;
+                    open.start(view, tile);
+                    if (isMine) {
+                        view.generation = rank;
+                        view.children = rank + 1 < ranks ? 1 : 0;
+                        picture.show(rank, view, zeros);
+                    }
+                    open.setTile(view);
+                }
+                open.end();
+            } else {
+                params.declarationKey = 1;
+                dfb::renderDataParallel(fb, world, CountingCamera{&asked}, find, params);
+            }
+            const double end = bench::now();
+            counters->meet();
+            if (rank != 0)
+                continue;
+            if (frame > 0)
+                ms.push_back(1e3 * (end - start));
+            for (const bench::Traffic& traffic : counters->sent)
+                cost.all += frame + 1 == s.frames ? traffic.all() : MessageCount();
+        }
+    });
+    cost.inputs = countOf(*counters, {Kind::Fragment});
+    cost.manifests = countOf(*counters, {Kind::Manifest, Kind::ManifestAck});
+    cost.ms = bench::figureOf(ms);
+    cost.asked = asked;
+    return cost;
+}
+
+// ---- what is behind something opaque
+
+// The CPU time in us of blending 16 inputs of a tile.
+double blendUs(float frontAlpha, float minTransmittance)
+{
+    constexpr int side = dfb::AlphaBlend::tileSize, layers = 16;
+    using Tile = dfb::Tile<dfb::colorChannel | dfb::depthChannel, side>;
+    const auto pool = dfb::MemoryPool::create();
+    const dfb::TileLayout layout(side, side, side);
+    const dfb::detail::WireCoder coder;
+    const auto tile = std::make_unique<Tile>();
+    tile->frame = tile->tile = 0;
+    tile->region = {0, 0, side, side};
+    std::vector<float> out(4 * side * side);
+    dfb::detail::Planes planes;
+    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(out.data());
+    dfb::TileInfo info;
+    info.region = tile->region;
+    info.minTransmittance = minTransmittance;
+    dfb::AlphaBlend op;
+    std::vector<double> us;
+    for (int repetition = 0; repetition < 201; ++repetition) {
+        op.newFrame(info);
+        for (int layer = 0; layer < layers; ++layer) {
+            const float alpha = layer == 0 ? frontAlpha : 0.2f;
+            for (int i = 0; i < side * side; ++i) {
+                const float red = alpha * 0.1f * static_cast<float>(i % 7);
+                const float rgba[4] = {red, 0, alpha, alpha};
+                std::copy_n(rgba, 4, tile->color + 4 * i);
+                tile->depth[i] = static_cast<float>(layer);
+            }
+            tile->source = static_cast<std::uint32_t>(layer);
+            dfb::detail::InputFaults faults;
+            op.add(dfb::detail::decodeFragment(
+                *pool,
+                dfb::detail::encodeFragment(*pool, *tile, Tile::channels, 0, nullptr, coder, dfb::WireFormat::Float32,
+                                            faults),
+                layout, [](int) { return 1; }, nullptr, coder));
+        }
+        dfb::FinishedTile finished(info.region, dfb::OutputFormat::RGBA32F, planes, side);
+        const double start = bench::threadCpuSeconds();
+        op.finish(finished);
+        us.push_back(1e6 * (bench::threadCpuSeconds() - start));
+    }
+    return bench::figureOf(us).median;
+}
+
+// ---- tiles that have converged
+
+struct Sampling {
+    int frames = 0;                         // until all tiles had converged
+    std::int64_t tiles = 0, stillNoisy = 0; // in all; those that got samples in the frame that was looked at
+    std::int64_t convergedRenders = 0;      // renderer's calls for others in that frame
+    std::int64_t renders = 0;
+    MessageCount inputs;             // in that frame
+    MessageCount last, lastOfPixels; // in a frame after all had converged: all, and inputs and finished tiles
+    std::int64_t lastRenders = 0;
+};
+
+// Only the left half of the image has noise. The second frame is looked at, and one when there is nothing to do.
+Sampling sample(int width, int height)
+{
+    using TileOp = dfb::Progressive<dfb::AlphaBlend>;
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, bench::CountedTransport>;
+    const auto counters = std::make_shared<bench::Counters>(ranks);
+    std::atomic<std::int64_t> renders{0}, convergedRenders{0}, asked{0};
+    Sampling result;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config;
+        config.width = width;
+        config.height = height;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
+        const dfb::World world = worldOf(fb.rank(), {0, 0, width, height});
+        dfb::AdaptiveSampler sampler(fb.layout(), {0.02, 4, 256, 64});
+        dfb::SamplePlan plan;
+        const auto render = [&](const dfb::Brick& brick, auto& tile) {
+            ++renders;
+            convergedRenders += (*plan)[static_cast<std::size_t>(tile.tile)].count == 0;
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                const unsigned mixed =
+                    (static_cast<unsigned>(x * 7919 + y * 104729 + tile.sample * 31) * 2654435761u) >> 16;
+                const float noise = x < width / 2 ? static_cast<float>(mixed % 256) / 255 : 0.5f;
+                rgba[0] = 0.2f * noise;
+                rgba[3] = 0.2f;
+                depth = static_cast<float>(brick.id);
+            });
+        };
+        const auto frame = [&] {
+            counters->meet();
+            if (fb.rank() == 0) {
+                reset(*counters);
+                renders = convergedRenders = 0;
+            }
+            counters->meet();
+            dfb::FrameParams params = sampler.next();
+            params.declarationKey = 1;
+            plan = params.samples;
+            sampler.update(dfb::renderDataParallel(fb, world, CountingCamera{&asked}, render, params));
+            counters->meet();
+        };
+        int frames = 0;
+        for (; !sampler.done(); ++frames) {
+            frame();
+            if (frames != 1 || fb.rank() != 0)
+                continue;
+            result.tiles = fb.layout().tileCount();
+            result.stillNoisy = std::count_if(plan->begin(), plan->end(), [](const auto& t) { return t.count > 0; });
+            result.renders = renders;
+            result.convergedRenders = convergedRenders;
+            result.inputs = countOf(*counters, {Kind::Fragment});
+        }
+        frame();
+        if (fb.rank() == 0) {
+            result.frames = frames;
+            for (const bench::Traffic& traffic : counters->sent)
+                result.last += traffic.all();
+            result.lastOfPixels = countOf(*counters, {Kind::Fragment, Kind::FinishedTiles});
+            result.lastRenders = renders;
+        }
+        counters->meet();
+    });
+    return result;
+}
+
+// ---- the program
+
+struct Options {
+    std::vector<std::array<int, 2>> sizes{{1024, 1024}};
+    int frames = 0;
+    bool quick = false;
+    std::string framesOf, json, svg, table, commit;
+};
+
+std::string text(const char* form, double value)
+{
+    char out[64];
+    std::snprintf(out, sizeof out, form, value);
+    return out;
+}
+
+class Bench {
+public:
+    explicit Bench(Options options) : o_(std::move(options)) {}
+
+    int run()
+    {
+        measureShares();
+        measureDeclarations();
+        measureChannels();
+        measureOpaque();
+        measureConverged();
+        const std::string title = "Claims, " + sizeText();
+        claims_.print(title);
+        if (!o_.table.empty())
+            claims_.appendTo(o_.table, title);
+        if (!o_.json.empty())
+            bench::appendJson(o_.json, results_);
+        std::printf("\n%s\n", failures_ == 0 ? "All claims hold that are counted." : "SOME CLAIMS DO NOT HOLD.");
+        return failures_ == 0 ? 0 : 1;
+    }
+
+private:
+    int width() const { return o_.sizes.front()[0]; }
+    int height() const { return o_.sizes.front()[1]; }
+    std::string sizeText() const { return std::to_string(width()) + 'x' + std::to_string(height()); }
+    Settings settings() const
+    {
+        Settings s;
+        s.width = width(), s.height = height(), s.frames = o_.frames;
+        return s;
+    }
+
+    enum class Sort { Counted, Shown };
+    void claim(const std::string& what, double measured, const char* form, double limit, Sort sort = Sort::Counted)
+    {
+        const bool holds = measured <= limit;
+        failures_ += !holds && sort == Sort::Counted;
+        claims_.add({what, text(form, measured), text(form, limit),
+                     std::string(holds ? "yes" : "NO") + (sort == Sort::Shown ? " (shown)" : "")});
+    }
+
+    void keep(const std::string& config, const FrameCost& cost, const std::string& more)
+    {
+        bench::Result r;
+        r.bench = "skip";
+        r.system = "dfb";
+        r.config = config;
+        r.scene = "square";
+        r.ranks = ranks;
+        r.width = width(), r.height = height();
+        r.ms = cost.ms;
+        r.bytes = static_cast<double>(cost.all.bytes);
+        r.messages = static_cast<double>(cost.all.messages);
+        r.commit = o_.commit;
+        r.more = more;
+        results_.push_back(std::move(r));
+    }
+
+    void measureShares()
+    {
+        bench::Table table({"active [%]", "ms", "bytes", "messages", "bytes, of full [%]", "messages", "time"});
+        std::vector<double> pixels, bytes;
+        bench::PlotLine bytesLine{"bytes", {}, 0}, timeLine{"time", {}, 1};
+        FrameCost full;
+        for (const double percent : {100.0, 50.0, 25.0, 10.0, 1.0, 0.0}) {
+            const Picture picture(width(), height(), percent / 100);
+            const FrameCost cost = framesOf<dfb::AlphaBlend>(picture, settings());
+            if (percent == 100)
+                full = cost;
+            pixels.push_back(picture.activePixels());
+            bytes.push_back(static_cast<double>(cost.all.bytes));
+            bytesLine.points.emplace_back(percent, ofFull(cost.all.bytes, full.all.bytes));
+            timeLine.points.emplace_back(percent, 100 * cost.ms.median / full.ms.median);
+            addRow(table, text("%g", percent), cost, full);
+            keep(text("%g %% active", percent), cost, text(R"(, "active_share": %g)", percent / 100));
+            if (percent > 0)
+                continue;
+            Settings blind = settings();
+            blind.knowsBounds = false;
+            const FrameCost found = framesOf<dfb::AlphaBlend>(picture, blind);
+            addRow(table, "0, found out tile by tile", found, full);
+            keep("0 % active, found out", found, R"(, "active_share": 0)");
+            claim("an empty frame: bytes, % of a full one", ofFull(cost.all.bytes, full.all.bytes), "%.3f", 3);
+            claim("its messages, %", ofFull(cost.all.messages, full.all.messages), "%.2f", 3);
+            claim("its time, %", 100 * cost.ms.median / full.ms.median, "%.1f", 3, Sort::Shown);
+            claim("an empty frame that is found out tile by tile: bytes, %", ofFull(found.all.bytes, full.all.bytes),
+                  "%.2f", 3);
+        }
+        const std::string title =
+            "A frame as less of it is active, " + sizeText() + ", 4 ranks of which each has it all";
+        table.print(title);
+        if (!o_.table.empty())
+            table.appendTo(o_.table, title);
+        if (!o_.svg.empty())
+            bench::writePlot(o_.svg, "A frame as less of it is active, " + sizeText() + ", 4 ranks",
+                             "active pixels [% of the image]", "% of a full frame", {bytesLine, timeLine}, false);
+        claim("bytes off a line through the active pixels, % of a full frame", offLine(pixels, bytes), "%.2f", 1);
+    }
+
+    static double ofFull(std::int64_t part, std::int64_t full)
+    {
+        return 100.0 * static_cast<double>(part) / static_cast<double>(full);
+    }
+
+    static void addRow(bench::Table& table, const std::string& name, const FrameCost& cost, const FrameCost& full)
+    {
+        table.add({name, bench::text(cost.ms), std::to_string(cost.all.bytes), std::to_string(cost.all.messages),
+                   text("%.3f", ofFull(cost.all.bytes, full.all.bytes)),
+                   text("%.2f", ofFull(cost.all.messages, full.all.messages)),
+                   text("%.1f", 100 * cost.ms.median / full.ms.median)});
+    }
+
+    // The most that a value is off the line of least squares, in % of the largest value.
+    static double offLine(const std::vector<double>& x, const std::vector<double>& y)
+    {
+        const auto n = static_cast<double>(x.size());
+        double sx = 0, sy = 0, sxx = 0, sxy = 0, most = 0;
+        for (std::size_t i = 0; i < x.size(); ++i)
+            sx += x[i], sy += y[i], sxx += x[i] * x[i], sxy += x[i] * y[i];
+        const double slope = (n * sxy - sx * sy) / (n * sxx - sx * sx), base = (sy - slope * sx) / n;
+        for (std::size_t i = 0; i < x.size(); ++i)
+            most = std::max(most, std::abs(y[i] - base - slope * x[i]));
+        return 100 * most / *std::max_element(y.begin(), y.end());
+    }
+
+    void measureDeclarations()
+    {
+        Settings s = settings();
+        s.frames = 2;
+        const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(width(), height(), 0.25), s);
+        claim("projections of bricks in a second frame with the same declarationKey (the first: "
+                  + std::to_string(cost.firstAsked) + ")",
+              static_cast<double>(cost.asked), "%.0f", 0);
+        claim("manifests and answers in it", static_cast<double>(cost.manifests.messages), "%.0f", 0);
+    }
+
+    void measureChannels()
+    {
+        const double share = 0.25;
+        const Picture picture(width(), height(), share);
+        Settings s = settings();
+        s.frames = 2;
+        constexpr dfb::ChannelMask more = dfb::normalChannel | dfb::albedoChannel;
+        const FrameCost sorted = framesOf<dfb::AlphaBlend>(picture, s);
+        const FrameCost ordered = framesOf<dfb::OrderedBlend>(picture, s);
+        using WithAux = dfb::BasicAlphaBlend<64, dfb::colorChannel | dfb::depthChannel | more>;
+        const FrameCost unasked = framesOf<WithAux>(picture, s);
+        s.aux = more;
+        const FrameCost asked = framesOf<WithAux>(picture, s);
+        // Where all ranks have the same tiles, each sends those of the three others.
+        const double travelling = (sorted.inputs.bytes - ordered.inputs.bytes) / 4.0;
+        const auto perPixel = [&](const FrameCost& cost) {
+            return static_cast<double>(cost.inputs.bytes - sorted.inputs.bytes) / travelling;
+        };
+        claim("bytes of a pixel that an image without auxiliary channels adds, whose operation has them",
+              perPixel(unasked), "%.3f", 0);
+        claim("with normals and albedo asked for", perPixel(asked), "%.3f", 24);
+        const double pixels = (ranks - 1) * picture.activePixels();
+        claim("depth where the order is known: bytes of inputs beyond 16 a pixel, %",
+              100 * (static_cast<double>(ordered.inputs.bytes) / (16 * pixels) - 1), "%.2f", 1);
+        claim("all other operations: bytes of inputs beyond 20 a pixel, %",
+              100 * (static_cast<double>(sorted.inputs.bytes) / (20 * pixels) - 1), "%.2f", 1);
+        keep("25 % active, in order", ordered, "");
+        keep("25 % active, normals and albedo", asked, "");
+    }
+
+    void measureOpaque()
+    {
+        const double all = blendUs(0.2f, 0), hidden = blendUs(1.0f, 0), nearly = blendUs(0.9999f, 1e-3f);
+        claim("16 inputs of a tile, the front one opaque: time of blending, % of that of translucent ones",
+              100 * hidden / all, "%.1f", 50, Sort::Shown);
+        claim("the front one opaque but for 1e-4, minTransmittance 1e-3", 100 * nearly / all, "%.1f", 50, Sort::Shown);
+        // Who is behind does not know of it.
+        Settings s = settings();
+        s.frames = 2;
+        const FrameCost translucent = framesOf<dfb::OrderedBlend>(Picture(width(), height(), 0.25), s);
+        const FrameCost opaque = framesOf<dfb::OrderedBlend>(Picture(width(), height(), 0.25, 1), s);
+        claim("4 ranks with the same pixels in order, the front one's opaque: bytes of inputs, % of translucent ones'",
+              ofFull(opaque.inputs.bytes, translucent.inputs.bytes), "%.1f", 25, Sort::Shown);
+    }
+
+    void measureConverged()
+    {
+        const Sampling s = sample(512, 512);
+        claim("adaptive, second frame: calls of the renderer for tiles that have converged ("
+                  + std::to_string(s.tiles - s.stillNoisy) + " of " + std::to_string(s.tiles) + ", calls for others "
+                  + std::to_string(s.renders) + ")",
+              static_cast<double>(s.convergedRenders), "%.0f", 0);
+        claim("inputs beyond those of the other tiles",
+              std::max(0.0,
+                       static_cast<double>(s.inputs.messages) - static_cast<double>(s.renders) * (ranks - 1) / ranks),
+              "%.0f", 0);
+        claim("all converged after " + std::to_string(s.frames) + " frames: calls of the renderer",
+              static_cast<double>(s.lastRenders), "%.0f", 0);
+        claim("inputs and finished tiles, messages", static_cast<double>(s.lastOfPixels.messages), "%.0f", 0);
+        // The verdict up and down, and that there are no finished tiles.
+        claim("all messages: those that end the frame", static_cast<double>(s.last.messages), "%.0f", 3 * (ranks - 1));
+    }
+
+    Options o_;
+    int failures_ = 0;
+    bench::Table claims_{{"claim", "measured", "at most", "holds"}};
+    std::vector<bench::Result> results_;
+};
+
+Options optionsOf(int argc, char** argv)
+{
+    Options o;
+    const auto readSize = [&](const std::string& value) {
+        return bench::readSizes(o.sizes)(value) && o.sizes.size() == 1;
+    };
+    const auto readContent = [&](const std::string& value) {
+        o.framesOf = value;
+        return value == "full" || value == "empty";
+    };
+    bench::readOptions(
+        argc, argv,
+        "usage: bench_skip [--size WxH] [--frames N] [--quick] [--frames-of full|empty] [--json FILE] [--svg FILE] "
+        "[--table FILE] [--commit ID]",
+        {{"--size", readSize},
+         {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
+         {"--frames-of", readContent},
+         {"--json", bench::readText(o.json)},
+         {"--svg", bench::readText(o.svg)},
+         {"--table", bench::readText(o.table)},
+         {"--commit", bench::readText(o.commit)}},
+        {{"--quick", &o.quick}});
+    if (o.frames == 0)
+        o.frames = o.quick ? 4 : 12;
+    return o;
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    const Options o = optionsOf(argc, argv);
+    if (o.framesOf.empty())
+        return Bench(o).run();
+    Settings s;
+    s.width = o.sizes.front()[0], s.height = o.sizes.front()[1], s.frames = o.frames;
+    const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(s.width, s.height, o.framesOf == "full" ? 1 : 0), s);
+    std::printf("%d frames, %s: the last sent %lld bytes in %lld messages\n", o.frames, o.framesOf.c_str(),
+                static_cast<long long>(cost.all.bytes), static_cast<long long>(cost.all.messages));
+    return 0;
+}

@@ -1,0 +1,103 @@
+// A picture of some lines over a common axis, as SVG.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdio>
+#include <fstream>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace bench {
+
+struct PlotLine {
+    std::string name;
+    std::vector<std::pair<double, double>> points;
+    std::size_t colour = 0;
+    bool isDashed = false;
+};
+
+// Both axes logarithmic, or both linear from 0 on.
+inline void writePlot(const std::string& path, const std::string& title, const std::string& xLabel,
+                      const std::string& yLabel, const std::vector<PlotLine>& lines, bool isLogarithmic)
+{
+    constexpr double left = 80, top = 60, plotWidth = 620, plotHeight = 440;
+    const auto scaled = [&](double v) { return isLogarithmic ? std::log10(v) : v; };
+    double x0 = isLogarithmic ? 1e300 : 0, x1 = -1e300, y0 = x0, y1 = x1;
+    for (const PlotLine& line : lines)
+        for (const auto& [x, y] : line.points) {
+            x0 = std::min(x0, scaled(x)), x1 = std::max(x1, scaled(x));
+            y0 = std::min(y0, scaled(y)), y1 = std::max(y1, scaled(y));
+        }
+    if (isLogarithmic) // whole decades
+        y0 = std::floor(y0), y1 = std::ceil(y1);
+    x1 = std::max(x1, x0 + 1e-9), y1 = std::max(y1, y0 + 1e-9);
+    const auto px = [&](double x) { return left + plotWidth * (scaled(x) - x0) / (x1 - x0); };
+    const auto py = [&](double y) { return top + plotHeight * (1 - (scaled(y) - y0) / (y1 - y0)); };
+
+    std::ofstream svg(path);
+    svg << R"(<svg xmlns="http://www.w3.org/2000/svg" width="980" height="560" font-family="sans-serif" font-size="12">)"
+        << "\n<rect width=\"980\" height=\"560\" fill=\"white\"/>\n<text x=\"" << left
+        << "\" y=\"28\" font-size=\"16\">" << title << "</text>\n";
+    const auto label = [&](double x, double y, const std::string& text, const char* style) {
+        svg << "<text x=\"" << x << "\" y=\"" << y << "\" " << style << ">" << text << "</text>\n";
+    };
+    const auto rule = [&](double ax, double ay, double bx, double by) {
+        svg << "<line x1=\"" << ax << "\" y1=\"" << ay << "\" x2=\"" << bx << "\" y2=\"" << by
+            << "\" stroke=\"#ddd\"/>\n";
+    };
+    const auto number = [](double v) {
+        char text[32];
+        std::snprintf(text, sizeof text, "%.6g", v);
+        return std::string(text);
+    };
+    const auto marks = [&](double low, double high, bool powersOfTwo) {
+        std::vector<double> at;
+        if (!isLogarithmic)
+            for (int i = 0; i <= 10; ++i)
+                at.push_back(low + (high - low) * i / 10);
+        else if (powersOfTwo)
+            for (double v = 1; v <= std::pow(10, high) * 1.001; v *= 2) {
+                if (v >= std::pow(10, low) * 0.999)
+                    at.push_back(v);
+            }
+        else
+            for (double e = low; e <= high; ++e)
+                at.push_back(std::pow(10, e));
+        return at;
+    };
+    for (const double v : marks(x0, x1, true)) {
+        rule(px(v), top, px(v), top + plotHeight);
+        label(px(v), top + plotHeight + 18, number(v), "text-anchor=\"middle\"");
+    }
+    for (const double v : marks(y0, y1, false)) {
+        rule(left, py(v), left + plotWidth, py(v));
+        label(left - 8, py(v) + 4, number(v), "text-anchor=\"end\"");
+    }
+    label(left + plotWidth / 2, top + plotHeight + 42, xLabel, "text-anchor=\"middle\"");
+    label(20, top - 10, yLabel, "");
+    static const char* const colours[] = {"#0a58a8", "#c03020", "#2a8a30", "#8040a0", "#b07000", "#555555"};
+    for (std::size_t i = 0; i < lines.size(); ++i) {
+        const char* colour = colours[lines[i].colour % (sizeof colours / sizeof *colours)];
+        svg << "<polyline fill=\"none\" stroke=\"" << colour << "\" stroke-width=\"2\""
+            << (lines[i].isDashed ? " stroke-dasharray=\"6 4\"" : "") << " points=\"";
+        for (const auto& [x, y] : lines[i].points)
+            svg << px(x) << ',' << py(y) << ' ';
+        svg << "\"/>\n";
+        for (const auto& [x, y] : lines[i].points)
+            svg << "<circle cx=\"" << px(x) << "\" cy=\"" << py(y) << "\" r=\"3\" fill=\"" << colour << "\"/>\n";
+        const double row = top + 16 + 20 * static_cast<double>(i);
+        svg << "<line x1=\"" << left + plotWidth + 20 << "\" y1=\"" << row - 4 << "\" x2=\"" << left + plotWidth + 50
+            << "\" y2=\"" << row - 4 << "\" stroke=\"" << colour << "\" stroke-width=\"2\""
+            << (lines[i].isDashed ? " stroke-dasharray=\"6 4\"" : "") << "/>\n";
+        label(left + plotWidth + 58, row, lines[i].name, "");
+    }
+    svg << "</svg>\n";
+    if (!svg.flush())
+        throw std::runtime_error("can not write " + path);
+}
+
+} // namespace bench
