@@ -1,0 +1,142 @@
+// What is measured for the paper's figures: ways to make an image, each of which has its turn from every view; and what
+// has been found, as JSON lines and as a table.
+#pragma once
+
+#include "frame_times.hpp"
+#include "results.hpp"
+
+#include <dfb/frame.hpp>
+
+#include <cstddef>
+#include <fstream>
+#include <functional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace bench {
+
+struct Measurement {
+    int figure = 0, threads = 1;
+    Result result;             // its time is that of a frame
+    Figure render, overhead;   // ms: until the slowest rank had rendered, and from then on
+    std::vector<double> views; // ms of a frame from each view, the median over its repetitions
+
+    std::string json() const
+    {
+        std::string text = result.json();
+        text.pop_back(); // the brace
+        char more[512];
+        std::snprintf(more, sizeof more,
+                      R"(, "figure": %d, "threads": %d, "views": %zu, "render_ms": %.4f, "render_mad_ms": %.4f, )"
+                      R"("overhead_ms": %.4f, "overhead_mad_ms": %.4f, "view_ms": [)",
+                      figure, threads, views.size(), render.median, render.deviation, overhead.median,
+                      overhead.deviation);
+        text += more;
+        for (std::size_t v = 0; v < views.size(); ++v) {
+            std::snprintf(more, sizeof more, "%s%.3f", v == 0 ? "" : ", ", views[v]);
+            text += more;
+        }
+        return text + "]}";
+    }
+};
+
+// A way to make the image.
+struct PaperWay {
+    std::string system, config;
+    std::function<double(int view)> frame{};     // collective; returns when this rank had rendered
+    std::function<std::vector<float>()> image{}; // of the last frame, linear; on rank 0
+    std::function<dfb::FrameReport()> report{};  // of the last frame; may be null
+    std::vector<std::vector<Times>> times{};     // of each view
+    double maxError = 0;                         // found by a check
+};
+
+// Collective.
+inline void measureWays(MPI_Comm comm, std::vector<PaperWay>& ways, int views, int repeats)
+{
+    FrameTimer timer(comm);
+    for (PaperWay& way : ways)
+        way.times.assign(static_cast<std::size_t>(views), {});
+    std::size_t turn = 0;
+    for (int repeat = -1; repeat < repeats; ++repeat)
+        for (int v = 0; v < (repeat < 0 ? 1 : views); ++v, ++turn) // the first frame touches memory
+            for (std::size_t i = 0; i < ways.size(); ++i) {
+                PaperWay& way = ways[(i + turn) % ways.size()];
+                const Times t = timer.time([&] { return way.frame(v); });
+                if (repeat >= 0)
+                    way.times[static_cast<std::size_t>(v)].push_back(t);
+            }
+}
+
+inline Measurement measurementOf(const PaperWay& way)
+{
+    Measurement m;
+    std::vector<double> image, render, overhead;
+    for (const std::vector<Times>& view : way.times) {
+        std::vector<double> ofView;
+        for (const Times& t : view) {
+            ofView.push_back(t.image);
+            image.push_back(t.image);
+            render.push_back(t.rendered);
+            overhead.push_back(t.overhead());
+        }
+        m.views.push_back(medianOf(ofView));
+    }
+    m.result.bench = "bench_paper";
+    m.result.system = way.system;
+    m.result.config = way.config;
+    m.result.ms = figureOf(image);
+    m.result.maxError = way.maxError;
+    m.render = figureOf(render);
+    m.overhead = figureOf(overhead);
+    if (way.report) {
+        const dfb::FrameReport report = way.report();
+        m.result.bytes = static_cast<double>(report.bytesSent);
+        m.result.messages = static_cast<double>(report.messagesSent);
+        m.result.peakMemoryBytes = static_cast<double>(report.peakMemoryBytes);
+    }
+    return m;
+}
+
+inline std::string sizeText(const Measurement& m)
+{
+    return std::to_string(m.result.width) + 'x' + std::to_string(m.result.height);
+}
+
+// Appends; throws std::runtime_error.
+inline void writeMeasurements(const std::vector<Measurement>& all, const std::string& caption,
+                              const std::string& jsonPath, const std::string& tablePath)
+{
+    std::string table = "**" + caption
+                        + "**\n\n| size | ranks | | frame [ms] | local rendering [ms] | overhead [ms] | "
+                          "speed-up | slowest view : fastest | MB sent |\n|---|--:|---|--:|--:|--:|--:|--:|--:|\n";
+    for (const Measurement& m : all) {
+        const Measurement* first = &m; // the same with the fewest ranks
+        for (const Measurement& other : all)
+            if (sizeText(other) == sizeText(m) && other.result.config == m.result.config
+                && other.result.system == m.result.system && other.result.ranks < first->result.ranks)
+                first = &other;
+        const auto [fastest, slowest] = std::minmax_element(m.views.begin(), m.views.end());
+        table += "| " + sizeText(m) + " | " + std::to_string(m.result.ranks) + " | " + m.result.system + ": "
+                 + m.result.config + " | " + text(m.result.ms) + " | " + text(m.render) + " | " + text(m.overhead)
+                 + " | " + text(first->result.ms.median / m.result.ms.median) + " | " + text(*slowest / *fastest)
+                 + " | " + (m.result.bytes > 0 ? text(1e-6 * m.result.bytes) : "-") + " |\n";
+    }
+    std::printf("\n%s\n", table.c_str());
+    const auto append = [](const std::string& path, const std::string& what) {
+        if (path.empty())
+            return;
+        std::ofstream file(path, std::ios::app);
+        file << what;
+        if (!file.flush())
+            throw std::runtime_error("can not write " + path);
+    };
+    std::string lines;
+    for (const Measurement& m : all)
+        lines += m.json() + '\n';
+    append(jsonPath, lines);
+    append(tablePath, table + '\n');
+}
+
+} // namespace bench
