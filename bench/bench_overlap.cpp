@@ -10,6 +10,7 @@
 #include <cmath>
 #include <cstdlib>
 #include <fstream>
+#include <memory>
 #include <string>
 #include <utility>
 #include <vector>
@@ -35,7 +36,11 @@ public:
 
     void run(int width, int height)
     {
-        bench::MarchedBricks bricks(comm_, width, height, o_.views, 1);
+        dfb::FrameBufferConfig config;
+        config.width = width;
+        config.height = height;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        bench::MarchedBricks bricks(comm_, config, o_.views);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
 #ifdef DFB_BENCH_HAS_ICET
         for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {

@@ -1,7 +1,8 @@
 // The figures of the paper (section 6), with data that is generated from a seed in place of its own, of which no rank
 // holds more than its part (in figure 6 each has all of it, as is the nature of image-parallel rendering).
 //   mpirun -n 8 bench_paper --figure 6|7|8|9|10 [--ranks 1,2,4,8] [--size 512x512,...] [--views 12] [--repeats 1]
-//     [--scale 1] [--seed 1] [--threads 1] [--check VIEWS] [--json FILE] [--svg FILE] [--table FILE] [--ppm FILE]
+//     [--scale 1] [--seed 1] [--threads 1] [--compress never|always|auto] [--check VIEWS] [--json FILE] [--svg FILE]
+//     [--table FILE] [--ppm FILE]
 //     [--commit ID]
 // Each number of ranks is measured on the first so many of those that there are; the others sleep meanwhile. --check
 // compares the images from so many views with those of another distribution of the same scene. --scale: of the data's
@@ -18,6 +19,7 @@
 #include <cstdlib>
 #include <fstream>
 #include <functional>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -33,9 +35,23 @@ struct Options {
     double scale = 1;
     std::vector<int> ranks; // ascending
     std::vector<std::array<int, 2>> sizes{{512, 512}};
-    std::string json, svg, table, ppm, commit;
+    std::string json, svg, table, ppm, commit, compress = "never";
 
     int scaled(int count) const { return std::max(8, static_cast<int>(std::lround(count * scale))); }
+
+    dfb::FrameBufferConfig config(int width, int height) const
+    {
+        dfb::FrameBufferConfig c;
+        c.width = width;
+        c.height = height;
+        c.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+#if defined(DFB_HAS_SNAPPY)
+        if (compress != "never")
+            c.codec = std::make_shared<dfb::SnappyCodec>();
+#endif
+        c.compression = compress == "auto" ? dfb::CompressionMode::Auto : dfb::CompressionMode::Always;
+        return c;
+    }
 };
 
 // Distance of two images.
@@ -118,7 +134,7 @@ private:
         }
         const PaperScene scene = this->scene();
         sceneName_ = scene.name;
-        bench::PaperStage stage(comm, scene, width, height, o_.views, o_.threads);
+        bench::PaperStage stage(comm, scene, o_.config(width, height), o_.views);
         std::vector<PaperWay> ways = waysOf(stage, ranks, dfb::OutputFormat::SRGBA8);
         if (o_.checked > 0 || !o_.ppm.empty()) {
             std::vector<PaperWay> exact = waysOf(stage, ranks, dfb::OutputFormat::RGBA32F);
@@ -152,7 +168,7 @@ private:
     void measureMarched(MPI_Comm comm, int ranks, int width, int height)
     {
         sceneName_ = "64^3 bricks";
-        bench::MarchedBricks bricks(comm, width, height, o_.views, o_.threads);
+        bench::MarchedBricks bricks(comm, o_.config(width, height), o_.views);
         std::vector<bench::MarchedSystem> systems{bricks.sorted("dfb: sorted"), bricks.inOrder("dfb: in order")};
 #ifdef DFB_BENCH_HAS_ICET
         for (const bench::IceTStrategy& strategy : bench::icetStrategies())
@@ -243,6 +259,8 @@ private:
             m.result.width = width;
             m.result.height = height;
             m.result.commit = o_.commit;
+            if (way.system == "dfb" && o_.compress != "never")
+                m.result.config += o_.compress == "auto" ? ", Snappy if faster" : ", Snappy";
             std::printf("%dx%d, %d ranks, %s: %s: %s ms\n", width, height, ranks, way.system.c_str(),
                         way.config.c_str(), bench::text(m.result.ms).c_str());
             found_.push_back(std::move(m));
@@ -252,6 +270,7 @@ private:
 
     // ---- plots
 
+    static std::string ranksText(int ranks) { return std::to_string(ranks) + (ranks == 1 ? " rank" : " ranks"); }
     static std::string nameOf(const Measurement& m) { return m.result.system + ", " + m.result.config; }
 
     // In the order in which they were measured.
@@ -329,8 +348,7 @@ private:
                 const std::vector<std::string> names = distinct(some, nameOf);
                 std::vector<std::pair<std::string, std::vector<bench::PlotBar>>> groups;
                 for (const Measurement& m : some) {
-                    const std::string group =
-                        std::to_string(m.result.ranks) + (m.result.ranks == 1 ? " rank" : " ranks");
+                    const std::string group = ranksText(m.result.ranks);
                     if (groups.empty() || groups.back().first != group)
                         groups.emplace_back(group, std::vector<bench::PlotBar>());
                     const auto colour = std::find(names.begin(), names.end(), nameOf(m)) - names.begin();
@@ -350,7 +368,7 @@ private:
                                 line.points.push_back({static_cast<double>(v), m.views[v], m.views[v], m.views[v]});
                             lines.push_back(std::move(line));
                         }
-                    plots.addCurves(std::to_string(ranks) + " ranks, " + size, "view", "time of a frame [ms]", lines);
+                    plots.addCurves(ranksText(ranks) + ", " + size, "view", "time of a frame [ms]", lines);
                 }
         plots.write(o_.svg);
     }
@@ -377,7 +395,8 @@ Options optionsOf(int argc, char** argv)
     };
     const char* usage =
         "usage: mpirun -n RANKS bench_paper --figure 6|7|8|9|10 [--ranks N,...] [--size WxH,...] [--views N] "
-        "[--repeats N] [--scale S] [--seed K] [--threads N] [--check VIEWS] [--json FILE] [--svg FILE] "
+        "[--repeats N] [--scale S] [--seed K] [--threads N] [--compress never|always|auto] [--check VIEWS] [--json "
+        "FILE] [--svg FILE] "
         "[--table FILE] [--ppm FILE] [--commit ID]";
     bench::readOptions(
         argc, argv, usage,

@@ -12,10 +12,11 @@
 
 namespace bench {
 
-// In ms from when the first rank began.
+// In ms, from when the first rank began.
 struct Times {
     double image = 0;    // rank 0 has it; without compositing: all ranks have rendered
     double rendered = 0; // the slowest rank has rendered
+    double cpu = 0;      // of all ranks
 
     // The paper's compositing overhead.
     double overhead() const { return image - rendered; }
@@ -52,11 +53,14 @@ public:
         const double begin = agree(comm_, clock() + 2e-3);
         if (const double wait = begin - clock(); wait > 0)
             std::this_thread::sleep_for(std::chrono::duration<double>(wait));
+        const double cpuBefore = processCpuSeconds();
         const double start = clock(), rendered = frame() + offset_, end = clock();
+        const double cpu = processCpuSeconds() - cpuBefore;
         const double first = reduce(comm_, start, MPI_MIN);
         Times t;
         t.rendered = 1e3 * (reduce(comm_, rendered, MPI_MAX) - first);
         t.image = makesImage ? 1e3 * (agree(comm_, end) - first) : t.rendered;
+        t.cpu = 1e3 * reduce(comm_, cpu, MPI_SUM);
         return t;
     }
 

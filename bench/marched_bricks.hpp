@@ -133,17 +133,14 @@ class MarchedBricks {
     }
 
 public:
-    // Collective. The communicator remains the caller's.
-    MarchedBricks(MPI_Comm comm, int width, int height, int viewCount, int threads)
-        : comm_(comm), messenger_(std::make_shared<Messenger>(comm)), width_(width), height_(height),
-          rank_(rankIn(comm)), grid_(sizeOf(comm)), marcher_(boxOf(rank_)),
+    // Collective. The communicator remains the caller's; `config` has size and executor, and what else dfb should do.
+    MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount)
+        : comm_(comm), messenger_(std::make_shared<Messenger>(comm)), config_(std::move(config)), width_(config_.width),
+          height_(config_.height), rank_(rankIn(comm)), grid_(sizeOf(comm)), marcher_(boxOf(rank_)),
           world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
-          image_(4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height), 0.0f)
+          image_(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f)
     {
-        config_.width = width;
-        config_.height = height;
         config_.format = dfb::OutputFormat::RGBA32F;
-        config_.executor = std::make_shared<dfb::ThreadExecutor>(threads);
         ordered_ = std::make_unique<Ordered>(messenger_, config_);
         shared_ = std::make_unique<dfb::SharedWorld>(*ordered_, world_);
         for (const dfb::PerspectiveCamera& camera : orbitOf(viewCount, grid_.size(), 1.9f)) {
@@ -248,11 +245,11 @@ private:
 
     MPI_Comm comm_;
     std::shared_ptr<Messenger> messenger_;
+    dfb::FrameBufferConfig config_;
     int width_, height_, rank_;
     BrickGrid grid_;
     BrickMarcher marcher_;
     dfb::World world_;
-    dfb::FrameBufferConfig config_;
     std::unique_ptr<Ordered> ordered_;
     std::unique_ptr<dfb::SharedWorld> shared_;
     std::vector<MarchedView> views_;

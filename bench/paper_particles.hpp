@@ -31,13 +31,13 @@ public:
 
     int cells() const { return cells_; } // along each side of the unit cube
     float cellSize() const { return 1.0f / static_cast<float>(cells_); }
-    float largestRadius() const { return 0.4f * cellSize(); }
+    float largestRadius() const { return 0.3f * cellSize(); }
 
     // Calls found(particle) for those of a cell, each of which is within the unit cube.
     template <class Found>
     void forEach(int x, int y, int z, const Found& found) const
     {
-        constexpr int candidates = 14;
+        constexpr int candidates = 24;
         HashedNumbers numbers(hashOf(seed_, x, y, z));
         for (int i = 0; i < candidates; ++i) {
             Particle p;
@@ -64,7 +64,7 @@ private:
     float densityAt(const dfb::Vec3& p) const
     {
         const float a = first_.turbulence(p, 3, 3), b = second_.turbulence(p, 3, 3);
-        return 0.01f + 0.99f * std::exp(-60 * (a * a + b * b));
+        return 0.004f + 0.996f * std::exp(-150 * (a * a + b * b));
     }
 
     int cells_;
@@ -105,7 +105,7 @@ public:
     }
 
 private:
-    static constexpr float opacity = 0.4f;
+    static constexpr float opacity = 0.25f;
 
     struct Hit {
         float t = 0;
@@ -231,7 +231,7 @@ private:
     static dfb::Vec3 colorOf(const Particle& p)
     {
         const float s = p.density;
-        return {0.15f + 0.85f * std::min(1.0f, 1.6f * s), 0.25f + 0.6f * s * s, 0.75f - 0.65f * s};
+        return {0.15f + 0.8f * std::min(1.0f, 1.5f * s), 0.2f + 0.6f * s * s, 0.7f - 0.6f * s};
     }
 
     dfb::Box3 bounds_;

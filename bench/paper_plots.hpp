@@ -65,7 +65,7 @@ public:
         end();
     }
 
-    // Both axes linear, y from 0.
+    // Both axes linear, y from 0; x has whole numbers.
     void addCurves(const std::string& title, const std::string& xTitle, const std::string& yTitle,
                    const std::vector<PlotLine>& lines)
     {
@@ -79,7 +79,7 @@ public:
         const auto x = [&](double v) { return plotWidth * v / right; };
         const auto y = [&](double v) { return plotHeight * (1 - v / most); };
         begin(title, xTitle, yTitle);
-        for (double v = 0; v <= right; v += stepOf(right))
+        for (double v = 0; v <= right; v += std::max(1.0, stepOf(right)))
             tickX(x(v), number(v));
         for (double v = 0; v <= most; v += stepOf(most))
             tickY(y(v), number(v));
@@ -119,10 +119,10 @@ public:
             }
             at += 0.6 * place;
         }
-        box(plotWidth - 150, -32, 10, 10, "#555", 1);
-        text(plotWidth - 135, -23, names.first, "");
-        box(plotWidth - 150, -16, 10, 10, "#555", 0.4);
-        text(plotWidth - 135, -7, names.second, "");
+        box(plotWidth - 150, -50, 10, 10, "#555", 1);
+        text(plotWidth - 135, -41, names.first, "");
+        box(plotWidth - 150, -34, 10, 10, "#555", 0.4);
+        text(plotWidth - 135, -25, names.second, "");
         end();
     }
 
@@ -133,7 +133,8 @@ public:
         if (columns == 0)
             return;
         const std::size_t rows = (panels_.size() + columns - 1) / columns;
-        const double width = static_cast<double>(columns) * panelWidth,
+        const double width = std::max(static_cast<double>(columns) * panelWidth,
+                                      40 + 8 * static_cast<double>(title_.size())),
                      height = 44 + static_cast<double>(rows) * panelHeight;
         std::ofstream svg(path);
         svg << "<svg xmlns=\"http://www.w3.org/2000/svg\" width=\"" << width << "\" height=\"" << height
@@ -141,7 +142,7 @@ public:
             << "\" fill=\"white\"/>\n<text x=\"20\" y=\"28\" font-size=\"15\">" << title_ << "</text>\n";
         for (std::size_t i = 0; i < panels_.size(); ++i)
             svg << "<g transform=\"translate(" << 62 + panelWidth * static_cast<double>(i % columns) << ','
-                << 104 + panelHeight * static_cast<double>(i / columns) << ")\">\n"
+                << 122 + panelHeight * static_cast<double>(i / columns) << ")\">\n"
                 << panels_[i] << "</g>\n";
         svg << "</svg>\n";
         if (!svg.flush())
@@ -149,7 +150,7 @@ public:
     }
 
 private:
-    static constexpr double plotWidth = 340, plotHeight = 230, panelWidth = 430, panelHeight = 350;
+    static constexpr double plotWidth = 340, plotHeight = 230, panelWidth = 430, panelHeight = 368;
 
     static const char* colours(int i)
     {
@@ -198,7 +199,7 @@ private:
     void begin(const std::string& title, const std::string& xTitle, const std::string& yTitle)
     {
         panel_.clear();
-        text(-46, -42, title, "font-size=\"12\" font-weight=\"bold\"");
+        text(-46, -60, title, "font-size=\"12\" font-weight=\"bold\"");
         text(-46, -8, yTitle, "");
         text(plotWidth / 2, plotHeight + 36, xTitle, "text-anchor=\"middle\"");
         line(0, plotHeight, plotWidth, plotHeight, "stroke=\"#333\"");
@@ -209,7 +210,7 @@ private:
     template <class X, class Y>
     void drawLines(const std::vector<PlotLine>& lines, const X& x, const Y& y)
     {
-        double legend = 54;
+        int named = 0; // the legend has two columns
         for (const PlotLine& l : lines) {
             const std::string stroke = std::string("stroke=\"") + colours(l.colour) + "\" stroke-width=\"1.5\"",
                               style = stroke + (l.dashed ? " stroke-dasharray=\"5 4\" stroke-opacity=\"0.6\"" : "");
@@ -226,9 +227,10 @@ private:
             put("<polyline points=\"" + path + "\" fill=\"none\" " + style + "/>");
             if (l.name.empty())
                 continue;
-            line(legend + 6, -28, legend + 26, -28, style);
-            text(legend + 30, -24, l.name, "");
-            legend += 42 + 5.8 * static_cast<double>(l.name.size());
+            const double x0 = named % 2 == 0 ? 0 : 185, y0 = named < 2 ? -44 : -28;
+            ++named;
+            line(x0, y0, x0 + 20, y0, style);
+            text(x0 + 25, y0 + 4, l.name, "");
         }
     }
 

@@ -24,11 +24,11 @@ namespace bench {
 // A scene, seen by the ranks of a communicator. Must outlive the ways it makes; what it does is collective.
 class PaperStage {
 public:
-    // The communicator remains the caller's.
-    PaperStage(MPI_Comm comm, PaperScene scene, int width, int height, int views, int threads)
+    // The communicator remains the caller's; `config` has all but the format.
+    PaperStage(MPI_Comm comm, PaperScene scene, dfb::FrameBufferConfig config, int views)
         : scene_(std::move(scene)), messenger_(std::make_shared<dfb::Messenger<dfb::MpiTransport>>(comm)),
-          executor_(std::make_shared<dfb::ThreadExecutor>(threads)), cameras_(orbitOf(views, unit, 1.05f)),
-          width_(width), height_(height), grid_(sizeOf(comm)), ranks_(sizeOf(comm))
+          config_(std::move(config)), cameras_(orbitOf(views, unit, 1.5f)), width_(config_.width),
+          height_(config_.height), grid_(sizeOf(comm)), ranks_(sizeOf(comm))
     {
         MPI_Comm_rank(comm, &rank_);
     }
@@ -83,7 +83,7 @@ public:
     {
         hold(whole, {{0, 0, 0}, unit});
         std::vector<float> rgba(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f);
-        executor_->parallelFor(static_cast<std::size_t>(height_), [&](std::size_t row) {
+        config_.executor->parallelFor(static_cast<std::size_t>(height_), [&](std::size_t row) {
             Pixels to;
             to.region = {0, static_cast<int>(row), width_, static_cast<int>(row) + 1};
             to.width = width_, to.height = height_, to.stride = width_;
@@ -109,7 +109,7 @@ private:
     void hold(std::uint32_t id, const dfb::Box3& bounds)
     {
         if (bricks_.find(id) == bricks_.end())
-            bricks_[id] = scene_.make(bounds, *executor_);
+            bricks_[id] = scene_.make(bounds, *config_.executor);
     }
 
     dfb::World worldOf(int bricksPerRank)
@@ -140,11 +140,8 @@ private:
     template <class FrameBuffer, class Start>
     PaperWay wayOf(const std::string& system, const std::string& name, dfb::OutputFormat format, Start start)
     {
-        dfb::FrameBufferConfig config;
-        config.width = width_;
-        config.height = height_;
+        dfb::FrameBufferConfig config = config_;
         config.format = format;
-        config.executor = executor_;
         const auto fb = std::make_shared<FrameBuffer>(messenger_, config);
         const auto report = std::make_shared<dfb::FrameReport>();
         PaperWay way;
@@ -166,7 +163,7 @@ private:
 
     PaperScene scene_;
     std::shared_ptr<dfb::Messenger<dfb::MpiTransport>> messenger_;
-    std::shared_ptr<dfb::Executor> executor_;
+    dfb::FrameBufferConfig config_;
     std::vector<dfb::PerspectiveCamera> cameras_;
     int width_, height_, rank_ = 0;
     BrickGrid grid_;
