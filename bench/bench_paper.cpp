@@ -2,14 +2,13 @@
 // holds more than its part (in figure 6 each has all of it, as is the nature of image-parallel rendering).
 //   mpirun -n 8 bench_paper --figure 6|7|8|9|10 [--ranks 1,2,4,8] [--size 512x512,...] [--views 12] [--repeats 1]
 //     [--scale 1] [--seed 1] [--threads 1] [--compress never|always|auto] [--check VIEWS] [--json FILE] [--svg FILE]
-//     [--table FILE] [--ppm FILE]
-//     [--commit ID]
+//     [--table FILE] [--ppm FILE] [--commit ID]
 // Each number of ranks is measured on the first so many of those that there are; the others sleep meanwhile. --check
 // compares the images from so many views with those of another distribution of the same scene. --scale: of the data's
 // resolution along each side.
 #include "marched_bricks.hpp"
+#include "paper_figures.hpp"
 #include "paper_particles.hpp"
-#include "paper_plots.hpp"
 #include "paper_volume.hpp"
 #include "paper_ways.hpp"
 
@@ -101,7 +100,7 @@ public:
         if (rank_ == 0) {
             bench::writeMeasurements(found_, caption(), o_.json, o_.table);
             if (!o_.svg.empty())
-                plot();
+                bench::drawFigure(o_.figure, caption(), found_, o_.svg);
         }
         return bench::agree(all_, isRight_ ? 1 : 0) > 0;
     }
@@ -186,6 +185,7 @@ private:
                 return frame(bricks.views()[static_cast<std::size_t>(view)]);
             };
             way.image = [image = s.image, values] { return std::vector<float>(image(), image() + values); };
+            way.traffic = s.traffic;
             ways.push_back(std::move(way));
         }
         // All bricks by one rank, one after the other.
@@ -248,10 +248,10 @@ private:
 
     void keep(const std::vector<PaperWay>& ways, const std::string& sceneName, int ranks, int width, int height)
     {
-        if (rank_ != 0)
-            return;
         for (const PaperWay& way : ways) {
             Measurement m = bench::measurementOf(way);
+            if (rank_ != 0)
+                continue;
             m.figure = o_.figure;
             m.threads = o_.threads;
             m.result.scene = sceneName;
@@ -266,111 +266,6 @@ private:
             found_.push_back(std::move(m));
         }
         std::fflush(stdout);
-    }
-
-    // ---- plots
-
-    static std::string ranksText(int ranks) { return std::to_string(ranks) + (ranks == 1 ? " rank" : " ranks"); }
-    static std::string nameOf(const Measurement& m) { return m.result.system + ", " + m.result.config; }
-
-    // In the order in which they were measured.
-    template <class Key>
-    static std::vector<std::string> distinct(const std::vector<Measurement>& of, const Key& key)
-    {
-        std::vector<std::string> names;
-        for (const Measurement& m : of)
-            if (std::find(names.begin(), names.end(), key(m)) == names.end())
-                names.push_back(key(m));
-        return names;
-    }
-
-    // Frames a second of each group of `of` over the ranks; and what they would be if each rank helped as much as the
-    // first.
-    template <class Key>
-    static std::vector<bench::PlotLine> scalingOf(const std::vector<Measurement>& of, const Key& key, bool hasIdeal)
-    {
-        std::vector<bench::PlotLine> lines;
-        int colour = 0;
-        for (const std::string& name : distinct(of, key)) {
-            bench::PlotLine line{name, {}, false, colour}, ideal{"", {}, true, colour};
-            ++colour;
-            for (const Measurement& m : of)
-                if (key(m) == name) {
-                    const double ranks = m.result.ranks, ms = m.result.ms.median, mad = m.result.ms.deviation;
-                    line.points.push_back({ranks, 1e3 / ms, 1e3 / (ms + mad), 1e3 / std::max(0.01 * ms, ms - mad)});
-                    const bench::PlotPoint first = line.points.front();
-                    const double y = first.y * ranks / first.x;
-                    ideal.points.push_back({ranks, y, y, y});
-                }
-            lines.push_back(std::move(line));
-            if (hasIdeal && ideal.points.size() > 1)
-                lines.push_back(std::move(ideal));
-        }
-        return lines;
-    }
-
-    static bench::PlotBar barOf(const Measurement& m, const std::string& name, int colour)
-    {
-        return {name, m.render.median, m.overhead.median, m.result.ms.deviation, colour};
-    }
-
-    void plot() const
-    {
-        const std::vector<std::string> sizes = distinct(found_, bench::sizeText);
-        const auto ofSize = [this](const std::string& size) {
-            std::vector<Measurement> some;
-            std::copy_if(found_.begin(), found_.end(), std::back_inserter(some),
-                         [&](const Measurement& m) { return bench::sizeText(m) == size; });
-            return some;
-        };
-        const std::pair<std::string, std::string> parts{"local rendering", "compositing overhead"};
-        bench::PaperPlots plots(caption(), o_.figure == 9 ? sizes.size() : 2);
-        const char* const rate = "frames/s (dashed: ideal)";
-        if (o_.figure == 6)
-            for (const std::string& size : sizes)
-                plots.addScaling(size, rate, scalingOf(ofSize(size), nameOf, true));
-        if (o_.figure == 7 || o_.figure == 8) {
-            plots.addScaling("(a) scaling", rate, scalingOf(found_, bench::sizeText, true));
-            std::vector<std::pair<std::string, std::vector<bench::PlotBar>>> groups;
-            for (const std::string& size : sizes) {
-                groups.emplace_back(size, std::vector<bench::PlotBar>());
-                for (const Measurement& m : ofSize(size))
-                    groups.back().second.push_back(
-                        barOf(m, std::to_string(m.result.ranks), static_cast<int>(groups.size()) - 1));
-            }
-            plots.addBars("(b) parts of the time, by ranks", parts, groups);
-        }
-        if (o_.figure == 9) {
-            for (const std::string& size : sizes)
-                plots.addScaling(size, "frames/s", scalingOf(ofSize(size), nameOf, false));
-            for (const std::string& size : sizes) {
-                const std::vector<Measurement> some = ofSize(size);
-                const std::vector<std::string> names = distinct(some, nameOf);
-                std::vector<std::pair<std::string, std::vector<bench::PlotBar>>> groups;
-                for (const Measurement& m : some) {
-                    const std::string group = ranksText(m.result.ranks);
-                    if (groups.empty() || groups.back().first != group)
-                        groups.emplace_back(group, std::vector<bench::PlotBar>());
-                    const auto colour = std::find(names.begin(), names.end(), nameOf(m)) - names.begin();
-                    groups.back().second.push_back(barOf(m, m.result.system, static_cast<int>(colour)));
-                }
-                plots.addBars(size, parts, groups);
-            }
-        }
-        if (o_.figure == 10)
-            for (const std::string& size : sizes)
-                for (const int ranks : o_.ranks) {
-                    std::vector<bench::PlotLine> lines;
-                    for (const Measurement& m : found_)
-                        if (m.result.ranks == ranks && bench::sizeText(m) == size) {
-                            bench::PlotLine line{m.result.config, {}, false, static_cast<int>(lines.size())};
-                            for (std::size_t v = 0; v < m.views.size(); ++v)
-                                line.points.push_back({static_cast<double>(v), m.views[v], m.views[v], m.views[v]});
-                            lines.push_back(std::move(line));
-                        }
-                    plots.addCurves(ranksText(ranks) + ", " + size, "view", "time of a frame [ms]", lines);
-                }
-        plots.write(o_.svg);
     }
 
     MPI_Comm all_;
@@ -393,6 +288,14 @@ Options optionsOf(int argc, char** argv)
             return *end == 0 && !value.empty() && n >= least && n < 1000000000;
         };
     };
+    const auto isCompression = [&o](const std::string& value) {
+        o.compress = value;
+#if defined(DFB_HAS_SNAPPY)
+        return value == "never" || value == "always" || value == "auto";
+#else
+        return value == "never";
+#endif
+    };
     const char* usage =
         "usage: mpirun -n RANKS bench_paper --figure 6|7|8|9|10 [--ranks N,...] [--size WxH,...] [--views N] "
         "[--repeats N] [--scale S] [--seed K] [--threads N] [--compress never|always|auto] [--check VIEWS] [--json "
@@ -413,6 +316,7 @@ Options optionsOf(int argc, char** argv)
          {"--scale", [&o](const std::string& value) { return (o.scale = std::atof(value.c_str())) > 0; }},
          {"--seed", number(o.seed, 0)},
          {"--threads", number(o.threads, 1)},
+         {"--compress", isCompression},
          {"--check", number(o.checked, 0)},
          {"--json", bench::readText(o.json)},
          {"--svg", bench::readText(o.svg)},

@@ -109,6 +109,8 @@ struct MarchedSystem {
     std::string name;
     std::function<double(const MarchedView&)> frame{}; // collective; returns when this rank had rendered
     std::function<const float*()> image{};             // of the last frame, on rank 0; none without compositing
+    // Of the last frame, by all ranks: bytes and messages sent. Collective; none without compositing.
+    std::function<std::array<double, 2>()> traffic{};
     std::vector<Times> times{};
 };
 
@@ -162,29 +164,32 @@ public:
     // dfb that is told the order, as IceT is. Ids of bricks are the ranks, so that places in the shared world are, too.
     MarchedSystem inOrder(const std::string& name)
     {
+        const auto report = std::make_shared<dfb::FrameReport>();
         return {name,
-                [this](const MarchedView& view) {
+                [this, report](const MarchedView& view) {
                     dfb::RoundRobinBricks owner;
                     auto frame = dfb::startOrdered(*ordered_, *shared_, view.camera, view.order, owner, renderer(view));
                     const double rendered = now();
-                    frame.end();
+                    *report = frame.end();
                     return rendered;
                 },
-                [this] { return ordered_->isDisplayRank() ? ordered_->image().rgba32f() : nullptr; }};
+                [this] { return ordered_->isDisplayRank() ? ordered_->image().rgba32f() : nullptr; },
+                trafficOf(report)};
     }
 
     // dfb as in the paper: what comes is sorted. Collective.
     MarchedSystem sorted(const std::string& name)
     {
         const auto fb = std::make_shared<dfb::DistributedFrameBuffer<dfb::AlphaBlend>>(messenger_, config_);
+        const auto report = std::make_shared<dfb::FrameReport>();
         return {name,
-                [this, fb](const MarchedView& view) {
+                [this, fb, report](const MarchedView& view) {
                     auto frame = dfb::startDataParallel(*fb, world_, view.camera, renderer(view));
                     const double rendered = now();
-                    frame.end();
+                    *report = frame.end();
                     return rendered;
                 },
-                [fb] { return fb->isDisplayRank() ? fb->image().rgba32f() : nullptr; }};
+                [fb] { return fb->isDisplayRank() ? fb->image().rgba32f() : nullptr; }, trafficOf(report)};
     }
 
 #ifdef DFB_BENCH_HAS_ICET
@@ -200,11 +205,16 @@ public:
                 [this, icet, result](const MarchedView& view) {
                     const dfb::Region r = renderAll(view);
                     const double rendered = now();
+                    icet->resetTraffic();
                     const int viewport[4] = {r.x0, r.y0, r.width(), r.height()};
                     *result = static_cast<const float*>(icet->composite(image_.data(), viewport, view.order));
                     return rendered;
                 },
-                [result] { return *result; }};
+                [result] { return *result; },
+                [this, icet] {
+                    return std::array<double, 2>{reduce(comm_, static_cast<double>(icet->bytesSent()), MPI_SUM),
+                                                 reduce(comm_, static_cast<double>(icet->messagesSent()), MPI_SUM)};
+                }};
     }
 #endif
 
@@ -222,6 +232,14 @@ private:
         int size = 1;
         MPI_Comm_size(comm, &size);
         return size;
+    }
+
+    static std::function<std::array<double, 2>()> trafficOf(const std::shared_ptr<dfb::FrameReport>& report)
+    {
+        return [report] {
+            return std::array<double, 2>{static_cast<double>(report->bytesSent),
+                                         static_cast<double>(report->messagesSent)};
+        };
     }
 
     // This rank's brick into image_; returns where that may be.

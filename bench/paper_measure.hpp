@@ -8,6 +8,7 @@
 #include <dfb/frame.hpp>
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdio>
 #include <fstream>
@@ -49,9 +50,11 @@ struct PaperWay {
     std::string system, config;
     std::function<double(int view)> frame{};     // collective; returns when this rank had rendered
     std::function<std::vector<float>()> image{}; // of the last frame, linear; on rank 0
-    std::function<dfb::FrameReport()> report{};  // of the last frame; may be null
-    std::vector<std::vector<Times>> times{};     // of each view
-    double maxError = 0;                         // found by a check
+    // Of the last frame, by all ranks: bytes and messages sent. Collective.
+    std::function<std::array<double, 2>()> traffic{};
+    std::function<dfb::FrameReport()> report{}; // of the last frame; may be null
+    std::vector<std::vector<Times>> times{};    // of each view
+    double maxError = -1;                       // found by a check
 };
 
 // Collective.
@@ -71,6 +74,7 @@ inline void measureWays(MPI_Comm comm, std::vector<PaperWay>& ways, int views, i
             }
 }
 
+// Collective.
 inline Measurement measurementOf(const PaperWay& way)
 {
     Measurement m;
@@ -92,14 +96,14 @@ inline Measurement measurementOf(const PaperWay& way)
     m.result.ms = figureOf(image);
     m.result.cpuMs = figureOf(cpu);
     m.result.maxError = way.maxError;
+    m.result.rmse = m.result.levels = -1; // not known
     m.render = figureOf(render);
     m.overhead = figureOf(overhead);
-    if (way.report) {
-        const dfb::FrameReport report = way.report();
-        m.result.bytes = static_cast<double>(report.bytesSent);
-        m.result.messages = static_cast<double>(report.messagesSent);
-        m.result.peakMemoryBytes = static_cast<double>(report.peakMemoryBytes);
-    }
+    const std::array<double, 2> traffic = way.traffic();
+    m.result.bytes = traffic[0];
+    m.result.messages = traffic[1];
+    if (way.report)
+        m.result.peakMemoryBytes = static_cast<double>(way.report().peakMemoryBytes);
     return m;
 }
 

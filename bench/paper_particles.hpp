@@ -76,7 +76,8 @@ private:
 // through a grid of the web's cells.
 class ParticleBrick : public PaperBrick {
 public:
-    ParticleBrick(const dfb::Box3& bounds, const ParticleWeb& web) : bounds_(bounds), cellSize_(web.cellSize())
+    ParticleBrick(const dfb::Box3& bounds, const ParticleWeb& web, dfb::Executor& executor)
+        : bounds_(bounds), cellSize_(web.cellSize())
     {
         const float lower[3] = {bounds.lower.x, bounds.lower.y, bounds.lower.z},
                     upper[3] = {bounds.upper.x, bounds.upper.y, bounds.upper.z};
@@ -90,10 +91,15 @@ public:
             from[axis] = cellOf(lower[axis] - web.largestRadius() - slack());
             to[axis] = cellOf(upper[axis] + web.largestRadius() + slack());
         }
-        for (int z = from[2]; z <= to[2]; ++z)
+        std::vector<std::vector<Particle>> slices(static_cast<std::size_t>(to[2] - from[2] + 1));
+        executor.parallelFor(slices.size(), [&](std::size_t slice) {
             for (int y = from[1]; y <= to[1]; ++y)
                 for (int x = from[0]; x <= to[0]; ++x)
-                    web.forEach(x, y, z, [this](const Particle& p) { particles_.push_back(p); });
+                    web.forEach(x, y, from[2] + static_cast<int>(slice),
+                                [&](const Particle& p) { slices[slice].push_back(p); });
+        });
+        for (const std::vector<Particle>& slice : slices)
+            particles_.insert(particles_.end(), slice.begin(), slice.end());
         fillGrid();
     }
 
@@ -244,8 +250,9 @@ private:
 // Figure 5c.
 inline PaperScene particleWeb(int cells, std::uint32_t seed)
 {
-    return {"particles in " + std::to_string(cells) + "^3 cells", [=](const dfb::Box3& bounds, dfb::Executor&) {
-                return std::make_unique<ParticleBrick>(bounds, ParticleWeb(cells, seed));
+    return {"particles in " + std::to_string(cells) + "^3 cells",
+            [=](const dfb::Box3& bounds, dfb::Executor& executor) {
+                return std::make_unique<ParticleBrick>(bounds, ParticleWeb(cells, seed), executor);
             }};
 }
 

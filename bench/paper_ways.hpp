@@ -157,6 +157,10 @@ private:
             const float* rgba = fb->image().rgba32f();
             return std::vector<float>(rgba, rgba + 4 * fb->image().pixelCount());
         };
+        way.traffic = [report] {
+            return std::array<double, 2>{static_cast<double>(report->bytesSent),
+                                         static_cast<double>(report->messagesSent)};
+        };
         way.report = [report] { return *report; };
         return way;
     }
