@@ -17,6 +17,7 @@ struct Times {
     double image = 0;    // rank 0 has it; without compositing: all ranks have rendered
     double rendered = 0; // the slowest rank has rendered
     double cpu = 0;      // of all ranks
+    double busiest = 0;  // CPU time of the rank with the most: near the frame's time where each has a core
 
     // The paper's compositing overhead.
     double overhead() const { return image - rendered; }
@@ -61,6 +62,7 @@ public:
         t.rendered = 1e3 * (reduce(comm_, rendered, MPI_MAX) - first);
         t.image = makesImage ? 1e3 * (agree(comm_, end) - first) : t.rendered;
         t.cpu = 1e3 * reduce(comm_, cpu, MPI_SUM);
+        t.busiest = 1e3 * reduce(comm_, cpu, MPI_MAX);
         return t;
     }
 

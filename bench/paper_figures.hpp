@@ -108,15 +108,19 @@ inline void drawFigure(int figure, const std::string& caption, const std::vector
     if (figure == 10)
         for (const std::string& size : sizes)
             for (const std::string& ranks : distinct(found, ranksOf)) {
-                std::vector<PlotLine> lines;
-                for (const Measurement& m : found)
-                    if (ranksOf(m) == ranks && sizeText(m) == size) {
-                        PlotLine line{m.result.config, {}, false, static_cast<int>(lines.size())};
-                        for (std::size_t v = 0; v < m.views.size(); ++v)
-                            line.points.push_back({static_cast<double>(v), m.views[v], m.views[v], m.views[v]});
-                        lines.push_back(std::move(line));
-                    }
-                plots.addCurves(ranks + ", " + size, "view", "time of a frame [ms]", lines);
+                const auto draw = [&](const char* yTitle, const auto& valuesOf) {
+                    std::vector<PlotLine> lines;
+                    for (const Measurement& m : found)
+                        if (ranksOf(m) == ranks && sizeText(m) == size) {
+                            PlotLine line{m.result.config, {}, false, static_cast<int>(lines.size())};
+                            for (const double value : valuesOf(m))
+                                line.points.push_back({static_cast<double>(line.points.size()), value, value, value});
+                            lines.push_back(std::move(line));
+                        }
+                    plots.addCurves(ranks + ", " + size, "view", yTitle, lines);
+                };
+                draw("time of a frame [ms]", [](const Measurement& m) { return m.views; });
+                draw("CPU time of the busiest rank [ms]", [](const Measurement& m) { return m.busiestOfViews; });
             }
     plots.write(path);
 }

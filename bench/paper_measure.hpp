@@ -22,9 +22,11 @@ namespace bench {
 
 struct Measurement {
     int figure = 0, threads = 1;
-    Result result;             // its time is that of a frame
-    Figure render, overhead;   // ms: until the slowest rank had rendered, and from then on
-    std::vector<double> views; // ms of a frame from each view, the median over its repetitions
+    Result result;           // its time is that of a frame
+    Figure render, overhead; // ms: until the slowest rank had rendered, and from then on
+    Figure busiest;          // ms: CPU time of the rank with the most
+    // From each view, the median over its repetitions, ms: of a frame; CPU time of the busiest rank.
+    std::vector<double> views, busiestOfViews;
 
     std::string json() const
     {
@@ -33,14 +35,19 @@ struct Measurement {
         char more[512];
         std::snprintf(more, sizeof more,
                       R"(, "figure": %d, "threads": %d, "views": %zu, "render_ms": %.4f, "render_mad_ms": %.4f, )"
-                      R"("overhead_ms": %.4f, "overhead_mad_ms": %.4f, "view_ms": [)",
+                      R"("overhead_ms": %.4f, "overhead_mad_ms": %.4f, "busiest_cpu_ms": %.4f, "view_ms": [)",
                       figure, threads, views.size(), render.median, render.deviation, overhead.median,
-                      overhead.deviation);
+                      overhead.deviation, busiest.median);
         text += more;
-        for (std::size_t v = 0; v < views.size(); ++v) {
-            std::snprintf(more, sizeof more, "%s%.3f", v == 0 ? "" : ", ", views[v]);
-            text += more;
-        }
+        const auto append = [&](const std::vector<double>& values) {
+            for (std::size_t v = 0; v < values.size(); ++v) {
+                std::snprintf(more, sizeof more, "%s%.3f", v == 0 ? "" : ", ", values[v]);
+                text += more;
+            }
+        };
+        append(views);
+        text += "], \"view_busiest_cpu_ms\": [";
+        append(busiestOfViews);
         return text + "]}";
     }
 };
@@ -78,17 +85,20 @@ inline void measureWays(MPI_Comm comm, std::vector<PaperWay>& ways, int views, i
 inline Measurement measurementOf(const PaperWay& way)
 {
     Measurement m;
-    std::vector<double> image, render, overhead, cpu;
+    std::vector<double> image, render, overhead, cpu, busiest;
     for (const std::vector<Times>& view : way.times) {
-        std::vector<double> ofView;
+        std::vector<double> ofView, busiestOfView;
         for (const Times& t : view) {
             ofView.push_back(t.image);
+            busiestOfView.push_back(t.busiest);
             image.push_back(t.image);
             render.push_back(t.rendered);
             overhead.push_back(t.overhead());
             cpu.push_back(t.cpu);
+            busiest.push_back(t.busiest);
         }
         m.views.push_back(medianOf(ofView));
+        m.busiestOfViews.push_back(medianOf(busiestOfView));
     }
     m.result.bench = "bench_paper";
     m.result.system = way.system;
@@ -99,6 +109,7 @@ inline Measurement measurementOf(const PaperWay& way)
     m.result.rmse = m.result.levels = -1; // not known
     m.render = figureOf(render);
     m.overhead = figureOf(overhead);
+    m.busiest = figureOf(busiest);
     const std::array<double, 2> traffic = way.traffic();
     m.result.bytes = traffic[0];
     m.result.messages = traffic[1];
@@ -126,8 +137,8 @@ inline void writeMeasurements(const std::vector<Measurement>& all, const std::st
     };
     std::string table = "**" + caption + "**\n\n| size | ranks | | frame [ms] | local rendering [ms] | overhead [ms] | "
                         + (comparesWays ? "speed : the first's" : "speed-up")
-                        + " | slowest view : fastest | CPU [ms] | MB sent |\n"
-                          "|---|--:|---|--:|--:|--:|--:|--:|--:|--:|\n";
+                        + " | slowest view : fastest | CPU, all [ms] | CPU, busiest rank | MB sent |\n"
+                          "|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|\n";
     for (const Measurement& m : all) {
         const auto reference =
             std::find_if(all.begin(), all.end(), [&](const Measurement& o) { return isReference(m, o); });
@@ -135,8 +146,8 @@ inline void writeMeasurements(const std::vector<Measurement>& all, const std::st
         table += "| " + sizeText(m) + " | " + std::to_string(m.result.ranks) + " | " + m.result.system + ": "
                  + m.result.config + " | " + text(m.result.ms) + " | " + text(m.render) + " | " + text(m.overhead)
                  + " | " + text(reference->result.ms.median / m.result.ms.median) + " | " + text(*slowest / *fastest)
-                 + " | " + text(m.result.cpuMs) + " | " + (m.result.bytes > 0 ? text(1e-6 * m.result.bytes) : "-")
-                 + " |\n";
+                 + " | " + text(m.result.cpuMs) + " | " + text(m.busiest) + " | "
+                 + (m.result.bytes > 0 ? text(1e-6 * m.result.bytes) : "-") + " |\n";
     }
     std::printf("\n%s\n", table.c_str());
     const auto append = [](const std::string& path, const std::string& what) {

@@ -65,9 +65,13 @@ public:
             "dfb", name, format, [this, owner, world, own = worldOf(bricksPerRank)](FrameBuffer& fb, int view) {
                 if (!*world)
                     *world = std::make_unique<dfb::SharedWorld>(fb, own);
-                return dfb::startMixedParallel(
-                    fb, **world, camera(view), *owner,
-                    [&](const dfb::Brick& brick, auto& tile) { render(brick.id, view, tile); });
+                // Its cost is CPU time, which says the same where ranks share cores.
+                const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
+                    const double before = threadCpuSeconds();
+                    render(brick.id, view, tile);
+                    return 1e9 * (threadCpuSeconds() - before);
+                };
+                return dfb::startMixedParallel(fb, **world, camera(view), *owner, renderBrick);
             });
         if constexpr (std::is_same_v<Owner, dfb::MeasuredCostBricks>)
             way.frame = [frame = way.frame, report = way.report, owner](int view) {
@@ -78,7 +82,8 @@ public:
         return way;
     }
 
-    // Not collective: the whole scene by this rank alone, and without a framebuffer.
+    // Not collective: the whole scene by this rank alone, and without a framebuffer. Keeps it until forgetUncut(),
+    // which only those may call that render in parts.
     std::vector<float> uncut(int view)
     {
         hold(whole, {{0, 0, 0}, unit});
@@ -92,6 +97,8 @@ public:
         });
         return rgba;
     }
+
+    void forgetUncut() { bricks_.erase(whole); }
 
 private:
     static constexpr dfb::Vec3 unit{1, 1, 1};
