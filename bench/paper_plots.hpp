@@ -57,8 +57,10 @@ public:
         begin(title, "ranks", yTitle);
         for (const double mark : marks)
             tickX(x(mark), number(mark));
+        const std::vector<double> digits =
+            most < 8 * least ? std::vector<double>{1, 1.5, 2, 3, 4, 5, 7} : std::vector<double>{1, 2, 5};
         for (double base = 1e-4; base < most; base *= 10)
-            for (const double digit : {1.0, 2.0, 5.0})
+            for (const double digit : digits)
                 if (const double v = digit * base; v >= least && v <= most)
                     tickY(y(v), number(v));
         drawLines(lines, x, y);
