@@ -1,7 +1,7 @@
 // What the loops over pixels cost beside memcpy: blending in a known order and sorted by depth, conversion to the
 // output formats, encoding and decoding of inputs. Each is called as the pipeline of a tile calls it, on one thread,
 // and counted in bytes of its input against memcpy of as many bytes in the same run. No MPI; half a minute.
-//   bench_kernels [--json FILE] [--benchmark_filter=REGEX and other options of Google Benchmark]
+//   bench_kernels [--json FILE] [--table FILE] [--benchmark_filter=REGEX and other options of Google Benchmark]
 // For example --benchmark_filter='memcpy|encode', with memcpy, as others are compared with it. Times are of the
 // thread's CPU, medians over repetitions that are interleaved at random, so that what else the machine does disturbs
 // all alike.
@@ -589,8 +589,8 @@ std::string number(const char* format, double value)
     return text;
 }
 
-// The table, and JSON lines into `json` if that is not empty.
-void report(const Reporter& reporter, const std::string& json)
+// The table, also into the file `tablePath`, and JSON lines into `json`, if these are not empty.
+void report(const Reporter& reporter, const std::string& json, const std::string& tablePath)
 {
     std::ofstream file;
     if (!json.empty())
@@ -631,7 +631,10 @@ void report(const Reporter& reporter, const std::string& json)
             file << R"(, "target": )" << number("%g", kernel.target);
         file << "}\n";
     }
-    table.print("Medians of the thread's CPU time ± median absolute deviation; bytes are of the input:");
+    const char* title = "Medians of the thread's CPU time ± median absolute deviation; bytes are of the input:";
+    table.print(title);
+    if (!tablePath.empty())
+        table.appendTo(tablePath, title);
     if (!json.empty() && !file.flush())
         throw std::runtime_error("can not write " + json);
 }
@@ -643,11 +646,13 @@ int main(int argc, char** argv)
     // What Google Benchmark is told unless the command line says otherwise: the last one counts.
     std::vector<std::string> arguments{argv[0], "--benchmark_repetitions=15", "--benchmark_min_time=0.008",
                                        "--benchmark_enable_random_interleaving=true"};
-    std::string json;
+    std::string json, table;
     for (int i = 1; i < argc; ++i) {
         const std::string argument = argv[i];
         if (argument == "--json" && i + 1 < argc)
             json = argv[++i];
+        else if (argument == "--table" && i + 1 < argc)
+            table = argv[++i];
         else
             arguments.push_back(argument);
     }
@@ -665,7 +670,7 @@ int main(int argc, char** argv)
         measureWire();
         Reporter reporter;
         benchmark::RunSpecifiedBenchmarks(&reporter);
-        report(reporter, json);
+        report(reporter, json, table);
     } catch (const std::exception& e) {
         std::fprintf(stderr, "bench_kernels: %s\n", e.what());
         return 1;

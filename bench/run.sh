@@ -1,48 +1,91 @@
 #!/bin/sh
-# sh bench/run.sh [--quick]
-# Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs
-# bench_error_time on 4 and on 8 ranks, its table to README.md, and bench_compositing and bench_overlap on 2, 4 and 8
-# ranks, bench_scaling and bench_skip, their tables to bench/README.md; all figures to bench/results. 17 minutes, or 6.
-# The exit status is 1 if what the last two count is not what it should be.
+# sh bench/run.sh [--quick] [--launcher CMD]
+# Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
+# benchmarks but bench_messaging and bench_gather: their tables go to README.md and bench/README.md, all figures to
+# bench/results. Half an hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
+# of a program, is to start it there, 4 ranks at best, one on each.
+# The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
 set -eu
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
-frames=41 compositing_frames=11 views=12 skip_size=4096x4096 quick=
-[ "${1:-}" != --quick ] || frames=5 compositing_frames=3 views=4 skip_size=1024x1024 quick=--quick
+frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
+launcher=
+while [ $# -gt 0 ]; do
+    case $1 in
+    --quick)
+        frames=5 compositing_frames=3 views=4 skip_size=1024x1024 paper_views=3 paper_sizes=256x256 quick=--quick
+        ;;
+    --launcher)
+        launcher=$2
+        shift
+        ;;
+    *)
+        echo "run.sh: no option $1: sh bench/run.sh [--quick] [--launcher CMD]" >&2
+        exit 2
+        ;;
+    esac
+    shift
+done
 jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
 results=bench/results
+bench=build/release/bench
 
-sh cmake/install_packages.sh
+sh cmake/install_packages.sh bench
 sh bench/get_icet.sh || [ $? -eq 3 ] # without IceT the others are measured
 cmake --preset release -DDFB_BUILD_BENCH=ON
 cmake --build --preset release --parallel "$jobs" --target bench_error_time bench_compositing bench_overlap \
-    bench_scaling bench_skip
+    bench_scaling bench_skip bench_paper bench_kernels
 
 mkdir -p "$results"
-rm -f "$results"/error_time.* "$results"/compositing.* "$results"/overlap.* "$results"/scaling.* "$results"/skip.*
+rm -f "$results"/*
+
+"$bench"/bench_kernels --json "$results/kernels.json" --table "$results/kernels.md"
+
 for ranks in 4 8; do
-    mpiexec -n "$ranks" build/release/bench/bench_error_time --frames "$frames" --commit "$commit" \
+    mpiexec -n "$ranks" "$bench"/bench_error_time --frames "$frames" --commit "$commit" \
         --json "$results/error_time.json" --svg "$results/error_time.$ranks" --table "$results/error_time.$ranks.md"
 done
 
-for ranks in 2 4 8; do
-    mpiexec -n "$ranks" build/release/bench/bench_compositing --scene all --size 1024x1024 \
+# What has been measured at one size tells most; the others show whether it holds.
+for ranks in 2 3 4 8 16; do
+    mpiexec -n "$ranks" "$bench"/bench_compositing --scene all --size 1024x1024 \
         --frames "$compositing_frames" --commit "$commit" \
         --json "$results/compositing.json" --table "$results/compositing.md"
 done
+for ranks in 2 4 8; do
+    mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
+        --only "in order, float32, tiles of 128|in order, unorm8|icet: float, direct|icet: ubyte, direct|tree" \
+        --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
+done
 
 for ranks in 2 4 8; do
-    mpiexec -n "$ranks" build/release/bench/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
+    mpiexec -n "$ranks" "$bench"/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
         --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
 done
 
+for figure in 6 7 8 9 10; do
+    ranks=1,2,4,8
+    [ "$figure" -ne 10 ] || ranks=4,8
+    mpiexec -n 8 "$bench"/bench_paper --figure "$figure" --ranks "$ranks" --size "$paper_sizes" \
+        --views "$paper_views" --check 1 --commit "$commit" \
+        --json "$results/paper.json" --svg "$results/paper.$figure.svg" --table "$results/paper.md"
+done
+
 status=0
-build/release/bench/bench_scaling $quick --commit "$commit" --json "$results/scaling.json" \
+"$bench"/bench_scaling $quick --commit "$commit" --json "$results/scaling.json" \
     --svg "$results/scaling.svg" --table "$results/scaling.md" || status=1
-build/release/bench/bench_skip $quick --size "$skip_size" --commit "$commit" --json "$results/skip.json" \
+"$bench"/bench_skip $quick --size "$skip_size" --commit "$commit" --json "$results/skip.json" \
     --svg "$results/skip.svg" --table "$results/skip.md" || status=1
+
+if [ -n "$launcher" ]; then
+    $launcher "$bench"/bench_compositing --scene bricks --size 1024x1024 --frames "$frames" --commit "$commit" \
+        --only "in order, float32, tiles of 128|in order, float32, snappy|icet: float, direct|icet: float, sequential" \
+        --json "$results/network.json" --table "$results/network.md"
+else
+    echo "run.sh: no --launcher: nothing was measured over a network"
+fi
 
 # between FILE NAME TABLE...: what FILE has between the marks of NAME is what was measured.
 between() {
@@ -65,4 +108,6 @@ between bench/README.md compositing "$results/compositing.md"
 between bench/README.md overlap "$results/overlap.md"
 between bench/README.md scaling "$results/scaling.md"
 between bench/README.md skip "$results/skip.md"
+between bench/README.md paper "$results/paper.md"
+between bench/README.md kernels "$results/kernels.md"
 exit "$status"

@@ -1,0 +1,123 @@
+// PaperBrick: a brick of a generated scene, which can be rendered; and what its renderers have in common.
+#pragma once
+
+#include <dfb/exec.hpp>
+#include <dfb/image.hpp>
+#include <dfb/render/visibility.hpp>
+#include <dfb/render/world.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <limits>
+#include <memory>
+#include <string>
+
+namespace bench {
+
+// Where pixels go: rows of `stride` pixels, of which the first is that of region.x0 and region.y0, cleared before.
+// Depth may be null.
+struct Pixels {
+    dfb::Region region;
+    int width = 0, height = 0; // of the whole image
+    std::ptrdiff_t stride = 0;
+    float *color = nullptr, *depth = nullptr;
+};
+
+struct Traced {
+    float rgba[4] = {0, 0, 0, 0}; // premultiplied
+    float depth = std::numeric_limits<float>::infinity();
+    float through = 1; // of the light from behind
+
+    // Over what comes behind; the colour is not premultiplied.
+    void add(float t, const dfb::Vec3& color, float alpha)
+    {
+        if (!(alpha > 0))
+            return;
+        if (rgba[3] == 0)
+            depth = t;
+        const float part = through * alpha;
+        rgba[0] += part * color.x;
+        rgba[1] += part * color.y;
+        rgba[2] += part * color.z;
+        rgba[3] += part;
+        through *= 1 - alpha;
+    }
+};
+
+// Half-open: what belongs to a brick is up to where a point is, and no rank needs to ask another.
+inline bool contains(const dfb::Box3& box, const dfb::Vec3& p)
+{
+    return p.x >= box.lower.x && p.y >= box.lower.y && p.z >= box.lower.z && p.x < box.upper.x && p.y < box.upper.y
+           && p.z < box.upper.z;
+}
+
+// The distances at which a ray enters and leaves a box that is wider by `slack`; false if it misses.
+inline bool clip(const dfb::Box3& box, float slack, const dfb::Vec3& origin, const dfb::Vec3& direction, float& enter,
+                 float& leave)
+{
+    enter = 0;
+    leave = std::numeric_limits<float>::max();
+    const auto along = [&](float lower, float upper, float from, float to) {
+        const float a = (lower - slack - from) / to, b = (upper + slack - from) / to;
+        if (std::isnan(a) || std::isnan(b)) // 0 / 0, of a ray within a face, limits nothing
+            return;
+        enter = std::max(enter, std::min(a, b));
+        leave = std::min(leave, std::max(a, b));
+    };
+    along(box.lower.x, box.upper.x, origin.x, direction.x);
+    along(box.lower.y, box.upper.y, origin.y, direction.y);
+    along(box.lower.z, box.upper.z, origin.z, direction.z);
+    return enter <= leave;
+}
+
+// Of a surface: half of it ambient, which `openness` (0 to 1) dims, the rest from a lamp above the viewer's shoulder.
+inline dfb::Vec3 lit(const dfb::Vec3& color, dfb::Vec3 normal, const dfb::Vec3& direction, float openness)
+{
+    if (dot(normal, direction) > 0)
+        normal = -1.0f * normal;
+    const dfb::Vec3 lamp = normalize(dfb::Vec3{0.35f, 0.75f, 0.2f} - direction);
+    const float diffuse = std::max(0.0f, dot(normal, lamp)),
+                mirrored = std::max(0.0f, dot(normal, normalize(lamp - direction)));
+    float gloss = mirrored * mirrored;
+    gloss *= gloss, gloss *= gloss, gloss *= gloss;
+    return (0.45f * openness + 0.6f * diffuse) * color + 0.25f * gloss * dfb::Vec3{1, 1, 1};
+}
+
+// The rank's part of a scene, between bounds; with as much of what surrounds it as rays need that stay within.
+class PaperBrick {
+public:
+    PaperBrick() = default;
+    PaperBrick(const PaperBrick&) = delete;
+    PaperBrick& operator=(const PaperBrick&) = delete;
+    virtual ~PaperBrick() = default;
+
+    // What rays meet within the bounds. From several threads at once.
+    virtual void render(const dfb::PerspectiveCamera& camera, const Pixels& to) const = 0;
+};
+
+// Fills a unit cube. Whatever the bounds of its bricks, together they show the same.
+struct PaperScene {
+    std::string name;
+    std::function<std::unique_ptr<PaperBrick>(const dfb::Box3&, dfb::Executor&)> make;
+};
+
+// Calls trace(direction, x, y) for each pixel, and stores what it returns.
+template <class Trace>
+void tracePixels(const dfb::PerspectiveCamera& camera, const Pixels& to, const Trace& trace)
+{
+    for (int y = to.region.y0; y < to.region.y1; ++y)
+        for (int x = to.region.x0; x < to.region.x1; ++x) {
+            const Traced traced = trace(camera.direction(x + 0.5, y + 0.5, to.width, to.height), x, y);
+            if (traced.rgba[3] == 0)
+                continue;
+            const std::ptrdiff_t at = (y - to.region.y0) * to.stride + (x - to.region.x0);
+            std::copy_n(traced.rgba, 4, to.color + 4 * at);
+            if (to.depth)
+                to.depth[at] = traced.depth;
+        }
+}
+
+} // namespace bench
