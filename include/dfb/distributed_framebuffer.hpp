@@ -40,15 +40,19 @@ public:
     // A frame that has begun. Leaving its scope without end() cancels it on all ranks.
     class Frame {
     public:
-        Frame(Frame&& other) noexcept : fb_(other.fb_), engine_(std::exchange(other.engine_, nullptr)) {}
+        Frame(Frame&& other) noexcept
+            : fb_(other.fb_), engine_(other.engine_), number_(other.number_),
+              isOpen_(std::exchange(other.isOpen_, false))
+        {
+        }
         Frame& operator=(Frame&&) = delete;
         ~Frame()
         {
-            if (engine_)
-                engine_->cancel();
+            if (isOpen_)
+                engine_->leave();
         }
 
-        std::int64_t number() const noexcept { return engine_->frame(); }
+        std::int64_t number() const noexcept { return number_; }
 
         // Makes `tile` this frame's tile of that index and pass: all pixels cleared, generation 0, no children, source
         // this rank, part 0. Throws InvalidArgument for an index or a pass that the frame does not have.
@@ -101,8 +105,14 @@ public:
         // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
         bool failed() const noexcept { return engine_->failed(); }
 
-        // Makes the frame fail on all ranks, with the text of this exception. From any thread.
+        // Makes the frame fail on all ranks, with the text of this exception; with FrameParams::allowPartial it goes on
+        // without what the exception was about. From any thread.
         void abort(const std::exception_ptr& reason) { engine_->abort(reason); }
+
+        // Makes the frame fail on all ranks with ErrorKind::Cancelled: nobody needs it any more. end() is called all
+        // the same; tiles that are set meanwhile are dropped, those that come late counted. From any thread, also
+        // during end() or after it, when it does nothing.
+        void cancel() const { engine_->cancel(number_); }
 
         // Collective; for several framebuffers, in the same order on all ranks. Waits until all tiles of all ranks are
         // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
@@ -110,17 +120,19 @@ public:
         // begin the next.
         FrameReport end()
         {
-            Engine* engine = std::exchange(engine_, nullptr);
-            const FrameReport report = engine->end();
-            fb_->lastEnded_ = engine;
+            isOpen_ = false;
+            const FrameReport report = engine_->end();
+            fb_->lastEnded_ = engine_;
             return report;
         }
 
     private:
         friend class DistributedFrameBuffer;
-        Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine) {}
+        Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
         DistributedFrameBuffer* fb_;
         Engine* engine_;
+        std::int64_t number_;
+        bool isOpen_ = true;
     };
 
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
@@ -168,6 +180,9 @@ public:
     // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be
     // frames in flight. Empty elsewhere.
     const Image& image() const noexcept { return lastEnded_->image(); }
+
+    // On the display rank: false if the last frame ended without that tile, see FrameParams::allowPartial.
+    bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
     // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI.

@@ -22,7 +22,7 @@ enum class ErrorKind : std::uint32_t {
     MalformedMessage, // bytes off the wire that are not a message of this framebuffer
     Disagreement,     // ranks were given different configurations or frame parameters
     UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
-    Cancelled,        // a frame was left without end()
+    Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time
     Transport         // the transport reported a failure
 };

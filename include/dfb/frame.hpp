@@ -4,6 +4,7 @@
 #include <dfb/channels.hpp>
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/error.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/wire_format.hpp>
@@ -12,6 +13,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <memory>
+#include <optional>
 #include <vector>
 
 namespace dfb {
@@ -86,6 +88,11 @@ struct FrameParams {
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
     // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
     int timeoutMs = 0;
+    // A frame that fails has the tiles that were finished by then: end() throws nothing but says so in
+    // FrameReport::failure. An exception of a renderer or an operation costs no more than the tiles that it was about;
+    // what misses an input is given up after timeoutMs, which must not be 0. See also
+    // DistributedFrameBuffer::isComplete().
+    bool allowPartial = false;
 };
 
 // What its operation says of a tile that was finished in a frame.
@@ -104,6 +111,10 @@ struct Figure {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
+    std::optional<ErrorInfo> failure; // all: with FrameParams::allowPartial, why there are tiles missing, if there are
+    // All: tiles that were not finished; the display rank's has those, too, that have not come. They show the
+    // background.
+    std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the call of end(), this rank
     double compositingOverheadMs = 0; // the call of end() to its return, this rank

@@ -6,9 +6,12 @@
 
 #include <dfb/testing/fault_transport.hpp>
 
+#include <algorithm>
 #include <cstdint>
 #include <memory>
+#include <numeric>
 #include <string>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -19,7 +22,8 @@ struct FaultGroup {
     std::uint64_t seed = 0;
     int ranks = 2;
     bool harmless = false; // nothing is lost or damaged: all frames must be right
-    Loop loop = Loop::Listing3;
+    enum class Op { Sorted, Ordered, Nearest, Average } op = Op::Sorted;
+    Loop loop = Loop::Listing3; // of Op::Sorted; the others have one each
     Scene scene;
     dfb::testing::FaultOptions faults;
 };
@@ -32,8 +36,14 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     g.seed = seed;
     g.ranks = 2 + pick(0, 4);
     g.loop = std::vector<Loop>{Loop::Listing3, Loop::Declared, Loop::ImageDealt}[static_cast<std::size_t>(pick(4, 3))];
-    g.scene = makeScene(isDataParallel(g.loop) ? 1 + pick(8, 6) : 1, seed, 33 + pick(12, 40), 17 + pick(20, 40),
-                        1 + pick(28, 2));
+    g.op = static_cast<FaultGroup::Op>(std::max(0, pick(50, 6) - 2)); // half of them sorted
+    const bool isImageParallel =
+        g.op == FaultGroup::Op::Average || (g.op == FaultGroup::Op::Sorted && !isDataParallel(g.loop));
+    g.scene =
+        makeScene(isImageParallel ? 1 : 1 + pick(8, 6), seed, 33 + pick(12, 40), 17 + pick(20, 40), 1 + pick(28, 2));
+    g.scene.rule = g.op == FaultGroup::Op::Ordered   ? dfb::BlendRule::InOrder
+                   : g.op == FaultGroup::Op::Nearest ? dfb::BlendRule::Nearest
+                                                     : dfb::BlendRule::SortByDepth;
     g.faults.seed = seed;
     g.faults.maxDelay = std::chrono::microseconds(200 + 300 * pick(32, 5));
     g.faults.reorder = 0.3 * pick(36, 2);
@@ -44,6 +54,7 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     g.faults.corrupt = pick(40, 3) == 2 ? 2 * lethal : 0;
     g.harmless = g.faults.drop + g.faults.corrupt == 0;
     g.scene.timeoutMs = g.harmless ? 20000 : 80;
+    g.scene.allowPartial = pick(54, 3) == 0;
     // Left alone is what makes the framebuffer, as no frame's time-out covers it; and the word of a rank that it gives
     // up, which a transport that still works at all delivers.
     g.faults.only = [](int, const dfb::Buffer& message) {
@@ -56,17 +67,47 @@ inline FaultGroup faultGroup(std::uint64_t seed)
 }
 
 struct FaultEnding {
-    std::string text;      // as of outcomeOf()
+    std::string text;      // as of outcomeOf(); "partial" and why, if that is what the image is
     std::size_t wrong = 0; // values, on the display rank
 };
 
+// A frame of a group with the loop that goes with the operation.
+template <class TileOp, class FrameBuffer>
+dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group)
+{
+    using Op = FaultGroup::Op;
+    constexpr Op op = std::is_same_v<TileOp, dfb::BasicAlphaBlend<16>>       ? Op::Sorted
+                      : std::is_same_v<TileOp, dfb::BasicOrderedBlend<16>>   ? Op::Ordered
+                      : std::is_same_v<TileOp, dfb::BasicDepthComposite<16>> ? Op::Nearest
+                                                                             : Op::Average;
+    const Scene& s = group.scene;
+    const auto renderOne = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
+    if constexpr (op == Op::Sorted) {
+        return renderLoop(fb, s, group.loop);
+    } else if constexpr (op == Op::Average) {
+        return dfb::renderImageParallel(
+            fb, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); },
+            paramsOf(s));
+    } else {
+        const dfb::SharedWorld world(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())));
+        dfb::RoundRobinBricks inTurn;
+        if constexpr (op == Op::Nearest) {
+            return dfb::renderMixedParallel(fb, world, FlatCamera(), inTurn, renderOne, paramsOf(s));
+        } else {
+            std::vector<int> order(s.bricks.size()); // by id, as in the world
+            std::iota(order.begin(), order.end(), 0);
+            return dfb::renderOrdered(fb, world, FlatCamera(), order, inTurn, renderOne, paramsOf(s));
+        }
+    }
+}
+
 // One rank's part: frames until one ends in a TransportError, after which nothing more can be done.
-template <class Base>
+template <class Base, class TileOp = dfb::BasicAlphaBlend<16>>
 std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communicator, const FaultGroup& group,
                                      const std::vector<dfb::testing::Pixel>& expected, int frames)
 {
     using Transport = dfb::testing::FaultTransport<Base>;
-    using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport>;
     dfb::FrameBufferConfig config;
     config.width = group.scene.width;
     config.height = group.scene.height;
@@ -87,11 +128,16 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     FrameBuffer& fb = *made;
     for (int frame = 0; frame < frames; ++frame) {
         FaultEnding ending;
+        std::string why;
         ending.text = outcomeOf([&] {
-            const auto report = renderLoop(fb, group.scene, group.loop);
+            const auto report = faultFrame<TileOp>(fb, group);
+            if (report.failure)
+                why = "partial: " + report.failure->message;
             if (fb.isDisplayRank())
-                ending.wrong = wrongValues(Picture(fb.image(), report), expected);
+                ending.wrong = wrongValues(Picture(fb.image(), report), referenceOf(group.scene, fb, expected));
         });
+        if (!why.empty())
+            ending.text = why;
         const bool over = has(ending.text, "TransportError");
         endings.push_back(std::move(ending));
         if (over)
@@ -108,7 +154,8 @@ inline std::string verdictOn(const std::vector<FaultEnding>& ranks, bool harmles
         anyTransport = anyTransport || has(r.text, "TransportError");
         if (r.wrong > 0)
             return "a wrong image: " + std::to_string(r.wrong) + " values";
-        if (r.text != "fine" && !has(r.text, "FrameError") && !has(r.text, "TransportError"))
+        if (r.text != "fine" && r.text.rfind("partial", 0) != 0 && !has(r.text, "FrameError")
+            && !has(r.text, "TransportError"))
             return "an error of another type: " + r.text;
         if (harmless && r.text != "fine")
             return "nothing was lost, but: " + r.text;

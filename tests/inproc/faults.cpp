@@ -10,11 +10,11 @@
 namespace {
 
 struct Tally {
-    int frames = 0, right = 0, frameErrors = 0, transportErrors = 0;
+    int frames = 0, right = 0, partial = 0, frameErrors = 0, transportErrors = 0;
     std::string wrong; // the first, with its seed
 };
 
-// Groups of frames until there are `frames`.
+// Groups of frames, of all operations and loops, until there are `frames`.
 Tally faultGroups(std::uint64_t firstSeed, int frames)
 {
     Tally tally;
@@ -23,8 +23,21 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
         const auto expected = scene::referenceOf(group.scene);
         std::vector<std::vector<scene::FaultEnding>> endings(static_cast<std::size_t>(group.ranks));
         dfb::runRanks(group.ranks, [&](dfb::InprocCommunicator communicator) {
-            endings[static_cast<std::size_t>(communicator.rank())] =
-                scene::faultFrames<dfb::InprocTransport>(communicator, group, expected, 10);
+            using Op = scene::FaultGroup::Op;
+            using Base = dfb::InprocTransport;
+            auto& mine = endings[static_cast<std::size_t>(communicator.rank())];
+            switch (group.op) {
+            case Op::Sorted: mine = scene::faultFrames<Base>(communicator, group, expected, 10); break;
+            case Op::Ordered:
+                mine = scene::faultFrames<Base, dfb::BasicOrderedBlend<16>>(communicator, group, expected, 10);
+                break;
+            case Op::Nearest:
+                mine = scene::faultFrames<Base, dfb::BasicDepthComposite<16>>(communicator, group, expected, 10);
+                break;
+            case Op::Average:
+                mine = scene::faultFrames<Base, dfb::BasicImageParallel<16>>(communicator, group, expected, 10);
+                break;
+            }
         });
         std::size_t longest = 0;
         for (const auto& e : endings)
@@ -46,6 +59,8 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
                 ++tally.transportErrors;
             else if (ended("FrameError"))
                 ++tally.frameErrors;
+            else if (ended("partial"))
+                ++tally.partial;
             else
                 ++tally.right;
         }
@@ -56,11 +71,12 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
 void check(const Tally& tally, int frames)
 {
     INFO(tally.wrong);
-    INFO(tally.frames << " frames: " << tally.right << " right, " << tally.frameErrors << " FrameError, "
-                      << tally.transportErrors << " TransportError");
+    INFO(tally.frames << " frames: " << tally.right << " right, " << tally.partial << " partial, " << tally.frameErrors
+                      << " FrameError, " << tally.transportErrors << " TransportError");
     CHECK(tally.wrong.empty());
     CHECK(tally.frames >= frames);
     CHECK(10 * tally.right >= 3 * frames);
+    CHECK(tally.partial > 0);
     CHECK(tally.frameErrors > 0);
     CHECK(tally.transportErrors > 0);
 }

@@ -34,6 +34,8 @@ struct Scene {
     int width = 97, height = 61; // primes
     int passes = 1;
     int timeoutMs = 0;
+    bool allowPartial = false;
+    dfb::BlendRule rule = dfb::BlendRule::SortByDepth; // InOrder: of the bricks
     std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
     std::uint64_t seed = 1;
     std::vector<dfb::Brick> bricks;
@@ -105,6 +107,7 @@ inline dfb::FrameParams paramsOf(const Scene& s)
     params.background = s.background;
     params.passes = s.passes;
     params.timeoutMs = s.timeoutMs;
+    params.allowPartial = s.allowPartial;
     return params;
 }
 
@@ -225,14 +228,33 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             std::vector<dfb::testing::Pixel> passes;
             for (int pass = 0; pass < s.passes; ++pass) {
                 std::vector<dfb::testing::Sample> samples;
-                for (const dfb::Brick& brick : s.bricks)
-                    if (const auto sample = sampleOf(s, brick, pass, x, y))
+                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing
+                    if (const auto sample = sampleOf(s, brick, pass, x, y);
+                        sample && sample->rgba != std::array<float, 4>{})
                         samples.push_back(*sample);
-                passes.push_back(dfb::testing::composite(std::move(samples), s.background));
+                passes.push_back(
+                    s.rule == dfb::BlendRule::SortByDepth ? dfb::testing::composite(std::move(samples), s.background)
+                    : s.rule == dfb::BlendRule::InOrder   ? dfb::testing::compositeInOrder(samples, s.background)
+                                                          : dfb::testing::nearest(samples, s.background));
             }
             result.push_back(dfb::testing::mean(passes));
         }
     return result;
+}
+
+// The same where some tiles are not complete.
+template <class FrameBuffer>
+std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const FrameBuffer& fb,
+                                             std::vector<dfb::testing::Pixel> expected)
+{
+    const dfb::testing::Pixel background = dfb::testing::mean(std::vector<dfb::testing::Pixel>(
+        static_cast<std::size_t>(s.passes), dfb::testing::composite({}, s.background)));
+    for (int tile = 0; tile < fb.layout().tileCount(); ++tile) {
+        const dfb::Region r = fb.layout().region(tile);
+        for (int y = r.y0; y < r.y1 && !fb.isComplete(tile); ++y)
+            std::fill_n(expected.begin() + y * s.width + r.x0, r.width(), background);
+    }
+    return expected;
 }
 
 // Number of values that are off: floats by more than 1 ulp, bytes and depths at all. All of them if the size is wrong.

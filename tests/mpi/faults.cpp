@@ -34,8 +34,10 @@ TEST_CASE("Disturbed frames over MPI end in the right image or in an error of df
 {
     int frames = 0, right = 0;
     // A communicator that is not shut down in order is not freed, and there may be a thousand or two of them.
-    for (std::uint64_t seed = 500; seed < 530; ++seed) {
+    for (std::uint64_t seed = 500; seed < 560; ++seed) {
         const scene::FaultGroup group = scene::faultGroup(seed);
+        if (group.op != scene::FaultGroup::Op::Sorted)
+            continue; // the others have their turn without MPI
         const auto expected = scene::referenceOf(group.scene);
         constexpr int most = 6;
         const auto mine = scene::faultFrames<dfb::MpiTransport>(MPI_COMM_WORLD, group, expected, most);

@@ -21,6 +21,7 @@
 #include <mutex>
 #include <new>
 #include <optional>
+#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -74,12 +75,14 @@ public:
         frame_ = frame;
         compresses_ = compresses && settings_.codec;
         batch_.reset();
+        flushed_ = false;
         tilesSent_ = 0;
         placed_.clear();
         held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
         ranksDone_ = 0;
+        incomplete_.clear();
         for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
             tilesOf_[r].received = 0;
             tilesOf_[r].announced = senders_[r] ? -1 : 0;
@@ -199,19 +202,22 @@ public:
         return place;
     }
 
-    void commit(int tile, Place&& place)
+    // False if it comes too late, after flush().
+    bool commit(int tile, Place&& place)
     {
         if (!enabled())
-            return;
+            return true;
         if (isDisplay_) {
             state_[static_cast<std::size_t>(tile)] = TileState::Received;
-            return;
+            return true;
         }
         if (place.writer) {
             const std::lock_guard<std::mutex> lock(mutex_);
+            if (flushed_)
+                return false;
             placed_.push_back(tile);
             ++tilesSent_;
-            return; // and with `place` the writer leaves
+            return true; // and with `place` the writer leaves
         }
         static thread_local FinishedRecord::Plan plan;
         record_.plan(tile, layout_.region(tile), place, compresses_, plan);
@@ -219,6 +225,8 @@ public:
         std::byte* record = nullptr;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
+            if (flushed_)
+                return false;
             if (batch_ && batch_->used + plan.bytes() > batch_->message.size()) {
                 batch_->closed = true;
                 if (batch_->writers == 0)
@@ -246,35 +254,42 @@ public:
         }
         if (isLast)
             sendBatch(*batch);
+        return true;
     }
 
-    // All tiles of this rank are committed: sends the rest, and how many there were.
+    // All tiles of this rank are committed, or the others come too late: sends the rest, and how many there were. Only
+    // the first call does anything.
     void flush()
     {
         if (!enabled() || !senders_[static_cast<std::size_t>(rank_)])
             return;
         std::shared_ptr<Batch> last;
         std::vector<Buffer> held;
+        Buffer done;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            last = std::move(batch_);
-            batch_.reset();
-        }
-        if (last)
-            sendBatch(*last);
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
+            if (flushed_)
+                return;
+            flushed_ = true;
+            if (batch_) {
+                batch_->closed = true;
+                if (batch_->writers == 0) // else the last of these sends it
+                    last = batch_;
+                batch_.reset();
+            }
             held.swap(held_);
+            const MessageHeader header = messageHeader(MessageKind::TilesDone);
+            done = pool_->acquire(sizeof header + sizeof tilesSent_ + sizeof(std::int32_t) * placed_.size());
+            std::memcpy(done.data(), &header, sizeof header);
+            std::memcpy(done.data() + sizeof header, &tilesSent_, sizeof tilesSent_);
+            std::copy(placed_.begin(), placed_.end(),
+                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof tilesSent_));
         }
         for (Buffer& message : held)
             send_(std::move(message));
-        const MessageHeader header = messageHeader(MessageKind::TilesDone);
-        Buffer message = pool_->acquire(sizeof header + sizeof tilesSent_ + sizeof(std::int32_t) * placed_.size());
-        std::memcpy(message.data(), &header, sizeof header);
-        std::memcpy(message.data() + sizeof header, &tilesSent_, sizeof tilesSent_);
-        std::copy(placed_.begin(), placed_.end(),
-                  reinterpret_cast<std::int32_t*>(message.data() + sizeof header + sizeof tilesSent_));
-        send_(std::move(message));
+        if (last)
+            sendBatch(*last);
+        send_(std::move(done));
     }
 
     // The display rank's side of a FinishedTiles message. Throws Error (MalformedMessage).
@@ -383,6 +398,24 @@ public:
         }
     }
 
+    // On the display rank: whether tiles of that rank have not come, and whether this may be one of them.
+    bool isOnItsWay(int tile, int owner) const
+    {
+        if (!isDisplay_ || !enabled() || owner == rank_)
+            return false;
+        const TilesOf& t = tilesOf_[static_cast<std::size_t>(owner)];
+        return t.received != t.announced && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+    }
+    // The same: the tile of a frame that is over is not to be seen.
+    void setIncomplete(int tile)
+    {
+        if (tile < 0 || tile >= static_cast<int>(state_.size()))
+            return;
+        state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
+        incomplete_.insert(tile);
+    }
+    bool isComplete(int tile) const { return incomplete_.count(tile) == 0; }
+
     // The frame has failed: nothing in the image can be relied on.
     void invalidate()
     {
@@ -473,10 +506,12 @@ private:
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
         if (settings_.atEnd) {
             const std::lock_guard<std::mutex> lock(mutex_);
-            held_.push_back(std::move(message));
-        } else {
-            send_(std::move(message));
+            if (!flushed_) {
+                held_.push_back(std::move(message));
+                return;
+            }
         }
+        send_(std::move(message));
     }
 
     MessageHeader messageHeader(MessageKind kind) const
@@ -507,6 +542,7 @@ private:
 
     mutable std::mutex mutex_;
     std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
+    bool flushed_ = false;
     std::vector<Buffer> held_;
     std::int64_t tilesSent_ = 0;
     SharedImage remote_;               // of the display rank, if this one sees it
@@ -517,6 +553,7 @@ private:
     ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
     std::array<float, 4> background_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
+    std::set<int> incomplete_;                  // of the last frame
     std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};
     std::atomic<int> ranksDone_{0};
     std::vector<TilesOf> tilesOf_; // per rank, on the display rank

@@ -97,6 +97,7 @@ public:
     int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return pipeline_->table().owned(); }
     const Image& image() const noexcept { return pipeline_->gather().image(); }
+    bool isComplete(int tile) const { return pipeline_->gather().isComplete(tile); }
     std::int64_t frame() const noexcept { return gate_.frame(); }
     bool wantsDeclaration() const noexcept { return wantsDeclaration_; }
     bool failed() const noexcept { return outcome_->failed(); }
@@ -112,8 +113,9 @@ public:
         checkSamples(params);
         if (params.declarationKey != 0 && !params.declared)
             throw InvalidArgument("a declarationKey without declared inputs");
-        if (params.timeoutMs < 0)
-            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
+        if (params.timeoutMs < 0 || (params.timeoutMs == 0 && params.allowPartial))
+            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms"
+                                  + (params.allowPartial ? " for a frame that may be partial" : ""));
         if (messaging_->messenger().needsCaller() && !messaging_->messenger().mayPoll())
             throw InvalidArgument("at this thread level of MPI frames belong to the thread that initialised it");
         messaging_->messenger().throwIfFailed();
@@ -271,14 +273,16 @@ public:
         if (!image().empty())
             guarded([this] { pipeline_->finishBackground(); });
         const Verdict verdict = conclude();
-        if (verdict.error)
+        if (verdict.error && (!params_.allowPartial || verdict.error->kind == ErrorKind::Disagreement))
             throw FrameError(*verdict.error);
         const bool compressed = compresses();
-        if (config_.codec)
-            compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
         pipeline_->fillBackground();
-        lastKey_ = params_.declarationKey;
-        lastAccumulationId_ = params_.accumulationId;
+        if (!verdict.error) {
+            if (config_.codec)
+                compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
+            lastKey_ = params_.declarationKey;
+            lastAccumulationId_ = params_.accumulationId;
+        }
 
         const double nsPerMs = 1e6;
         FrameReport report;
@@ -293,14 +297,20 @@ public:
         return report;
     }
 
-    // A frame that is left without end(), mostly while an exception passes.
-    void cancel() noexcept
+    void cancel(std::int64_t frame)
     {
-        ErrorInfo info;
-        info.kind = ErrorKind::Cancelled;
-        info.message = "the frame was left without end()";
+        if (!gate_.enter(frame))
+            return; // it is over
+        failWith(std::make_exception_ptr(Error(cancelled("the frame was cancelled"))));
+        gate_.leave();
+    }
+
+    // A frame that is left without end(), mostly while an exception passes.
+    void leave() noexcept
+    {
         try {
-            outcome_->fail(std::make_exception_ptr(Error(std::move(info))), {});
+            const ErrorInfo info = cancelled("the frame was left without end()");
+            outcome_->fail(std::make_exception_ptr(Error(info)), {});
             messaging_->flow().drop();
             conclude();
         } catch (const TransportError&) {
@@ -491,7 +501,7 @@ private:
             });
             return;
         }
-        if (outcome_->failed())
+        if (outcome_->failed() && !(params_.allowPartial && isFinishedTile(kind)))
             return;
         switch (kind) {
         case MessageKind::Fragment: arrive(std::move(message), source); break;
@@ -532,6 +542,11 @@ private:
             break;
         default: break;
         }
+    }
+
+    static bool isFinishedTile(MessageKind kind)
+    {
+        return kind == MessageKind::FinishedTiles || kind == MessageKind::TilesDone;
     }
 
     template <class Body>
@@ -586,14 +601,11 @@ private:
     {
         ErrorInfo where;
         where.tile = tile;
-        guarded(
-            [&] {
-                if (outcome_->failed())
-                    return;
-                pipeline_->finish(tile);
-                tilesLess(1);
-            },
-            where);
+        if (!outcome_->failed()) {
+            const bool finished = guarded([&] { pipeline_->finish(tile); }, where);
+            if (finished || params_.allowPartial)
+                guarded([&] { tilesLess(1); }, where);
+        }
         gate_.leave();
     }
 
@@ -642,29 +654,60 @@ private:
     // ---- failure, verdict, end
 
     // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then, `source` whose
-    // message it was about, or -1.
+    // message it was about, or -1. False if it did throw.
     template <class Body>
-    void guarded(const Body& body, const ErrorInfo& where = {}, int source = -1)
+    bool guarded(const Body& body, const ErrorInfo& where = {}, int source = -1)
     {
         try {
             body();
+            return true;
         } catch (...) {
             ErrorInfo place = where;
             if (source >= 0)
                 place.message = messageFrom(source).message;
             failWith(std::current_exception(), place);
+            return false;
         }
+    }
+
+    static ErrorInfo cancelled(const char* text)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Cancelled;
+        info.message = text;
+        return info;
+    }
+
+    // Whether a frame that may be partial goes on without what this was about.
+    bool isBearable(const std::exception_ptr& reason) const
+    {
+        const ErrorKind kind = errorInfoOf(reason, {}).kind;
+        return params_.allowPartial && kind != ErrorKind::TimedOut && kind != ErrorKind::Cancelled
+               && kind != ErrorKind::Disagreement;
     }
 
     // False if this rank has voted.
     bool failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
+        if (isBearable(reason)) {
+            outcome_->note(reason, where);
+            return true;
+        }
         const bool inTime = outcome_->fail(reason, where);
         if (!inTime)
             gate_.countLate(); // too late to matter to this frame
-        messaging_->flow().drop();
+        dropRest();
         tryVote();
         return inTime;
+    }
+
+    // The frame has failed: what has not left matters no more, unless what is finished is wanted.
+    void dropRest()
+    {
+        if (!params_.allowPartial)
+            messaging_->flow().drop();
+        else if (!ownTilesDone_)
+            pipeline_->gather().flush();
     }
 
     void failElsewhere(const ErrorInfo& info)
@@ -676,7 +719,7 @@ private:
         if (info.kind == ErrorKind::TimedOut)
             copy.tile = copy.expected = -1; // it must not pass for the list of the rank that it came from
         outcome_->failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(copy) ? *mine : copy);
-        messaging_->flow().drop();
+        dropRest();
         tryVote();
     }
 
@@ -731,6 +774,8 @@ private:
                            v.wireErrorBound = reports.wireErrorBound;
                            v.tileErrors = FrameFigures::of(reports.errors);
                            figures_.addTo(v);
+                           if (params_.allowPartial)
+                               v.incomplete = pipeline_->table().unfinished(params_.declared);
                            repeatedBefore_ = repeated;
                            v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
                                        static_cast<std::int64_t>(messaging_->flow().peakInboxBytes()),
@@ -781,6 +826,9 @@ private:
         try {
             tryVote();
             verdict = params_.timeoutMs > 0 ? waitInTime() : *outcome_->wait();
+            if (verdict.error && params_.allowPartial) // finished tiles may still be on their way
+                messaging_->wait([this] { return pipeline_->gather().complete(); },
+                                 Clock::now() + std::chrono::milliseconds(params_.timeoutMs));
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
@@ -790,7 +838,9 @@ private:
         frameOpen_ = false;
         lastFailed_ = transportError || verdict.error;
         pipeline_->gather().closeImage();
-        if (lastFailed_)
+        if (lastFailed_ && params_.allowPartial && !transportError)
+            pipeline_->setIncomplete(verdict.incomplete);
+        else if (lastFailed_)
             pipeline_->gather().invalidate();
         if (transportError)
             std::rethrow_exception(transportError);

@@ -62,6 +62,17 @@ public:
         return !late;
     }
 
+    // Something was lost, but the frame goes on: the verdict will say so.
+    void note(const std::exception_ptr& reason, const ErrorInfo& where)
+    {
+        ErrorInfo info = errorInfoOf(reason, where);
+        info.rank = messaging_.rank();
+        info.frame = gate_.frame();
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (!error_)
+            error_ = info;
+    }
+
     // Another rank says that it has failed, and why. vote() must follow.
     void failElsewhere(const ErrorInfo& info)
     {

@@ -176,15 +176,18 @@ public:
     void finish(int tile)
     {
         // The display rank knows how the background looks.
-        if (EmptyIsBackground<TileOp>::value && IsPointwise<PixelOp>::value && !table_.hasPixels(tile))
+        if (EmptyIsBackground<TileOp>::value && IsPointwise<PixelOp>::value && !table_.hasPixels(tile)) {
+            table_.setFinished(tile);
             return;
+        }
+        bool inTime = true;
         const FloatEnvironment floatEnvironment;
         const Region region = table_.layout().region(tile);
         if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {
             auto place = gather_.reserve(tile);
             FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither);
             table_.finish(tile, out);
-            gather_.commit(tile, std::move(place));
+            inTime = gather_.commit(tile, std::move(place));
         } else {
             const auto width = static_cast<std::size_t>(region.width()),
                        height = static_cast<std::size_t>(region.height());
@@ -223,8 +226,10 @@ public:
                                     width * bytes);
                 }
             }
-            gather_.commit(tile, std::move(place));
+            inTime = gather_.commit(tile, std::move(place));
         }
+        if (inTime)
+            table_.setFinished(tile);
         if constexpr (HasReport<TileOp>::value)
             addReport(tile);
         if (isLossy()) {
@@ -268,6 +273,16 @@ public:
     void fillBackground()
     {
         gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
+    }
+
+    // The frame has ended without these tiles; on the display rank also without those that have not come.
+    void setIncomplete(std::vector<std::int32_t>& tiles)
+    {
+        for (int tile = 0; tile < table_.layout().tileCount(); ++tile)
+            if (gather_.isOnItsWay(tile, table_.owner(tile)))
+                tiles.push_back(tile);
+        for (const std::int32_t tile : tiles)
+            gather_.setIncomplete(tile);
     }
 
     // Input pixels of this frame, set on this rank, that had an infinity or NaN.

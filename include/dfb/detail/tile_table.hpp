@@ -155,6 +155,30 @@ public:
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
 
+    // A complete tile has been finished, and is on its way.
+    void setFinished(int tile)
+    {
+        const std::lock_guard<std::mutex> lock(mutexOf(tile));
+        slotFor(tile).finished = true;
+    }
+
+    // The tiles of this rank that are to be finished in this frame and are not. `declared`: see missing().
+    std::vector<std::int32_t> unfinished(bool declared)
+    {
+        std::vector<std::int32_t> tiles;
+        const ExpectedInputs* expected = expected_;
+        for (std::size_t i = 0; i < owned_.size(); ++i) {
+            const int tile = owned_[i];
+            const std::lock_guard<std::mutex> lock(mutexOf(tile));
+            const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
+            const bool isBackground = declared && expected && !expected->count(tile);
+            if (touched ? !slots_[i]->finished && !(isBackground && !slots_[i]->touched)
+                        : !isBackground && samples(tile).count > 0)
+                tiles.push_back(tile);
+        }
+        return tiles;
+    }
+
     // What the operation says of a tile that is finished.
     TileReport report(int tile)
     {
@@ -226,7 +250,7 @@ public:
 private:
     struct Slot {
         std::int64_t frame = -1;
-        bool ready = false, touched = false, declared = false, hasPixels = false;
+        bool ready = false, touched = false, declared = false, hasPixels = false, finished = false;
         std::vector<DependencyTracker> trees; // one per pass
         TileOp op;
     };
@@ -240,7 +264,7 @@ private:
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             slot->frame = info_.frame;
-            slot->ready = slot->touched = slot->declared = slot->hasPixels = false;
+            slot->ready = slot->touched = slot->declared = slot->hasPixels = slot->finished = false;
             slot->trees.resize(static_cast<std::size_t>(samples(tile).count));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();

@@ -74,6 +74,7 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
     f.add(p.declared);
     f.add(p.declarationKey);
     f.add(static_cast<std::uint64_t>(p.timeoutMs));
+    f.add(p.allowPartial);
     return f.value();
 }
 
@@ -85,10 +86,11 @@ struct Verdict {
     std::array<std::int64_t, 8> sums{};
     // Peak memory in bytes, rendering in ns, peak of the inbox in bytes, ns from begin() until all is done here.
     std::array<std::int64_t, 4> maxima{};
-    double wireErrorBound = 0;       // a maximum
-    std::vector<Figure> tileErrors;  // by tile; no two ranks have the same
-    std::vector<Figure> figures;     // by key; sums
-    std::vector<Figure> mergeErrors; // by tile; sums
+    double wireErrorBound = 0;            // a maximum
+    std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
+    std::vector<Figure> figures;          // by key; sums
+    std::vector<Figure> mergeErrors;      // by tile; sums
+    std::vector<std::int32_t> incomplete; // tiles that their owners have not finished, of a frame that may be partial
 
     std::vector<std::byte> bytes() const
     {
@@ -105,6 +107,9 @@ struct Verdict {
             for (const Figure& figure : *list)
                 out.put(figure);
         }
+        out.put(static_cast<std::uint32_t>(incomplete.size()));
+        for (const std::int32_t tile : incomplete)
+            out.put(tile);
         return out.take();
     }
 
@@ -121,6 +126,8 @@ struct Verdict {
         for (auto* list : {&v.tileErrors, &v.figures, &v.mergeErrors})
             for (auto left = in.get<std::uint32_t>(); left > 0; --left)
                 list->push_back(in.get<Figure>());
+        for (auto left = in.get<std::uint32_t>(); left > 0; --left)
+            v.incomplete.push_back(in.get<std::int32_t>());
         return v;
     }
 
@@ -146,6 +153,8 @@ struct Verdict {
         for (const Figure& f : tileErrors)
             report.tileErrors.push_back({static_cast<int>(f.key), f.value});
         report.figures = figures;
+        report.failure = error;
+        report.tilesIncomplete = static_cast<std::int64_t>(incomplete.size());
     }
 
     // Two lists by key become one; values of the same key are added.
@@ -177,7 +186,7 @@ struct Verdict {
         info.kind = ErrorKind::Disagreement;
         info.message = "the frame was begun with different parameters (background, passes, samples, maxLayers, "
                        "accumulationId, declared, "
-                       "declarationKey, timeoutMs)";
+                       "declarationKey, timeoutMs, allowPartial)";
         return info;
     }
 
@@ -217,6 +226,7 @@ struct Verdict {
         a.tileErrors = merged(a.tileErrors, b.tileErrors);
         a.figures = merged(a.figures, b.figures);
         a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
+        a.incomplete.insert(a.incomplete.end(), b.incomplete.begin(), b.incomplete.end()); // each tile has one owner
         return a.bytes();
     }
 };

@@ -107,7 +107,7 @@ public:
                     return;
                 // Not one per thread: a renderer that waits inside a job may be given another job on the same thread.
                 std::unique_ptr<Tile> tile = take();
-                job(i, *tile);
+                guard([&] { job(i, *tile); }); // the frame may do without that one
                 const std::lock_guard<std::mutex> lock(mutex_);
                 spare_.push_back(std::move(tile));
             });

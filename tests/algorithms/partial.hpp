@@ -1,0 +1,232 @@
+// Frames that lose something: with allowPartial the rest of the image, and a list of what is missing; and frames that
+// are cancelled, from any rank and thread at any time.
+#pragma once
+
+#include "everywhere.hpp"
+#include "send_all.hpp"
+
+#include <algorithm>
+#include <chrono>
+#include <memory>
+#include <set>
+#include <stdexcept>
+#include <thread>
+#include <vector>
+
+namespace algorithms {
+
+// An operation that fails for one tile, if it is told so.
+struct FailsAt {
+    int tile = -1;
+};
+class FailingBlend : public dfb::BasicAlphaBlend<16> {
+public:
+    using FrameData = FailsAt;
+
+    void newFrame(const dfb::TileInfo& info, const FailsAt& data)
+    {
+        BasicAlphaBlend::newFrame(info);
+        fails_ = info.tile == data.tile;
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        if (fails_)
+            throw std::runtime_error("this operation can not");
+        BasicAlphaBlend::finish(out);
+    }
+
+private:
+    bool fails_ = false;
+};
+
+// On the display rank: tiles that are complete are right, the others background; `missing` are among the latter. With
+// `exactly` there are no others: a machine that has too much to do may miss a time-out that was not meant for it.
+template <class FrameBuffer>
+void checkTiles(Result& result, const FrameBuffer& fb, const dfb::FrameReport& report, const scene::Scene& s,
+                const std::set<int>& missing, bool exactly, const std::string& what)
+{
+    if (!fb.isDisplayRank())
+        return;
+    const scene::Picture picture(fb.image(), report);
+    std::set<int> incomplete;
+    for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+        if (!fb.isComplete(tile))
+            incomplete.insert(tile);
+    const std::size_t wrong = wrongValues(picture, referenceOf(s, fb, referenceOf(s)));
+    result.expect(wrong == 0, what + ": " + std::to_string(wrong) + " values");
+    result.expect(exactly ? incomplete == missing
+                          : std::includes(incomplete.begin(), incomplete.end(), missing.begin(), missing.end()),
+                  what + ": other tiles are missing, " + std::to_string(incomplete.size()));
+    result.expect(report.tilesIncomplete == static_cast<std::int64_t>(incomplete.size()), what + ": the count");
+    if (exactly)
+        result.hash = result.hash * 31 + picture.hash();
+}
+
+struct PartialFrames {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        for (const dfb::GatherMode gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd}) {
+            const scene::Scene s = scene::makeScene(5, 3);
+            auto config = configOf(s, 2);
+            config.gather = gather;
+            using FrameBuffer = dfb::DistributedFrameBuffer<FailingBlend, dfb::NoPixelOp, Transport>;
+            FrameBuffer fb(communicator, config);
+            auto params = paramsOf(s);
+            params.allowPartial = true;
+            const auto mine = bricksOf(s, fb.rank(), fb.size());
+            // A tile with the first brick in it, and the ones after.
+            const dfb::Region box = scene::FlatCamera().project(s.bricks[0].bounds, 0, 0);
+            int lost = 0;
+            while (dfb::intersection(box, fb.layout().region(lost)).empty())
+                ++lost;
+            constexpr int never = 20000, soon = 400; // ms
+            const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
+                params.timeoutMs = timeoutMs;
+                return dfb::renderDataParallel(fb, dfb::World(mine), scene::FlatCamera(), render, params, fails);
+            };
+            const auto renderAll = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
+            const std::set<int> one{lost}, none;
+            const auto fails = [&](const dfb::FrameReport& report, dfb::ErrorKind kind, const std::string& text,
+                                   const std::set<int>& missing, bool exactly, const std::string& what) {
+                result.expect(report.failure && report.failure->kind == kind
+                                  && scene::has(report.failure->message, text),
+                              what + ": " + (report.failure ? report.failure->message : std::string("no failure")));
+                checkTiles(result, fb, report, s, missing, exactly, what);
+            };
+            const auto isFine = [&](const std::string& what) {
+                const dfb::FrameReport report = frame(never, renderAll, {});
+                result.expect(!report.failure && report.tilesIncomplete == 0, what + ": it does not count as whole");
+                checkTiles(result, fb, report, s, none, true, what);
+            };
+            isFine("the first");
+            fails(frame(soon,
+                        [&](const dfb::Brick& b, auto& tile) {
+                            if (tile.tile == lost && b.id == s.bricks[0].id)
+                                throw std::runtime_error("this renderer can not");
+                            renderBrick(s, b, tile);
+                        },
+                        {}),
+                  dfb::ErrorKind::UserCode, "this renderer can not", one, false, "a renderer");
+            isFine("after a renderer");
+            const auto start = std::chrono::steady_clock::now();
+            fails(frame(never, renderAll, {lost}), dfb::ErrorKind::UserCode, "this operation can not", one, true,
+                  "an operation");
+            result.expect(std::chrono::steady_clock::now() - start < std::chrono::milliseconds(never / 2),
+                          "an operation that fails is waited for");
+            isFine("after an operation");
+            {
+                // Inputs that are announced and never come.
+                params.timeoutMs = soon;
+                auto open = fb.begin(params);
+                const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+                if (fb.tileOwner(lost) == fb.rank()) {
+                    open.start(*tile, lost);
+                    tile->source = 1000;
+                    tile->children = 1;
+                    open.setTile(*tile);
+                }
+                for (int index = 0; index < fb.layout().tileCount(); ++index)
+                    if (index != lost && fb.tileOwner(index) == fb.rank()) {
+                        open.start(*tile, index);
+                        for (const dfb::Brick& b : s.bricks)
+                            tile->children += meets(fb, b, index);
+                        open.setTile(*tile);
+                    }
+                for (int index = 0; index < fb.layout().tileCount(); ++index)
+                    for (const dfb::Brick& b : mine)
+                        if (index != lost && meets(fb, b, index)) {
+                            open.start(*tile, index);
+                            tile->generation = 1;
+                            tile->source = b.id;
+                            renderBrick(s, b, *tile);
+                            open.setTile(*tile);
+                        }
+                fails(open.end(), dfb::ErrorKind::TimedOut, "tile " + std::to_string(lost), one, false,
+                      "a missing input");
+            }
+            {
+                params.timeoutMs = never;
+                auto open = fb.begin(params);
+                sendAll(fb, open, s, false);
+                if (fb.rank() == fb.size() / 2)
+                    open.cancel();
+                fails(open.end(), dfb::ErrorKind::Cancelled, "cancelled", none, false, "a frame that is cancelled");
+            }
+            isFine("the last");
+        }
+        return result;
+    }
+
+private:
+    template <class FrameBuffer>
+    static bool meets(const FrameBuffer& fb, const dfb::Brick& b, int index)
+    {
+        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
+    }
+};
+
+struct CancelledFrames {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        enum When { AtOnce, HalfWay, BeforeEnd, InEnd, Times };
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 3);
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator,
+                                                                                            configOf(s, 2));
+        for (int who = 0; who < fb.size(); ++who)
+            for (int when = AtOnce; when < Times; ++when) {
+                const std::string what = "rank " + std::to_string(who) + " at " + std::to_string(when);
+                {
+                    auto frame = fb.begin(paramsOf(s));
+                    const auto cancel = [&](int now) {
+                        if (fb.rank() == who && when == now)
+                            std::thread([&] { frame.cancel(); }).join(); // any thread may
+                    };
+                    cancel(AtOnce);
+                    sendAll(fb, frame, s, false);
+                    cancel(HalfWay);
+                    if (when == BeforeEnd)
+                        sendAll(fb, frame, s, true);
+                    cancel(BeforeEnd);
+                    std::thread other;
+                    if (fb.rank() == who && when == InEnd) // which can not come to an end without it
+                        other = std::thread([&] { frame.cancel(); });
+                    const std::string outcome = scene::outcomeOf([&] { frame.end(); });
+                    if (other.joinable())
+                        other.join();
+                    result.expect(when == BeforeEnd ? outcome == "fine" || scene::has(outcome, "cancelled")
+                                                    : scene::has(outcome, "FrameError")
+                                                          && scene::has(outcome, "the frame was cancelled"),
+                                  what + ": " + outcome);
+                }
+                const dfb::FrameReport report = renderLoop(fb, s, scene::Loop::Listing3);
+                if (fb.isDisplayRank()) {
+                    const scene::Picture picture(fb.image(), report);
+                    result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": the frame after");
+                    result.hash = picture.hash();
+                }
+            }
+        return result;
+    }
+};
+
+// In partial.cpp, so that the tests over MPI need not compile them again.
+extern template Result inProcess<PartialFrames>(int);
+extern template Result inProcess<CancelledFrames>(int);
+
+} // namespace algorithms
+
+#if !defined(ALGORITHMS_WITHOUT_TESTS)
+TEST_CASE("A frame that may be partial has all tiles but those that lost something", "[partial]")
+{
+    everywhere<algorithms::PartialFrames>();
+}
+
+TEST_CASE("A frame can be cancelled by any rank and thread at any time, and the next is right", "[partial]")
+{
+    everywhere<algorithms::CancelledFrames>();
+}
+#endif

@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/partial.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/partial.hpp"
