@@ -1,0 +1,163 @@
+// Edges: images and tiles of every odd size, data on few ranks, framebuffers made and gone in any order, user code that
+// has threads of its own.
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <vector>
+
+#if defined(DFB_HAS_TBB)
+#include <tbb/parallel_for.h>
+#include <tbb/task_arena.h>
+#endif
+
+namespace {
+
+using Inproc = dfb::InprocTransport;
+template <class TileOp>
+using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Inproc>;
+
+// Values that are wrong in an image of `ranks` ranks; all bricks on the last one with deal -1.
+template <int TileSize>
+std::size_t wrongIn(const scene::Scene& s, int ranks, int deal = 0)
+{
+    std::size_t wrong = 0;
+    dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::BasicAlphaBlend<TileSize>> fb(communicator, configOf(s));
+        for (int frame = 0; frame < 2; ++frame) {
+            const auto report = scene::renderLoop(fb, s, scene::Loop::Declared, deal);
+            if (fb.isDisplayRank())
+                wrong += wrongValues(scene::Picture(fb.image(), report), referenceOf(s));
+        }
+    });
+    return wrong;
+}
+
+} // namespace
+
+TEST_CASE("Images of one pixel, one row, one column and prime sizes, with more ranks than tiles", "[edges]")
+{
+    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{1, 1}, {1, 97}, {101, 1}, {31, 37}})
+        for (const int deal : {0, -1})
+            for (const int ranks : {1, 5}) {
+                scene::Scene s = scene::makeScene(4, 3, width, height);
+                s.bricks[0].bounds = {{0, 0, 0}, {static_cast<float>(width), static_cast<float>(height), 1}};
+                INFO(width << "x" << height << ", " << ranks << " ranks, deal " << deal);
+                CHECK(wrongIn<8>(s, ranks, deal) == 0);
+                CHECK(wrongIn<256>(s, ranks, deal) == 0);
+            }
+}
+
+TEST_CASE("The smallest and the largest tiles, and what is between", "[edges]")
+{
+    const scene::Scene s = scene::makeScene(5, 4, 300, 270);
+    CHECK(wrongIn<8>(s, 3) == 0);
+    CHECK(wrongIn<24>(s, 3) == 0); // no power of two
+    CHECK(wrongIn<256>(s, 3) == 0);
+}
+
+TEST_CASE("An image of 16384 x 16384 pixels of which little is touched", "[edges]")
+{
+    scene::Scene s;
+    s.width = s.height = 16384;
+    s.background = {};
+    s.bricks.push_back({7, {{16000, 16100, 0}, {16384, 16384, 1}}}); // the last corner
+    dfb::FrameReport report;                                         // of the display rank
+    std::size_t wrong = 0;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(s);
+        config.format = dfb::OutputFormat::RGBA8; // 1 GiB
+        config.depth = false;
+        FrameBuffer<dfb::BasicAlphaBlend<64>> fb(communicator, config);
+        const auto mine = scene::renderLoop(fb, s, scene::Loop::Declared, -1);
+        if (!fb.isDisplayRank())
+            return;
+        report = mine;
+        for (int y = 16000; y < 16384; y += 3)
+            for (int x = 15900; x < 16384; x += 3) {
+                std::vector<dfb::testing::Sample> samples;
+                if (const auto sample = sampleOf(s, s.bricks[0], 0, x, y))
+                    samples.push_back(*sample);
+                const auto expected = dfb::testing::composite(samples, s.background);
+                const std::size_t pixel = 4 * (static_cast<std::size_t>(y) * 16384 + static_cast<std::size_t>(x));
+                for (std::size_t c = 0; c < 4; ++c)
+                    wrong += static_cast<std::size_t>(fb.image().rgba8()[pixel + c]
+                                                      != dfb::testing::toUnorm8(expected.rgba[c]));
+            }
+    });
+    CHECK(wrong == 0);
+    CHECK(report.tilesTotal == 256 * 256);
+    CHECK(report.tilesTouched == 6 * 5);
+    CHECK(report.bytesSent < 4 << 20);
+}
+
+TEST_CASE("Framebuffers on one messenger are made and gone in any order", "[edges]")
+{
+    const scene::Scene s = scene::makeScene(5, 3);
+    std::size_t wrong = 0; // written by the display rank
+    int images = 0;
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        using Fb = FrameBuffer<dfb::BasicAlphaBlend<16>>;
+        const auto messenger = std::make_shared<dfb::Messenger<Inproc>>(communicator);
+        std::vector<std::unique_ptr<Fb>> alive(4);
+        for (std::uint64_t step = 0; step < 40; ++step) { // the same on all ranks
+            auto& one = alive[scene::mix(step) % alive.size()];
+            if (one && scene::mix(step + 99) % 2)
+                one.reset();
+            else if (!one)
+                one = std::make_unique<Fb>(messenger, configOf(s));
+            if (!one)
+                continue;
+            const auto report = scene::renderLoop(*one, s, scene::Loop::Declared);
+            if (one->isDisplayRank())
+                wrong += wrongValues(scene::Picture(one->image(), report), referenceOf(s)), ++images;
+        }
+    });
+    CHECK(wrong == 0);
+    CHECK(images > 15);
+}
+
+#if defined(DFB_HAS_TBB)
+TEST_CASE("A framebuffer is used inside the user's own TBB arena, by several of its threads", "[edges]")
+{
+    const scene::Scene s = scene::makeScene(6, 8);
+    std::size_t wrong = 0; // written by the display rank
+    int images = 0;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        tbb::task_arena arena(2);
+        auto config = configOf(s);
+        config.executor = std::make_shared<dfb::TbbExecutor>(2);
+        using Fb = FrameBuffer<dfb::BasicAlphaBlend<16>>;
+        Fb fb(communicator, config);
+        for (int frame = 0; frame < 5; ++frame) {
+            auto params = paramsOf(s);
+            params.declared = true;
+            auto open = fb.begin(params);
+            const auto mine = bricksOf(s, fb.rank(), fb.size());
+            const auto pairs = visibleTiles(dfb::World(mine), scene::FlatCamera(), fb.layout());
+            open.declare(inputsOf(dfb::World(mine), pairs));
+            arena.execute([&] {
+                tbb::parallel_for(std::size_t{0}, pairs.size(), [&](std::size_t i) {
+                    const auto tile = std::make_unique<Fb::Tile>();
+                    const dfb::Brick& brick = mine[static_cast<std::size_t>(pairs[i].brick)];
+                    open.start(*tile, pairs[i].tile);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    renderBrick(s, brick, *tile);
+                    open.setTile(*tile);
+                });
+            });
+            dfb::FrameReport report;
+            arena.execute([&] { report = open.end(); }); // waits in there, too
+            if (fb.isDisplayRank())
+                wrong += wrongValues(scene::Picture(fb.image(), report), referenceOf(s)), ++images;
+        }
+    });
+    CHECK(wrong == 0);
+    CHECK(images == 5);
+}
+#endif
