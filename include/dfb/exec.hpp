@@ -2,6 +2,7 @@
 // its own. (TbbExecutor, in tbb_executor.hpp: in a oneTBB arena of its own.)
 #pragma once
 
+#include <dfb/detail/fifo.hpp>
 #include <dfb/version.hpp>
 
 #include <atomic>
@@ -37,7 +38,7 @@ public:
     {
         {
             std::lock_guard<std::mutex> lock(mutex_);
-            tasks_.push_back(std::move(task));
+            tasks_.push(std::move(task));
         }
         wake();
     }
@@ -88,8 +89,7 @@ protected:
             std::lock_guard<std::mutex> lock(mutex_);
             if (tasks_.empty())
                 return false;
-            task = std::move(tasks_.front());
-            tasks_.pop_front();
+            task = tasks_.pop();
         }
         task();
         return true;
@@ -97,7 +97,7 @@ protected:
 
 private:
     std::mutex mutex_;
-    std::deque<Task> tasks_;
+    detail::Fifo<Task> tasks_;
 };
 
 // A fixed number of threads. The destructor runs what was submitted, then joins.

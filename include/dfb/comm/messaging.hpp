@@ -5,6 +5,7 @@
 #include <dfb/comm/flow_control.hpp>
 #include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
+#include <dfb/detail/fifo.hpp>
 #include <dfb/exec.hpp>
 
 #include <algorithm>
@@ -13,7 +14,6 @@
 #include <condition_variable>
 #include <cstdint>
 #include <cstring>
-#include <deque>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -366,14 +366,13 @@ private:
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            inbox_.push_back({source, header, std::move(message)});
+            inbox_.push({source, header, std::move(message)});
         }
         submit([this] {
             std::optional<Arrival> next;
             {
                 const std::lock_guard<std::mutex> lock(mutex_);
-                next = std::move(inbox_.front());
-                inbox_.pop_front();
+                next.emplace(inbox_.pop());
             }
             dispatch(std::move(*next));
         });
@@ -429,7 +428,7 @@ private:
 
     std::mutex mutex_;
     std::condition_variable changed_;
-    std::deque<Arrival> inbox_;
+    Fifo<Arrival> inbox_;
     int tasks_ = 0; // submitted and not yet done
     bool isEnding_ = false;
 };

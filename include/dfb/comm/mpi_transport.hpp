@@ -14,6 +14,7 @@
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/detail/fifo.hpp>
 
 #include <mpi.h>
 
@@ -299,29 +300,8 @@ private:
         std::uint64_t byteCount;
     };
 
-    // A queue that keeps its memory.
-    template <class T>
-    class Fifo {
-    public:
-        bool empty() const { return first_ == items_.size(); }
-        void push(T&& item) { items_.push_back(std::move(item)); }
-        T pop()
-        {
-            T item = std::move(items_[first_++]);
-            if (empty() || (first_ >= 1024 && first_ >= items_.size() / 2)) {
-                items_.erase(items_.begin(), items_.begin() + static_cast<std::ptrdiff_t>(first_));
-                first_ = 0;
-            }
-            return item;
-        }
-
-    private:
-        std::vector<T> items_;
-        std::size_t first_ = 0;
-    };
-
     struct Peer {
-        Fifo<Buffer> waiting;
+        detail::Fifo<Buffer> waiting;
         int inFlight = 0; // sends to it that have not completed
         int tag = 0;      // the last one used
         bool listed = false, addressed = false;
@@ -788,7 +768,7 @@ private:
     detail::PacketWriter packet_;   // that is being filled
     std::vector<Transfer> bodies_;  // to follow it
     Transfers sends_, receives_, notices_;
-    Fifo<Announced> announced_;
+    detail::Fifo<Announced> announced_;
     Buffer packets_; // the posted ones
     std::vector<MPI_Request> packetRequests_;
     std::vector<int> indices_;
