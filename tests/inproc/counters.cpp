@@ -72,13 +72,19 @@ namespace {
 constexpr int ranks = 4, side = 512, tileSide = 64, tileCount = (side / tileSide) * (side / tileSide);
 
 // Every box covers the image.
+std::atomic<int> projections{0};
 struct WholeImage {
-    dfb::Region project(const dfb::Box3&, int, int) const { return {0, 0, side, side}; }
+    dfb::Region project(const dfb::Box3&, int, int) const
+    {
+        ++projections;
+        return {0, 0, side, side};
+    }
 };
 
 struct Cost {
     dfb::FrameReport report; // of the last frame
     std::int64_t allocations = 0;
+    int projections = 0; // of boxes, on all ranks
 };
 
 // Frames of the same picture: each rank has an image of which the first `rows` rows have something.
@@ -114,13 +120,14 @@ Cost cost(int rows, bool declaresAgain = false, int frames = 4)
         for (int frame = 0; frame < frames; ++frame) {
             meet();
             const std::int64_t before = allocations;
+            const int projectionsBefore = projections;
             meet();
             dfb::FrameParams params;
             params.declarationKey = declaresAgain ? 0 : 1;
             const dfb::FrameReport report = dfb::renderDataParallel(fb, world, WholeImage(), find, params);
             meet();
             if (fb.isDisplayRank())
-                result = {report, allocations - before};
+                result = {report, allocations - before, projections - projectionsBefore};
             meet();
         }
     });
@@ -235,11 +242,13 @@ TEST_CASE("A frame of nothing costs next to nothing", "[counters]")
     CHECK(empty.report.messagesSent <= 3 * (ranks - 1)); // of the verdict up and down, and that there are no tiles
 }
 
-TEST_CASE("The second frame with the same declaration sends no manifests", "[counters]")
+TEST_CASE("The second frame with the same declaration sends no manifests and looks for no bricks", "[counters]")
 {
     const Cost again = cost<dfb::AlphaBlend>(side, true), kept = cost<dfb::AlphaBlend>(side, false);
     // Each rank to each other one, their answers, and that all have declared, up and down.
     CHECK(again.report.messagesSent - kept.report.messagesSent >= 2 * ranks * (ranks - 1));
+    CHECK(again.projections == ranks);
+    CHECK(kept.projections == 0);
 }
 
 TEST_CASE("Messages: one for each input, a few for each rank", "[counters]")

@@ -5,8 +5,10 @@
 #include <dfb/frame.hpp>
 #include <dfb/render/tile_loop.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <numeric>
 #include <vector>
 
 namespace dfb {
@@ -17,8 +19,22 @@ enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles
     RoundRobin, // dealt out one by one
-    Dynamic     // one half as with Linear, the other handed out on demand, in shares that shrink
+    Dynamic     // one half dealt out evenly, the other handed out on demand, in shares that shrink
 };
+
+namespace detail {
+
+// The multiples of it, modulo `count`, are all numbers below that, and any few in a row are spread evenly: neighbours
+// in an image cost alike, so who gets some of these gets a fair share.
+inline std::int64_t scatteringStride(std::int64_t count)
+{
+    auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
+    while (stride > 1 && std::gcd(stride, count) != 1)
+        --stride;
+    return std::max<std::int64_t>(stride, 1);
+}
+
+} // namespace detail
 
 // Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and returns the
 // frame, which is to be ended. `renderTile(tile)` is called from several threads at once, for each pass with its own
@@ -69,9 +85,11 @@ template <class FrameBuffer, class RenderTile>
         frame.setTile(tile);
     };
     const std::int64_t count = jobs.count(), rank = fb.rank(), size = fb.size();
-    const auto renderRange = [&](std::int64_t begin, std::int64_t end) {
-        loop.run(static_cast<std::size_t>(end - begin),
-                 [&](std::size_t i, auto& tile) { render(begin + static_cast<std::int64_t>(i), tile); });
+    // Jobs begin + i, each times `stride`.
+    const auto renderRange = [&](std::int64_t begin, std::int64_t end, std::int64_t stride = 1) {
+        loop.run(static_cast<std::size_t>(end - begin), [&](std::size_t i, auto& tile) {
+            render((begin + static_cast<std::int64_t>(i)) * stride % count, tile);
+        });
     };
     switch (distribution) {
     case WorkDistribution::Linear: renderRange(count * rank / size, count * (rank + 1) / size); break;
@@ -83,7 +101,7 @@ template <class FrameBuffer, class RenderTile>
         loop.guard([&] {
             for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
                  range = frame.nextJobs(count))
-                renderRange(range.begin, range.end);
+                renderRange(range.begin, range.end, detail::scatteringStride(count));
         });
         break;
     case WorkDistribution::Owned: break;

@@ -28,14 +28,15 @@
 namespace dfb {
 
 // Deals the tiles of a brick to the ranks that hold it (section 4.3 of the paper); with `sharePasses` each pass of each
-// tile.
+// tile. Tiles are mixed first: taken as they come they would be dealt out in columns where the image is some multiple
+// of the ranks wide, and neighbours cost alike.
 struct RoundRobinBricks {
     bool sharePasses = false;
 
     int operator()(const SharedBrick& brick, int tile, int pass) const
     {
-        const std::size_t turn =
-            brick.brick.id + static_cast<std::size_t>(tile) + static_cast<std::size_t>(sharePasses ? pass : 0);
+        const std::uint32_t mixed = static_cast<std::uint32_t>(tile) * 0x9e3779b1u >> 16;
+        const std::size_t turn = brick.brick.id + mixed + static_cast<std::size_t>(sharePasses ? pass : 0);
         return brick.ranks[turn % brick.ranks.size()];
     }
 };
