@@ -34,8 +34,8 @@ public:
         if (initialized)
             throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
         detail::checkMpi(MPI_Init_thread(&argc, &argv, level, &level_), "MPI_Init_thread", -1);
-        MPI_Comm_rank(MPI_COMM_WORLD, &rank_);
-        MPI_Comm_size(MPI_COMM_WORLD, &size_);
+        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
         if (level_ < level) {
             finalize();
             throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
@@ -105,7 +105,7 @@ private:
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
         wait(request);
-        MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN);
+        check(MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
 
         std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
         std::vector<MPI_Request> requests;

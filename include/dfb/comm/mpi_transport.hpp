@@ -21,6 +21,8 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <functional>
@@ -49,7 +51,8 @@ inline void checkMpi(int code, const char* call, int rank)
         return;
     char text[MPI_MAX_ERROR_STRING];
     int length = 0;
-    MPI_Error_string(code, text, &length);
+    if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
+        length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
     throw TransportError(std::string(call) + ": " + std::string(text, static_cast<std::size_t>(length)), rank);
 }
 
@@ -110,12 +113,12 @@ public:
         check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
         for (detail::Patience patience; !completed(duplicated);)
             patience.nap();
-        MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN);
-        MPI_Comm_rank(comm_, &rank_);
-        MPI_Comm_size(comm_, &size_);
+        check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
+        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
         const int* tagBound = nullptr;
         int found = 0;
-        MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found);
+        check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
 
         peers_.resize(static_cast<std::size_t>(size_));
@@ -221,7 +224,7 @@ private:
     {
         char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
         int length = 0;
-        MPI_Get_processor_name(host, &length);
+        check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
         const auto memory = memoryToShare();
         const Card mine{std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
                         memory ? memory->address() : detail::NodeMemory::Address()};
@@ -621,10 +624,10 @@ private:
             handler_->receive(source, std::move(message));
     }
 
-    static std::size_t byteCountOf(const MPI_Status& status)
+    std::size_t byteCountOf(const MPI_Status& status) const
     {
         int byteCount = 0;
-        MPI_Get_count(&status, MPI_BYTE, &byteCount);
+        check(MPI_Get_count(&status, MPI_BYTE, &byteCount), "MPI_Get_count");
         return static_cast<std::size_t>(byteCount);
     }
 
@@ -732,7 +735,7 @@ private:
     {
         for (MPI_Request& request : packetRequests_)
             if (request != MPI_REQUEST_NULL)
-                MPI_Cancel(&request);
+                check(MPI_Cancel(&request), "MPI_Cancel");
         statuses_.resize(std::max(statuses_.size(), packetRequests_.size()));
         for (int slot = 0; slot < postedPackets; ++slot) {
             MPI_Request& request = packetRequests_[static_cast<std::size_t>(slot)];
@@ -742,7 +745,7 @@ private:
             int done = 0, cancelled = 0;
             for (detail::Patience patience; check(MPI_Test(&request, &done, &status), "MPI_Test"), !done;)
                 patience.nap();
-            MPI_Test_cancelled(&status, &cancelled);
+            check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(slot, byteCountOf(status));
         }
