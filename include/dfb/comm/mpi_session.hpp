@@ -55,11 +55,16 @@ public:
         MPI_Finalized(&finalized);
         if (finalized)
             return;
-        if (std::uncaught_exceptions() == exceptions_)
+        if (!isGivenUp_ && std::uncaught_exceptions() == exceptions_)
             finalize();
         else if (std::atexit(abortJob) != 0)
             abortJob();
     }
+
+    // For who goes on after a TransportError: other ranks may have gone, and MPI_Finalize would wait for them for ever.
+    // The end of this object then waits for nobody, and when this process exits it aborts the job, with code 1, as
+    // after an exception.
+    void giveUp() noexcept { isGivenUp_ = true; }
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
@@ -136,6 +141,7 @@ private:
 
     int level_ = MPI_THREAD_SINGLE, rank_ = 0, size_ = 1;
     int exceptions_ = std::uncaught_exceptions();
+    bool isGivenUp_ = false;
 };
 
 } // namespace dfb

@@ -171,8 +171,11 @@ public:
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
     bool wakesOnArrival() const noexcept { return false; }
-    // Longer where ranks share cores: waking up takes the core from one that computes.
-    void nap(std::chrono::nanoseconds limit) { signal_.nap(limit * crowding_ / 4); }
+    // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are.
+    void nap(std::chrono::nanoseconds limit)
+    {
+        signal_.nap(limit < std::chrono::milliseconds(10) ? limit * crowding_ / 4 : limit);
+    }
     void interrupt() { signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
@@ -208,8 +211,21 @@ public:
     // come; MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
-        if (!orderly || failed_ || !guarded([this] { return finish(); }))
-            abandon();
+        if (orderly && !failed_) {
+            if (guarded([this] { return finish(); }))
+                return;
+            flush();
+        }
+        abandon();
+    }
+
+    // Ends all ranks of MPI_COMM_WORLD: for another communicator MPICH first waits for its ranks, also for dead ones.
+    [[noreturn]] void abort(const std::string& text)
+    {
+        std::fprintf(stderr, "%s\n", text.c_str());
+        std::fflush(stderr);
+        MPI_Abort(MPI_COMM_WORLD, 1);
+        std::abort(); // it should not return
     }
 
 private:
@@ -688,6 +704,8 @@ private:
     bool moveUntil(const Done& done)
     {
         for (detail::Patience patience; !done();) {
+            if (handler_)
+                handler_->waiting();
             if (handler_ && handler_->failed())
                 return false;
             if (move())
@@ -748,6 +766,16 @@ private:
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(slot, byteCountOf(status));
+        }
+    }
+
+    // What tells the others why this rank goes should still leave, but not at any cost.
+    void flush()
+    {
+        leaving_ = false;
+        for (int tries = 0; tries < 100 && !failed_ && !quiet(); ++tries) {
+            guarded([this] { return move(); });
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));
         }
     }
 
