@@ -3,6 +3,7 @@
 //   mpirun -n 3 mpi_session lower        the MPI library has a lower thread level than is asked for
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
+//   mpirun -n 3 mpi_session give_up      rank 1 can not go on, and the others neither: the same
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
@@ -130,6 +131,24 @@ void leaveWithException(int& argc, char**& argv)
     std::fprintf(stderr, "mpi_session: the job goes on without rank 1\n");
 }
 
+// Nobody's exception leaves the life of the session.
+void giveUp(int& argc, char**& argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    try {
+        dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(mpi.communicator(), {64, 64});
+        emptyFrame(fb);
+        if (mpi.rank() == 1 % mpi.size())
+            throw std::runtime_error("rank 1 leaves");
+        emptyFrame(fb);
+        std::fprintf(stderr, "mpi_session: the job goes on without rank 1\n");
+    } catch (const std::exception& e) {
+        mpi.giveUp();
+        std::printf("mpi_session: caught: %s\n", e.what());
+        std::fflush(stdout);
+    }
+}
+
 } // namespace
 
 extern "C" int MPI_Init_thread(int* argc, char*** argv, int required, int* provided)
@@ -158,6 +177,9 @@ int main(int argc, char** argv)
             std::printf("mpi_session: caught: %s\n", e.what());
             std::fflush(stdout);
         }
+    } else if (what == "give_up") {
+        giveUp(argc, argv);
+        check(!isFinalized(), "MPI is finalised");
     } else {
         check(false, "no such run", what);
     }

@@ -3,6 +3,7 @@
 
 #include "camera.hpp"
 
+#include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire_format.hpp>
 
 #include <CLI/CLI.hpp>
@@ -44,6 +45,7 @@ struct Options {
     int threads = 0;  // per rank; 0: as many as the machine has
     Compression compression = Compression::None;
     bool sharedMemory = true;
+    int peerTimeout = dfb::defaultPeerTimeoutMs / 1000; // seconds; 0: off
     OwnerMap ownerMap = OwnerMap::Lattice;
 
     int width = 1024, height = 1024;
@@ -243,6 +245,12 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     bool noSharedMemory = false;
     app.add_flag("--no-shared-memory", noSharedMemory,
                  "Send all messages through MPI, also those between ranks of one node")
+        ->group(how);
+    app.add_option("--peer-timeout", options.peerTimeout,
+                   "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, "
+                   "as for a debugger; default 300")
+        ->check(detail::number(0, most))
+        ->option_text("SECONDS")
         ->group(how);
     app.add_option("--compression", options.compression, "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
                    "faster; default none")

@@ -71,6 +71,7 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
     config.sharedMemory = o.sharedMemory;
+    config.peerTimeoutMs = 1000 * o.peerTimeout;
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner

@@ -140,8 +140,9 @@ public:
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(
             std::make_shared<Messenger<Transport>>(
-                communicator, MessengerOptions{config.progress, config.checksums, config.sharedMemory}),
-            std::move(config), std::move(pixelOp))
+                communicator, MessengerOptions{config.progress, config.checksums, config.sharedMemory,
+                                               config.peerTimeoutMs, config.onPeerLost}),
+            config, std::move(pixelOp)) // not moved: the options may be made of it afterwards
     {
     }
 

@@ -48,7 +48,7 @@ inline const char* toString(ErrorKind kind)
 // What went wrong, and where. A negative number means "does not apply".
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
-    int rank = -1; // the rank that noticed
+    int rank = -1; // the rank that noticed; or the one that is lost
     std::int64_t frame = -1;
     std::int64_t tile = -1;
     std::int64_t pass = -1;

@@ -3,6 +3,7 @@
 
 #include <dfb/channels.hpp>
 #include <dfb/comm/compression.hpp>
+#include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
@@ -12,6 +13,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -31,8 +33,8 @@ enum class CompressionMode : std::uint8_t {
          // better, and now and then a few of the other again; the same on all ranks
 };
 
-// What a framebuffer is made with. Everything but executor and progress must be the same on all ranks, which is
-// checked when it is made.
+// What a framebuffer is made with. Everything but executor, progress, peerTimeoutMs and onPeerLost must be the same on
+// all ranks, which is checked when it is made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
@@ -58,6 +60,10 @@ struct FrameBufferConfig {
     Progress progress = Progress::Thread;
     bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
+    // 0, or 100 and more: a rank of which nothing has been heard for so long, in a frame or a call that waits for all
+    // ranks, is lost, and the job ends with an error that names it, or onPeerLost says what else; see MessengerOptions.
+    int peerTimeoutMs = defaultPeerTimeoutMs;
+    std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.

@@ -57,6 +57,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.threads == 0);
     CHECK(o.compression == Compression::None);
     CHECK(o.sharedMemory);
+    CHECK(o.peerTimeout == 300);
     CHECK(o.ownerMap == OwnerMap::Lattice);
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
@@ -120,11 +121,14 @@ TEST_CASE("Every option arrives", "[options]")
                                "s.json",
                                "--no-fit",
                                "--no-shared-memory",
+                               "--peer-timeout",
+                               "20",
                                "c.obj",
                                "d.xyz"});
     CHECK(o.scene == std::vector<std::string>{"a.ply", "b_2x2x2_uint8.raw", "c.obj", "d.xyz"});
     CHECK_FALSE(o.fit);
     CHECK_FALSE(o.sharedMemory);
+    CHECK(o.peerTimeout == 20);
     CHECK(o.mode == Mode::Image);
     CHECK(o.ranks == 7);
     CHECK(o.bricks == 9);
@@ -165,7 +169,7 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
         for (const std::string value :
              {"0", "-1", "nan", "inf", "1.5", "", " ", "two", "3x", "2147483648", "99999999999999999999"})
             checkRefused({option, value});
-    for (const std::string option : {"--bricks", "--threads", "--seed"})
+    for (const std::string option : {"--bricks", "--threads", "--seed", "--peer-timeout"})
         for (const std::string value : {"-1", "nan", "inf", "-inf", "1.5", "two", "99999999999999999999"})
             checkRefused({option, value});
     for (const std::string option :

@@ -27,12 +27,14 @@ enum class MessageKind : std::uint8_t {
     JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
     Jobs,          // a range of them
     ImagePlace,    // where in shared memory the image of the display rank lies
-    Failure        // the sender's messenger can not go on, nor can anybody who waits for it
+    Failure,       // the sender's messenger can not go on, nor can anybody who waits for it
+    AreYouThere,   // to be answered at once with the next
+    Present        // the sender is there, and answers whenever it is asked
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb;
-    static constexpr std::uint8_t formatVersion = 4;
+    static constexpr std::uint8_t formatVersion = 5;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
@@ -75,7 +77,7 @@ inline MessageHeader readMessageHeader(const Buffer& message)
         failMalformed("not a message of dfb");
     if (header.version != MessageHeader::formatVersion)
         failMalformed("wire format version", MessageHeader::formatVersion, header.version);
-    if (header.kind > MessageKind::Failure)
+    if (header.kind > MessageKind::Present)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;
 }

@@ -4,6 +4,7 @@
 
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/checksum.hpp>
+#include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
@@ -14,6 +15,7 @@
 #include <cstdint>
 #include <cstring>
 #include <exception>
+#include <functional>
 #include <map>
 #include <memory>
 #include <mutex>
@@ -32,6 +34,14 @@ struct MessengerOptions {
     bool checksums = false; // each message carries a CRC-32C; must be the same on all ranks
     // Ranks that see each other's memory hand messages over there.
     bool sharedMemory = true;
+    // With Progress::Thread: while messages are expected, in a frame or a call that waits for all ranks, a rank of
+    // which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this rank
+    // looks for no other and is not looked for; what is less than 100 counts as that. May differ between ranks.
+    int peerTimeoutMs = defaultPeerTimeoutMs;
+    // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort, with the
+    // error on standard error), as MPI does not go on without a rank. Else it is called, by a thread of the library,
+    // with that rank in ErrorInfo::rank; it must be quick and not throw, and then all ranks get this as TransportError.
+    std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
 namespace detail {
@@ -91,8 +101,11 @@ public:
           transport_(communicator, pool_, options.progress)
     {
         transport_.start(*this);
-        if (transport_.needsPolling() && options_.progress == Progress::Thread)
-            progress_.start();
+        if (!hasOwnThread())
+            return;
+        progress_.start();
+        for (const int other : heartbeat_.neighbours())
+            sendSign(other, detail::MessageKind::Present);
     }
 
     // While an exception passes it waits for nobody, as the other ranks may not be on their way here, and tells them.
@@ -251,11 +264,11 @@ public:
         throw TransportError(*failure_);
     }
 
-    // This rank can not go on: says so to the others, so that nobody waits for it.
-    void giveUp(const ErrorInfo& error)
+    // This rank can not go on: says so to the others, so that nobody waits for it. False if it has failed before.
+    bool giveUp(const ErrorInfo& error)
     {
         if (!setFailure(error))
-            return;
+            return false;
         detail::ByteWriter body;
         put(body, error);
         detail::MessageHeader header;
@@ -264,9 +277,12 @@ public:
             if (other != rank())
                 send(other, detail::makeMessage(*pool_, header, body.bytes().data(), body.bytes().size()));
         tellReceivers();
+        return true;
     }
 
 private:
+    using Clock = std::chrono::steady_clock;
+
     struct Peer {
         std::uint32_t sent = 0;
         detail::SequenceWindow received;
@@ -302,13 +318,15 @@ private:
         try {
             header = detail::readMessageHeader(message);
             checkChecksum(header, message);
-            if (!isNew(source, header.sequence))
+            if (!isNew(source, header))
                 return;
             if (header.kind == detail::MessageKind::Failure) {
                 detail::ByteReader body(std::as_const(message).data() + sizeof header, message.size() - sizeof header);
                 fail(detail::getErrorInfo(body));
                 return;
             }
+            if (header.kind == detail::MessageKind::AreYouThere || header.kind == detail::MessageKind::Present)
+                return;
         } catch (const Error& e) {
             const std::lock_guard<std::mutex> lock(mutex_);
             for (const auto& [address, receiver] : receivers_)
@@ -325,10 +343,15 @@ private:
             early_[header.receiver].push_back({source, header, std::move(message)});
     }
 
-    bool isNew(int source, std::uint32_t sequence)
+    bool isNew(int source, const detail::MessageHeader& header)
     {
         const std::lock_guard<std::mutex> lock(peersMutex_);
-        const auto result = peers_[source].received.arrive(sequence);
+        heartbeat_.heard(source, header.kind == detail::MessageKind::Present);
+        if (header.kind == detail::MessageKind::AreYouThere) {
+            askers_.insert(source);
+            isAsked_ = true;
+        }
+        const auto result = peers_[source].received.arrive(header.sequence);
         if (result == detail::SequenceWindow::Result::Absurd)
             detail::failMalformed("a running number far from the others");
         duplicates_ += result == detail::SequenceWindow::Result::Duplicate;
@@ -353,6 +376,73 @@ private:
             tellReceivers();
     }
 
+    // --- signs of life
+
+    bool hasOwnThread() const { return transport_.needsPolling() && options_.progress == Progress::Thread; }
+
+    std::chrono::milliseconds peerTimeout() const
+    {
+        const bool isOn = hasOwnThread() && options_.peerTimeoutMs >= 100;
+        return std::chrono::milliseconds(isOn ? options_.peerTimeoutMs : 0);
+    }
+
+    // Short enough for questions to be answered in time.
+    Clock::duration longestNap() const
+    {
+        const Clock::duration longest = std::chrono::seconds(1);
+        return heartbeat_.isOn() ? std::min(longest, heartbeat_.patience()) : longest;
+    }
+
+    void sendSign(int other, detail::MessageKind kind)
+    {
+        detail::MessageHeader header;
+        header.kind = kind;
+        send(other, detail::makeMessage(*pool_, header, nullptr, 0));
+    }
+
+    // Between two polls, by the thread that polls.
+    void beat(Clock::time_point now, bool expecting)
+    {
+        if (isAsked_ && isAsked_.exchange(false)) {
+            std::set<int> askers;
+            {
+                const std::lock_guard<std::mutex> lock(peersMutex_);
+                askers.swap(askers_);
+            }
+            for (const int other : askers)
+                sendSign(other, detail::MessageKind::Present);
+        }
+        if (!heartbeat_.isOn() || failed_ || now < nextBeat_)
+            return;
+        nextBeat_ = now + heartbeat_.interval();
+        detail::Heartbeat::Due due;
+        {
+            const std::lock_guard<std::mutex> lock(peersMutex_);
+            due = heartbeat_.due(now, expecting);
+        }
+        for (const int other : due.ask)
+            sendSign(other, detail::MessageKind::AreYouThere);
+        if (due.lost >= 0)
+            lose(due.lost);
+    }
+
+    void lose(int other)
+    {
+        ErrorInfo error;
+        error.kind = ErrorKind::Transport;
+        error.rank = other;
+        error.message = "this rank is lost: it has ended, is stopped or can not be reached. Rank "
+                        + std::to_string(rank()) + " has heard nothing of it for "
+                        + std::to_string(options_.peerTimeoutMs) + " ms (peerTimeoutMs)";
+        if constexpr (detail::CanAbort<Transport>::value)
+            if (!options_.onPeerLost)
+                transport_.abort(error.describe());
+        if (giveUp(error) && options_.onPeerLost)
+            options_.onPeerLost(error);
+    }
+
+    void waiting() override { beat(Clock::now(), true); }
+
     void tellReceivers()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -367,7 +457,13 @@ private:
     std::atomic<std::int64_t> duplicates_{0};
 
     mutable std::mutex peersMutex_;
-    std::unordered_map<int, Peer> peers_; // made when first needed; under peersMutex_
+    // Under peersMutex_:
+    std::unordered_map<int, Peer> peers_; // made when first needed
+    detail::Heartbeat heartbeat_{transport_.rank(), transport_.size(), peerTimeout()};
+    std::set<int> askers_; // that want a sign of life
+
+    std::atomic<bool> isAsked_{false}; // there are askers
+    Clock::time_point nextBeat_{};     // only the thread that polls uses it
 
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::map<std::uint32_t, detail::MessageReceiver*> receivers_;
@@ -380,7 +476,8 @@ private:
     std::optional<ErrorInfo> failure_;
     std::atomic<bool> failed_{false};
 
-    ProgressThread<Transport> progress_{transport_};
+    ProgressThread<Transport> progress_{transport_, longestNap(),
+                                        [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
 };
 
 } // namespace dfb

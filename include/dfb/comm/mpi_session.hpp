@@ -34,8 +34,8 @@ public:
         if (initialized)
             throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
         detail::checkMpi(MPI_Init_thread(&argc, &argv, level, &level_), "MPI_Init_thread", -1);
-        MPI_Comm_rank(MPI_COMM_WORLD, &rank_);
-        MPI_Comm_size(MPI_COMM_WORLD, &size_);
+        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
         if (level_ < level) {
             finalize();
             throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
@@ -55,11 +55,16 @@ public:
         MPI_Finalized(&finalized);
         if (finalized)
             return;
-        if (std::uncaught_exceptions() == exceptions_)
+        if (!isGivenUp_ && std::uncaught_exceptions() == exceptions_)
             finalize();
         else if (std::atexit(abortJob) != 0)
             abortJob();
     }
+
+    // For who goes on after a TransportError: other ranks may have gone, and MPI_Finalize would wait for them for ever.
+    // The end of this object then waits for nobody, and when this process exits it aborts the job, with code 1, as
+    // after an exception.
+    void giveUp() noexcept { isGivenUp_ = true; }
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
@@ -105,7 +110,7 @@ private:
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
         wait(request);
-        MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN);
+        check(MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
 
         std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
         std::vector<MPI_Request> requests;
@@ -136,6 +141,7 @@ private:
 
     int level_ = MPI_THREAD_SINGLE, rank_ = 0, size_ = 1;
     int exceptions_ = std::uncaught_exceptions();
+    bool isGivenUp_ = false;
 };
 
 } // namespace dfb

@@ -22,6 +22,8 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
 #include <cstring>
 #include <exception>
 #include <functional>
@@ -50,7 +52,8 @@ inline void checkMpi(int code, const char* call, int rank)
         return;
     char text[MPI_MAX_ERROR_STRING];
     int length = 0;
-    MPI_Error_string(code, text, &length);
+    if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
+        length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
     throw TransportError(std::string(call) + ": " + std::string(text, static_cast<std::size_t>(length)), rank);
 }
 
@@ -111,12 +114,12 @@ public:
         check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
         for (detail::Patience patience; !completed(duplicated);)
             patience.nap();
-        MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN);
-        MPI_Comm_rank(comm_, &rank_);
-        MPI_Comm_size(comm_, &size_);
+        check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
+        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
         const int* tagBound = nullptr;
         int found = 0;
-        MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found);
+        check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
 
         peers_.resize(static_cast<std::size_t>(size_));
@@ -169,8 +172,11 @@ public:
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
     bool wakesOnArrival() const noexcept { return false; }
-    // Longer where ranks share cores: waking up takes the core from one that computes.
-    void nap(std::chrono::nanoseconds limit) { signal_.nap(limit * crowding_ / 4); }
+    // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are.
+    void nap(std::chrono::nanoseconds limit)
+    {
+        signal_.nap(limit < std::chrono::milliseconds(10) ? limit * crowding_ / 4 : limit);
+    }
     void interrupt() { signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
@@ -206,8 +212,21 @@ public:
     // come; MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
-        if (!orderly || failed_ || !guarded([this] { return finish(); }))
-            abandon();
+        if (orderly && !failed_) {
+            if (guarded([this] { return finish(); }))
+                return;
+            flush();
+        }
+        abandon();
+    }
+
+    // Ends all ranks of MPI_COMM_WORLD: for another communicator MPICH first waits for its ranks, also for dead ones.
+    [[noreturn]] void abort(const std::string& text)
+    {
+        std::fprintf(stderr, "%s\n", text.c_str());
+        std::fflush(stderr);
+        MPI_Abort(MPI_COMM_WORLD, 1);
+        std::abort(); // it should not return
     }
 
 private:
@@ -222,7 +241,7 @@ private:
     {
         char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
         int length = 0;
-        MPI_Get_processor_name(host, &length);
+        check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
         const auto memory = memoryToShare();
         const Card mine{std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
                         memory ? memory->address() : detail::NodeMemory::Address()};
@@ -601,10 +620,10 @@ private:
             handler_->receive(source, std::move(message));
     }
 
-    static std::size_t byteCountOf(const MPI_Status& status)
+    std::size_t byteCountOf(const MPI_Status& status) const
     {
         int byteCount = 0;
-        MPI_Get_count(&status, MPI_BYTE, &byteCount);
+        check(MPI_Get_count(&status, MPI_BYTE, &byteCount), "MPI_Get_count");
         return static_cast<std::size_t>(byteCount);
     }
 
@@ -665,6 +684,8 @@ private:
     bool moveUntil(const Done& done)
     {
         for (detail::Patience patience; !done();) {
+            if (handler_)
+                handler_->waiting();
             if (handler_ && handler_->failed())
                 return false;
             if (move())
@@ -712,7 +733,7 @@ private:
     {
         for (MPI_Request& request : packetRequests_)
             if (request != MPI_REQUEST_NULL)
-                MPI_Cancel(&request);
+                check(MPI_Cancel(&request), "MPI_Cancel");
         statuses_.resize(std::max(statuses_.size(), packetRequests_.size()));
         for (int slot = 0; slot < postedPackets; ++slot) {
             MPI_Request& request = packetRequests_[static_cast<std::size_t>(slot)];
@@ -722,9 +743,19 @@ private:
             int done = 0, cancelled = 0;
             for (detail::Patience patience; check(MPI_Test(&request, &done, &status), "MPI_Test"), !done;)
                 patience.nap();
-            MPI_Test_cancelled(&status, &cancelled);
+            check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(slot, byteCountOf(status));
+        }
+    }
+
+    // What tells the others why this rank goes should still leave, but not at any cost.
+    void flush()
+    {
+        leaving_ = false;
+        for (int tries = 0; tries < 100 && !failed_ && !quiet(); ++tries) {
+            guarded([this] { return move(); });
+            std::this_thread::sleep_for(std::chrono::milliseconds(1));
         }
     }
 

@@ -1,5 +1,6 @@
 // ProgressThread: calls poll() of a transport so that messages move while the renderer works. It polls for a
 // few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
+// In between it calls who wants to look at the clock.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -7,8 +8,11 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cstdint>
+#include <functional>
 #include <mutex>
 #include <thread>
+#include <utility>
 
 #if defined(__linux__)
 #include <sys/prctl.h>
@@ -19,8 +23,14 @@ namespace dfb {
 template <class Transport>
 class ProgressThread {
 public:
-    // Does not start yet. `transport` must live until stop().
-    explicit ProgressThread(Transport& transport) : transport_(transport) {}
+    using Clock = std::chrono::steady_clock;
+
+    // Does not start yet. `transport` must live until stop(). `between` is called by the thread when there has been a
+    // poll since the last time; with nothing to do it sleeps for `longestNap` at most.
+    ProgressThread(Transport& transport, Clock::duration longestNap, std::function<void(Clock::time_point now)> between)
+        : transport_(transport), longestNap_(longestNap), between_(std::move(between))
+    {
+    }
     ProgressThread(const ProgressThread&) = delete;
     ProgressThread& operator=(const ProgressThread&) = delete;
     ~ProgressThread() { stop(); }
@@ -45,7 +55,11 @@ public:
     bool tryPoll()
     {
         const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
-        return lock.owns_lock() && transport_.poll();
+        if (!lock.owns_lock())
+            return false;
+        const bool moved = transport_.poll();
+        ++polls_;
+        return moved;
     }
 
     // Whether messages may come in: if not, and nothing waits to be sent, the thread sleeps. From any thread.
@@ -55,6 +69,7 @@ public:
         if (expect)
             transport_.interrupt();
     }
+    bool expectsMessages() const noexcept { return expecting_; }
 
     // Somebody waits for messages from now on, or no more; as often false as true. From any thread.
     void hurry(bool more)
@@ -66,7 +81,6 @@ public:
     }
 
 private:
-    using Clock = std::chrono::steady_clock;
     static constexpr std::chrono::microseconds pollTime{5};
 
     // Waking up costs some 10 us of a core, which rendering threads lose. While nobody waits here, a message that is
@@ -79,7 +93,7 @@ private:
         };
         // What the network library has taken may need it for a moment more.
         if (!expecting_ && quiet && idle > std::chrono::milliseconds(10))
-            return std::chrono::seconds(1);
+            return longestNap_;
         if (transport_.wakesOnArrival())
             return between(waiting_ > 0 ? 50 : 200, 2000);
         return waiting_ > 0 ? between(50, 200) : between(1000, 2000);
@@ -91,12 +105,19 @@ private:
         prctl(PR_SET_TIMERSLACK, 1000, 0, 0, 0); // in ns: the default would double the nap
 #endif
         auto last = Clock::now();
+        std::uint64_t polls = 0;
         while (!stop_) {
-            if (tryPoll()) {
-                last = Clock::now();
+            const bool moved = tryPoll();
+            const auto now = Clock::now();
+            if (polls_ != polls) {
+                polls = polls_;
+                between_(now);
+            }
+            if (moved) {
+                last = now;
                 continue;
             }
-            const Clock::duration idle = Clock::now() - last;
+            const Clock::duration idle = now - last;
             if (idle < pollTime)
                 continue;
             transport_.nap(napAfter(idle, transport_.quiet()));
@@ -104,7 +125,10 @@ private:
     }
 
     Transport& transport_;
+    const Clock::duration longestNap_;
+    const std::function<void(Clock::time_point)> between_;
     std::mutex pollMutex_;
+    std::atomic<std::uint64_t> polls_{0};
     std::atomic<bool> stop_{false}, expecting_{false};
     std::atomic<int> waiting_{0};
     std::thread thread_;

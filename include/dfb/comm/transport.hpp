@@ -33,6 +33,10 @@
 //   bool lendsTo(int other) const;  std::int32_t placeOf(const std::byte* block) const;
 //   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
 //
+// And, if it can end the job of which the ranks are processes:
+//   void abort(const std::string& text);         between start() and stop(), or in waiting(), on the thread that polls;
+//                                                says why on standard error and ends all ranks; does not return
+//
 // Messages may outlive the transport.
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
@@ -44,6 +48,7 @@
 #include <condition_variable>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <type_traits>
 #include <utility>
 
@@ -64,6 +69,8 @@ public:
     virtual void receive(int source, Buffer&& message) = 0;
     virtual void fail(const ErrorInfo& error) = 0; // the transport can not go on
     virtual bool failed() const = 0;               // it can not, or another rank has said that it can not
+    // Called over and over by a stop() that waits for other ranks, on its thread: here, alone, send() may be called.
+    virtual void waiting() {}
 
 protected:
     ~TransportHandler() = default;
@@ -155,6 +162,15 @@ template <class T>
 struct SharesMemory<T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)),
                                    decltype(std::declval<const T&>().placeOf(nullptr)),
                                    decltype(std::declval<const T&>().blockAt(0, 0, 0))>> : std::true_type {
+};
+
+// Optional.
+template <class T, class = void>
+struct CanAbort : std::false_type {
+};
+template <class T>
+struct CanAbort<T, std::void_t<decltype(std::declval<T&>().abort(std::declval<const std::string&>()))>>
+    : std::true_type {
 };
 
 } // namespace detail

@@ -48,6 +48,8 @@ public:
         config_.progress = messenger->options().progress;
         config_.checksums = messenger->options().checksums;
         config_.sharedMemory = messenger->options().sharedMemory;
+        config_.peerTimeoutMs = messenger->options().peerTimeoutMs;
+        config_.onPeerLost = messenger->options().onPeerLost;
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
         MessageHandler& self = *this;
         messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
@@ -65,6 +67,9 @@ public:
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
+            if (config_.peerTimeoutMs != 0 && config_.peerTimeoutMs < 100)
+                throw InvalidArgument("a time-out for peers of " + std::to_string(config_.peerTimeoutMs)
+                                      + " ms: 0, or 100 and more");
             checkWire();
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),

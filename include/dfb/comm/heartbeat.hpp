@@ -1,0 +1,110 @@
+// Heartbeat: which ranks this one listens for, when to ask them for a sign of life, and which of them is lost. It only
+// says so: the messenger sends and receives.
+//
+// Needed as MPI tells nobody that a rank has ended or hangs: a receive from it just never completes.
+#pragma once
+
+#include <dfb/version.hpp>
+
+#include <chrono>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// Minutes, as a rank may be held for a while and then go on: stopped by a batch system, by swapping, in a debugger. How
+// long it renders does not matter, since its progress thread answers meanwhile.
+inline constexpr int defaultPeerTimeoutMs = 300000;
+
+namespace detail {
+
+class Heartbeat {
+public:
+    using Time = std::chrono::steady_clock::time_point;
+    using Duration = Time::duration;
+
+    // `timeout` 0: it listens for nobody.
+    Heartbeat(int rank, int size, std::chrono::milliseconds timeout) : timeout_(timeout)
+    {
+        if (timeout.count() <= 0)
+            return;
+        if (rank != 0)
+            peers_.push_back(Peer{rank & (rank - 1)});
+        for (int bit = 1; bit < size && !(rank & bit); bit <<= 1)
+            if (rank + bit < size)
+                peers_.push_back(Peer{rank + bit});
+    }
+
+    // The ranks that this one listens for, and they for it: its neighbours in the tree of reductions, whose messages
+    // they get in each frame anyway. Each rank has one at least and no more than log2 of their number, and whichever
+    // ranks are lost, one of them has a neighbour that is not.
+    std::vector<int> neighbours() const
+    {
+        std::vector<int> ranks;
+        for (const Peer& peer : peers_)
+            ranks.push_back(peer.rank);
+        return ranks;
+    }
+    bool isOn() const noexcept { return !peers_.empty(); }
+
+    // Without a message for so long, a rank is asked; and it must answer sooner than that.
+    Duration patience() const noexcept { return timeout_ / 4; }
+    // How often to call due().
+    Duration interval() const noexcept { return timeout_ / 32; }
+
+    // A message has come from that rank. `promises`: it says by it that it answers at any time; before that nobody
+    // counts on it.
+    void heard(int rank, bool promises)
+    {
+        for (Peer& peer : peers_)
+            if (peer.rank == rank) {
+                peer.heard = true;
+                peer.promises = peer.promises || promises;
+                return;
+            }
+    }
+
+    struct Due {
+        std::vector<int> ask;
+        int lost = -1; // nothing has been heard of this rank for the whole time-out
+    };
+
+    // What there is to do, for a rank that has polled since the last call. `expecting`: it waits for messages; only
+    // then time counts. Nor does it count when this rank has not been here for long, as it was held itself then, and
+    // what the others have sent meanwhile is still to be received.
+    Due due(Time now, bool expecting)
+    {
+        const bool wasHere = isExpecting_ && now - last_ <= patience();
+        isExpecting_ = expecting;
+        last_ = now;
+        Due result;
+        for (Peer& peer : peers_) {
+            const bool heard = std::exchange(peer.heard, false);
+            if (!expecting || !wasHere || heard) {
+                peer.since = peer.asked = now;
+            } else if (peer.promises && now - peer.since >= timeout_) {
+                result.lost = peer.rank;
+            } else if (peer.promises && now - peer.asked >= patience()) {
+                peer.asked = now;
+                result.ask.push_back(peer.rank);
+            }
+        }
+        return result;
+    }
+
+private:
+    struct Peer {
+        int rank;
+        bool heard = false, promises = false;
+        Time since{}, asked{}; // nothing was heard since; or asked last
+    };
+
+    Duration timeout_;
+    std::vector<Peer> peers_;
+    bool isExpecting_ = false;
+    Time last_{};
+};
+
+} // namespace detail
+
+} // namespace dfb

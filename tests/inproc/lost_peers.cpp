@@ -1,0 +1,438 @@
+// A rank that stops answering: the others name it within the time-out, in whatever call they wait, and can be
+// destroyed; a rank that is only slow, or was held itself, raises no alarm; who expects nothing sends nothing. Ranks
+// are threads, each with a progress thread of its own, which a test can hold.
+#include "board.hpp"
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <atomic>
+#include <chrono>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace {
+
+using board::Board;
+using board::BoardTransport;
+using board::joined;
+using board::runOn;
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using scene::configOf;
+using scene::has;
+using scene::outcomeOf;
+using std::chrono::milliseconds;
+using Clock = std::chrono::steady_clock;
+
+constexpr int timeoutMs = 600;
+// How long after that many milliseconds an error may come, on a machine that is busy with other things.
+constexpr double marginMs = 5000;
+constexpr std::uint64_t seed = 1; // messages are moved by poll()
+
+struct Holds {
+    explicit Holds(int ranks) : held(static_cast<std::size_t>(ranks)), slowMs(held.size()), naps(held.size()) {}
+    std::vector<std::atomic<bool>> held;  // poll() of that rank does not return
+    std::vector<std::atomic<int>> slowMs; // it takes so long
+    std::vector<std::atomic<int>> naps;   // that it has taken
+};
+
+class HeldTransport {
+public:
+    struct Communicator {
+        BoardTransport::Communicator inner;
+        std::shared_ptr<Holds> holds;
+    };
+    [[maybe_unused]] static constexpr const char* name = "held";
+
+    HeldTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
+        : holds_(c.holds), inner_(c.inner, std::move(pool), progress)
+    {
+    }
+    int rank() const { return inner_.rank(); }
+    int size() const { return inner_.size(); }
+    bool needsPolling() const { return inner_.needsPolling(); }
+    bool mayPoll() const { return inner_.mayPoll(); }
+    bool wakesOnArrival() const { return inner_.wakesOnArrival(); }
+    bool quiet() const { return inner_.quiet(); }
+    bool poll()
+    {
+        const auto self = static_cast<std::size_t>(rank());
+        while (holds_->held[self])
+            std::this_thread::sleep_for(milliseconds(1));
+        if (const int slowMs = holds_->slowMs[self]; slowMs > 0)
+            std::this_thread::sleep_for(milliseconds(slowMs));
+        return inner_.poll();
+    }
+    void nap(std::chrono::nanoseconds limit)
+    {
+        ++holds_->naps[static_cast<std::size_t>(rank())];
+        inner_.nap(limit);
+    }
+    void interrupt() { inner_.interrupt(); }
+    void start(dfb::TransportHandler& handler) { inner_.start(handler); }
+    void stop(bool orderly) { inner_.stop(orderly); }
+    void send(int to, dfb::Buffer&& message) { inner_.send(to, std::move(message)); }
+
+private:
+    std::shared_ptr<Holds> holds_;
+    BoardTransport inner_;
+};
+
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, HeldTransport>;
+
+dfb::FrameBufferConfig smallConfig(int peerTimeoutMs = timeoutMs)
+{
+    auto config = configOf(scene::makeScene(0));
+    config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+    config.peerTimeoutMs = peerTimeoutMs;
+    return config;
+}
+
+FrameBuffer::Frame begin(FrameBuffer& fb)
+{
+    dfb::FrameParams params;
+    params.declared = true;
+    auto frame = fb.begin(params);
+    frame.declare({});
+    return frame;
+}
+
+void emptyFrame(FrameBuffer& fb) { begin(fb).end(); }
+
+// What a rank got out of waiting for one that is lost.
+struct Told {
+    std::optional<dfb::ErrorInfo> error;
+    double ms = 0;    // from the moment when that rank was held
+    double endMs = 0; // that destruction took then
+};
+
+// Messages that only say or ask that somebody is there.
+bool isSign(const MessageHeader& header)
+{
+    return header.kind == MessageKind::AreYouThere || header.kind == MessageKind::Present;
+}
+
+// `wait(messenger, fb)` is the call that the others are in when `victim` answers no more. `withFrameBuffer`: the
+// victim is held when that has been made and a first frame ended, else as soon as there is a messenger.
+std::vector<Told>
+lose(int ranks, int victim, bool withFrameBuffer,
+     const std::function<void(std::shared_ptr<dfb::Messenger<HeldTransport>>, std::unique_ptr<FrameBuffer>&)>& wait)
+{
+    const auto holds = std::make_shared<Holds>(ranks);
+    std::vector<Told> told(static_cast<std::size_t>(ranks));
+    std::atomic<int> ready{0}, over{0};
+    std::atomic<std::int64_t> heldAt{0};
+    runOn(
+        std::make_shared<Board>(), ranks,
+        [&](const BoardTransport::Communicator& communicator) {
+            const int rank = communicator.inner.rank();
+            dfb::MessengerOptions options;
+            options.peerTimeoutMs = timeoutMs;
+            auto messenger = std::make_shared<dfb::Messenger<HeldTransport>>(
+                HeldTransport::Communicator{communicator, holds}, options);
+            std::unique_ptr<FrameBuffer> fb;
+            if (withFrameBuffer) {
+                fb = std::make_unique<FrameBuffer>(messenger, smallConfig());
+                emptyFrame(*fb);
+            } else {
+                std::this_thread::sleep_for(milliseconds(100)); // until all have heard that the others answer
+            }
+            for (++ready; ready < ranks;)
+                std::this_thread::sleep_for(milliseconds(1));
+            Told& mine = told[static_cast<std::size_t>(rank)];
+            if (rank == victim) {
+                heldAt = Clock::now().time_since_epoch().count();
+                holds->held[static_cast<std::size_t>(rank)] = true;
+                while (over < ranks - 1)
+                    std::this_thread::sleep_for(milliseconds(1));
+                holds->held[static_cast<std::size_t>(rank)] = false; // it comes back, too late
+            } else {
+                while (heldAt == 0)
+                    std::this_thread::sleep_for(milliseconds(1));
+            }
+            try {
+                wait(messenger, fb);
+            } catch (const dfb::TransportError& e) {
+                mine.error = e.info();
+            }
+            const auto now = Clock::now();
+            mine.ms = std::chrono::duration<double, std::milli>(now - Clock::time_point(Clock::duration(heldAt.load())))
+                          .count();
+            fb.reset();
+            messenger.reset();
+            mine.endMs = std::chrono::duration<double, std::milli>(Clock::now() - now).count();
+            ++over;
+        },
+        seed);
+    return told;
+}
+
+void checkTold(const std::vector<Told>& told, int victim)
+{
+    for (std::size_t rank = 0; rank < told.size(); ++rank) {
+        INFO("rank " << rank << ", after " << told[rank].ms << " ms");
+        CHECK(told[rank].endMs < marginMs);
+        if (static_cast<int>(rank) == victim && !told[rank].error)
+            continue; // what it was to get was there already when it came back
+        REQUIRE(told[rank].error);
+        CHECK(told[rank].error->kind == dfb::ErrorKind::Transport);
+        CHECK(told[rank].error->rank == victim);
+        CHECK(has(told[rank].error->describe(), "is lost"));
+        if (static_cast<int>(rank) != victim) {
+            CHECK(told[rank].ms >= timeoutMs / 2);
+            CHECK(told[rank].ms < timeoutMs + marginMs);
+        }
+    }
+}
+
+} // namespace
+
+TEST_CASE("A rank that stops answering is named by all others, in whatever call they wait", "[lost_peers]")
+{
+    using Messenger = dfb::Messenger<HeldTransport>;
+    const auto constructor = [](const std::shared_ptr<Messenger>& messenger, std::unique_ptr<FrameBuffer>& fb) {
+        fb = std::make_unique<FrameBuffer>(messenger, smallConfig());
+    };
+    const auto frame = [](const std::shared_ptr<Messenger>&, std::unique_ptr<FrameBuffer>& fb) { emptyFrame(*fb); };
+    const auto reduction = [](const std::shared_ptr<Messenger>&, std::unique_ptr<FrameBuffer>& fb) {
+        fb->allReduce({1}, FrameBuffer::Reduce::Sum);
+    };
+    for (const int ranks : {2, 5})
+        for (const int victim : {0, ranks - 1}) {
+            INFO("rank " << victim << " of " << ranks);
+            checkTold(lose(ranks, victim, false, constructor), victim);
+            checkTold(lose(ranks, victim, true, frame), victim);
+            checkTold(lose(ranks, victim, true, reduction), victim);
+        }
+}
+
+TEST_CASE("A frame that is open while rendering fails when a rank is lost, and says so before end()", "[lost_peers]")
+{
+    std::atomic<int> failed{0};
+    const auto told =
+        lose(3, 2, true, [&](const std::shared_ptr<dfb::Messenger<HeldTransport>>&, std::unique_ptr<FrameBuffer>& fb) {
+            auto frame = begin(*fb);
+            for (const auto start = Clock::now(); !frame.failed() && Clock::now() - start < std::chrono::seconds(10);)
+                std::this_thread::sleep_for(milliseconds(1));
+            failed += frame.failed();
+            frame.end();
+        });
+    checkTold(told, 2);
+    CHECK(failed >= 2); // the lost one may not even begin it
+}
+
+TEST_CASE("The handler is called where a rank was found lost, once, and not on the others", "[lost_peers]")
+{
+    constexpr int ranks = 5, victim = 4; // only rank 0 listens for it
+    const auto holds = std::make_shared<Holds>(ranks);
+    std::vector<std::atomic<int>> calls(ranks);
+    std::atomic<int> lost{-1}, over{0};
+    std::vector<std::string> texts(ranks);
+    runOn(
+        std::make_shared<Board>(), ranks,
+        [&](const BoardTransport::Communicator& communicator) {
+            const auto rank = static_cast<std::size_t>(communicator.inner.rank());
+            auto config = smallConfig();
+            config.onPeerLost = [&, rank](const dfb::ErrorInfo& error) {
+                ++calls[rank];
+                lost = error.rank;
+            };
+            FrameBuffer fb({communicator, holds}, config);
+            emptyFrame(fb);
+            if (fb.rank() == victim) {
+                holds->held[victim] = true;
+                while (over < ranks - 1)
+                    std::this_thread::sleep_for(milliseconds(1));
+                holds->held[victim] = false;
+            }
+            texts[rank] = outcomeOf([&] { emptyFrame(fb); });
+            ++over;
+        },
+        seed);
+    INFO(joined(texts));
+    CHECK(lost == victim);
+    CHECK(calls[0] == 1);
+    for (std::size_t rank = 1; rank < ranks; ++rank)
+        CHECK(calls[rank] == 0);
+    for (const std::string& text : texts)
+        CHECK(has(text, "rank 4"));
+}
+
+TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_peers]")
+{
+    const auto holds = std::make_shared<Holds>(3);
+    std::vector<std::string> texts(3);
+    runOn(
+        std::make_shared<Board>(), 3,
+        [&](const BoardTransport::Communicator& communicator) {
+            FrameBuffer fb({communicator, holds}, smallConfig());
+            emptyFrame(fb);
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            if (rank == 2)
+                holds->slowMs[rank] = 20; // others: 1 ms or so
+            texts[rank] = outcomeOf([&] {
+                auto frame = begin(fb);
+                if (rank == 2)
+                    std::this_thread::sleep_for(milliseconds(4 * timeoutMs));
+                frame.end();
+                if (rank == 1) // and between frames, with the others in a call that waits for all
+                    std::this_thread::sleep_for(milliseconds(3 * timeoutMs));
+                fb.allReduce({1}, FrameBuffer::Reduce::Sum);
+            });
+            holds->slowMs[rank] = 0;
+        },
+        seed);
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(text == "fine");
+}
+
+TEST_CASE("A rank that was held itself does not take the others for lost", "[lost_peers]")
+{
+    const auto holds = std::make_shared<Holds>(3);
+    std::vector<std::string> texts(3);
+    runOn(
+        std::make_shared<Board>(), 3,
+        [&](const BoardTransport::Communicator& communicator) {
+            const bool isHeld = communicator.inner.rank() == 1;
+            FrameBuffer fb({communicator, holds}, smallConfig(isHeld ? timeoutMs : 60000));
+            emptyFrame(fb);
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            texts[rank] = outcomeOf([&] {
+                auto frame = begin(fb);
+                if (isHeld) {
+                    std::this_thread::sleep_for(milliseconds(timeoutMs / 2));
+                    holds->held[rank] = true;
+                    std::this_thread::sleep_for(milliseconds(3 * timeoutMs));
+                    holds->held[rank] = false;
+                    std::this_thread::sleep_for(milliseconds(2 * timeoutMs));
+                }
+                frame.end();
+            });
+        },
+        seed);
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(text == "fine");
+}
+
+TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken for lost", "[lost_peers]")
+{
+    for (const bool byCaller : {true, false}) {
+        const auto holds = std::make_shared<Holds>(2);
+        std::vector<std::string> texts(2);
+        runOn(
+            std::make_shared<Board>(), 2,
+            [&](const BoardTransport::Communicator& communicator) {
+                const bool isOther = communicator.inner.rank() == 1;
+                auto config = smallConfig();
+                if (isOther && byCaller)
+                    config.progress = dfb::Progress::Caller;
+                else if (isOther)
+                    config.peerTimeoutMs = 0;
+                FrameBuffer fb({communicator, holds}, config);
+                const auto rank = static_cast<std::size_t>(fb.rank());
+                texts[rank] = outcomeOf([&] {
+                    auto frame = begin(fb);
+                    holds->held[1] = isOther && !byCaller;
+                    if (isOther)
+                        std::this_thread::sleep_for(milliseconds(3 * timeoutMs));
+                    holds->held[1] = false;
+                    frame.end();
+                });
+            },
+            seed);
+        INFO(joined(texts));
+        for (const std::string& text : texts)
+            CHECK(text == "fine");
+    }
+}
+
+TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few messages are sent", "[lost_peers]")
+{
+    constexpr int ranks = 4, quietMs = 3 * timeoutMs;
+    std::vector<int> naps; // of all ranks while idle, without and with a time-out
+    for (const int peerTimeoutMs : {0, timeoutMs}) {
+        const auto holds = std::make_shared<Holds>(ranks);
+        const auto board = std::make_shared<Board>();
+        std::atomic<int> signs{0}, others{0};
+        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
+            ++(isSign(header) ? signs : others);
+            return Board::What::Pass;
+        };
+        std::atomic<int> atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0};
+        const auto allNaps = [&] {
+            int sum = 0;
+            for (const auto& n : holds->naps)
+                sum += n;
+            return sum;
+        };
+        runOn(
+            board, ranks,
+            [&](const BoardTransport::Communicator& communicator) {
+                FrameBuffer fb({communicator, holds}, smallConfig(peerTimeoutMs));
+                emptyFrame(fb);
+                std::this_thread::sleep_for(milliseconds(300)); // until all are out of it and asleep
+                if (fb.rank() == 0) {
+                    atStart = signs.load();
+                    napsBefore = allNaps();
+                }
+                std::this_thread::sleep_for(milliseconds(quietMs));
+                if (fb.rank() == 0) {
+                    idle = signs - atStart;
+                    napsIdle = allNaps() - napsBefore;
+                }
+                std::this_thread::sleep_for(milliseconds(300));
+                auto frame = begin(fb);
+                if (fb.rank() == 0)
+                    silent = -signs;
+                std::this_thread::sleep_for(milliseconds(quietMs));
+                if (fb.rank() == 0)
+                    silent += signs;
+                frame.end();
+            },
+            seed);
+        naps.push_back(napsIdle);
+        const int pairs = ranks - 1; // of neighbours in the tree
+        INFO("time-out " << peerTimeoutMs << ": " << atStart << " signs of life at the start, " << idle << " idle, "
+                         << silent << " in a frame of " << quietMs << " ms; " << napsIdle << " naps");
+        CHECK(atStart == (peerTimeoutMs > 0 ? 2 * pairs : 0));
+        CHECK(idle == 0);
+        if (peerTimeoutMs == 0) {
+            CHECK(silent == 0);
+        } else {
+            CHECK(silent > 0);
+            // No more than a question and an answer in each direction, for each quarter of the time-out.
+            CHECK(silent <= pairs * 4 * 4 * (quietMs / timeoutMs + 1));
+        }
+    }
+    // Idle threads wake up once a second, or once in a quarter of the time-out if that is shorter.
+    INFO(naps[0] << " naps without, " << naps[1] << " with");
+    CHECK(naps[0] <= ranks * (quietMs / 1000 + 2));
+    CHECK(naps[1] <= ranks * (quietMs / (timeoutMs / 4) + 2));
+}
+
+TEST_CASE("A time-out for peers that can not be is refused on all ranks", "[lost_peers]")
+{
+    for (const int wrong : {-1, 1, 99}) {
+        std::vector<std::string> texts(2);
+        const auto holds = std::make_shared<Holds>(2);
+        runOn(
+            std::make_shared<Board>(), 2,
+            [&](const BoardTransport::Communicator& communicator) {
+                const int rank = communicator.inner.rank();
+                texts[static_cast<std::size_t>(rank)] = outcomeOf([&] {
+                    FrameBuffer fb({communicator, holds}, smallConfig(rank == 1 ? wrong : 0));
+                });
+            },
+            seed);
+        INFO(joined(texts));
+        for (const std::string& text : texts)
+            CHECK((has(text, "InvalidArgument") && has(text, std::to_string(wrong) + " ms")));
+    }
+}

@@ -1,0 +1,211 @@
+// A rank that dies or hangs under MPI: the others say which, in time, and come to an end.
+//   mpirun -n 4 mpi_dead <how> <where> <reaction> <victim> <folder>
+//     how:      kill (SIGKILL), exit (without MPI_Finalize), stop (SIGSTOP), resume (SIGSTOP, and SIGCONT later)
+//     where:    constructor, frame (while rendering), reduction (between frames), end (destruction)
+//     reaction: abort (the default: MPI_Abort), handler (the other ranks go on, as far as they can)
+// Launchers end a job when a rank dies, in most cases, or do not let it live on. Therefore each process forks first:
+// what the launcher sees goes on until all ranks have been told, whatever has become of the rank itself. So this is the
+// case in which nobody but the library notices. mpi_dead.cmake starts it and looks at what it prints:
+//   mpi_dead: rank 0 told of rank 3 after 1234 ms, gone after 5 ms: <error>
+// <folder> must be empty.
+#include <dfb/dfb.hpp>
+
+#include <atomic>
+#include <chrono>
+#include <csignal>
+#include <cstdio>
+#include <cstdlib>
+#include <exception>
+#include <fstream>
+#include <functional>
+#include <memory>
+#include <string>
+#include <thread>
+
+#include <sys/prctl.h>
+#include <sys/stat.h>
+#include <sys/types.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+namespace {
+
+using Clock = std::chrono::steady_clock;
+using std::chrono::milliseconds;
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
+constexpr int timeoutMs = 1500;
+
+struct Run {
+    std::string how, where, reaction;
+    int victim = 0;
+    std::string folder;
+};
+
+double msSince(Clock::time_point start)
+{
+    return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+}
+
+std::string noteOf(const Run& run, int rank) { return run.folder + "/told." + std::to_string(rank); }
+bool exists(const std::string& path)
+{
+    struct stat status;
+    return stat(path.c_str(), &status) == 0;
+}
+
+// Whether all ranks that can be told have been. The size of the job is in a file, as this process is not in MPI.
+bool allTold(const Run& run)
+{
+    int size = 0;
+    std::ifstream(run.folder + "/size") >> size;
+    bool all = size > 0;
+    for (int rank = 0; rank < size; ++rank)
+        all = all && ((rank == run.victim && run.how != "resume") || exists(noteOf(run, rank)));
+    return all;
+}
+bool othersTold(const Run& run)
+{
+    Run others = run;
+    others.how = "kill";
+    return allTold(others);
+}
+
+void die(const Run& run)
+{
+    if (run.how == "kill")
+        raise(SIGKILL);
+    else if (run.how == "exit")
+        _exit(0);
+    else
+        raise(SIGSTOP);
+}
+
+void emptyFrame(
+    FrameBuffer& fb, const std::function<void()>& render = [] {})
+{
+    dfb::FrameParams params;
+    params.declared = true;
+    auto frame = fb.begin(params);
+    frame.declare({});
+    render();
+    frame.end();
+}
+
+void runRank(const Run& run, int& argc, char**& argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    mpi.giveUp(); // MPI_Finalize would wait for ever
+    if (mpi.rank() == 0) {
+        std::ofstream(run.folder + "/size.new") << mpi.size() << '\n';
+        std::rename((run.folder + "/size.new").c_str(), (run.folder + "/size").c_str());
+    }
+    const bool isVictim = mpi.rank() == run.victim;
+    std::atomic<bool> handlerCalled{false};
+    std::string text, lateText;
+    dfb::MessengerOptions options;
+    options.peerTimeoutMs = timeoutMs;
+    if (run.reaction == "handler")
+        options.onPeerLost = [&](const dfb::ErrorInfo& error) {
+            handlerCalled = true;
+            lateText = error.describe();
+        };
+    auto start = Clock::now();
+    int lost = -1;
+    double toldMs = 0;
+    {
+        auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(mpi.communicator(), options);
+        try {
+            const auto make = [&] {
+                return std::make_unique<FrameBuffer>(messenger, dfb::FrameBufferConfig{256, 256});
+            };
+            std::unique_ptr<FrameBuffer> fb;
+            if (run.where == "constructor") {
+                std::this_thread::sleep_for(milliseconds(200)); // until each has heard that the others answer
+            } else {
+                fb = make();
+                emptyFrame(*fb);
+            }
+            start = Clock::now();
+            if (isVictim && run.where != "frame")
+                die(run);
+            if (run.where == "constructor")
+                fb = make();
+            else if (run.where == "frame")
+                emptyFrame(*fb, [&] {
+                    std::this_thread::sleep_for(milliseconds(50));
+                    if (isVictim)
+                        die(run);
+                });
+            else if (run.where == "reduction")
+                fb->allReduce({1}, FrameBuffer::Reduce::Sum);
+        } catch (const dfb::TransportError& e) {
+            text = e.what();
+            lost = e.info().rank;
+        }
+        toldMs = msSince(start);
+        start = Clock::now();
+    }
+    const double goneMs = msSince(start);
+    if (run.where == "end" && handlerCalled) {
+        text = lateText;
+        lost = run.victim;
+        toldMs = goneMs;
+    }
+    std::printf("mpi_dead: rank %d told of rank %d after %.0f ms, gone after %.0f ms: %s\n", mpi.rank(), lost, toldMs,
+                goneMs, text.c_str());
+    std::fflush(stdout);
+    std::ofstream note(noteOf(run, mpi.rank()));
+}
+
+// What the launcher sees: goes on until all have been told.
+int watch(const Run& run, pid_t child)
+{
+    bool childIsThere = true, resumed = false;
+    for (const auto end = Clock::now() + std::chrono::seconds(25); Clock::now() < end;) {
+        int status = 0;
+        if (childIsThere && waitpid(child, &status, WNOHANG) == child)
+            childIsThere = false;
+        if (run.how == "resume" && !resumed && othersTold(run)) {
+            resumed = true;
+            kill(child, SIGCONT);
+        }
+        if (allTold(run))
+            break;
+        std::this_thread::sleep_for(milliseconds(20));
+    }
+    std::this_thread::sleep_for(milliseconds(200)); // what was printed is on its way
+    if (childIsThere) {
+        kill(child, SIGKILL);
+        waitpid(child, nullptr, 0);
+    }
+    return 0;
+}
+
+} // namespace
+
+int main(int argc, char** argv)
+{
+    if (argc != 6) {
+        std::fprintf(stderr, "mpi_dead: five arguments\n");
+        return 2;
+    }
+    const Run run{argv[1], argv[2], argv[3], std::atoi(argv[4]), argv[5]};
+    const pid_t parent = getpid();
+    const pid_t child = fork();
+    if (child < 0)
+        return 2;
+    if (child > 0)
+        return watch(run, child);
+    prctl(PR_SET_PDEATHSIG, SIGKILL); // stopped or not, it does not outlive its parent
+    if (getppid() != parent)
+        _exit(2);
+    int code = 0;
+    try {
+        runRank(run, argc, argv);
+    } catch (const std::exception& e) {
+        std::printf("mpi_dead: unexpected: %s\n", e.what());
+        code = 1;
+    }
+    std::fflush(stdout);
+    _exit(code); // nothing of MPI is orderly any more
+}
