@@ -38,9 +38,10 @@ struct MessengerOptions {
     // which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this rank
     // looks for no other and is not looked for; what is less than 100 counts as that. May differ between ranks.
     int peerTimeoutMs = defaultPeerTimeoutMs;
-    // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort, with the
-    // error on standard error), as MPI does not go on without a rank. Else it is called, by a thread of the library,
-    // with that rank in ErrorInfo::rank; it must be quick and not throw, and then all ranks get this as TransportError.
+    // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort of
+    // MPI_COMM_WORLD, with the error on standard error), as MPI does not go on without a rank. Else all ranks get the
+    // error as TransportError, with the lost rank in ErrorInfo::rank, and this is called with it, once, by a thread of
+    // the library, where the loss was found: on one neighbour of that rank or several. It must be quick and not throw.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
