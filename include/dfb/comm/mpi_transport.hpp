@@ -225,6 +225,7 @@ public:
     {
         std::fprintf(stderr, "%s\n", text.c_str());
         std::fflush(stderr);
+        std::this_thread::sleep_for(std::chrono::milliseconds(500)); // launchers drop what they have not passed on yet
         MPI_Abort(MPI_COMM_WORLD, 1);
         std::abort(); // it should not return
     }
