@@ -13,32 +13,54 @@ namespace example {
 
 namespace detail {
 
-// tinyobjloader takes what is no number, or is not there, for 0; so the vertices are looked at first.
-inline void checkObjVertices(std::string_view bytes, const std::string& name)
+// The next word of a line.
+inline std::string_view nextObjWord(std::string_view& line)
+{
+    const char* space = " \t";
+    line.remove_prefix(std::min(line.find_first_not_of(space), line.size()));
+    const std::string_view word = line.substr(0, line.find_first_of(space));
+    line.remove_prefix(word.size());
+    return word;
+}
+
+// Takes a number, which may have a sign, from the front of a word. False if there is none or it is too large.
+template <class Number>
+bool takeObjNumber(std::string_view& word, Number& value)
+{
+    word.remove_prefix(word.size() > 1 && word[0] == '+' && word[1] != '-');
+    const auto result = std::from_chars(word.data(), word.data() + word.size(), value);
+    word.remove_prefix(static_cast<std::size_t>(result.ptr - word.data()));
+    return result.ec == std::errc();
+}
+
+// tinyobjloader takes what is no number, or is not there, for 0, and cuts indices to 32 bits; so vertices and faces are
+// looked at first. Lines end as they do there.
+inline void checkObjLines(std::string_view bytes, const std::string& name)
 {
     std::size_t lineNumber = 0;
     while (!bytes.empty()) {
-        const std::size_t end = std::min(bytes.find('\n'), bytes.size());
+        const std::size_t end = std::min(bytes.find_first_of("\r\n"), bytes.size());
         std::string_view line = bytes.substr(0, end);
-        bytes.remove_prefix(std::min(end + 1, bytes.size()));
+        bytes.remove_prefix(std::min(end + (bytes.substr(end, 2) == "\r\n" ? 2 : 1), bytes.size()));
         ++lineNumber;
-        const char* space = " \t\r";
-        const auto skipSpace = [&] { line.remove_prefix(std::min(line.find_first_not_of(space), line.size())); };
-        skipSpace();
-        if (line.size() < 2 || line[0] != 'v' || (line[1] != ' ' && line[1] != '\t'))
-            continue;
-        line.remove_prefix(1);
-        for (int i = 0; i < 3; ++i) {
-            skipSpace();
-            line.remove_prefix(!line.empty() && line[0] == '+');
-            double value = 0;
-            const std::string_view word = line.substr(0, line.find_first_of(space));
-            const auto result = std::from_chars(word.data(), word.data() + word.size(), value);
-            if (word.empty() || result.ec != std::errc() || result.ptr != word.data() + word.size()
-                || !std::isfinite(value))
-                throw std::runtime_error(name + ": line " + std::to_string(lineNumber)
-                                         + ": expected 'v x y z' with finite numbers");
-            line.remove_prefix(word.size());
+        const auto fail = [&](const char* expected) {
+            throw std::runtime_error(name + ": line " + std::to_string(lineNumber) + ": expected " + expected);
+        };
+        const std::string_view kind = nextObjWord(line);
+        if (kind == "v" && !line.empty()) {
+            for (int i = 0; i < 3; ++i) {
+                double value = 0;
+                std::string_view word = nextObjWord(line);
+                if (!takeObjNumber(word, value) || !word.empty() || !std::isfinite(value))
+                    fail("'v x y z' with finite numbers");
+            }
+        } else if (kind == "f") {
+            for (std::string_view word = nextObjWord(line); !word.empty(); word = nextObjWord(line)) {
+                int index = 0;
+                if (!takeObjNumber(word, index)
+                    || !(word.empty() || (word[0] == '/' && word.find_first_not_of("/+-0123456789") == word.npos)))
+                    fail("'f' with indices as in i, i/j, i//k or i/j/k");
+            }
         }
     }
 }
@@ -49,7 +71,7 @@ inline void checkObjVertices(std::string_view bytes, const std::string& name)
 // with `name`, what was expected and what was found.
 inline Mesh parseObj(const std::string& bytes, const std::string& name)
 {
-    detail::checkObjVertices(bytes, name);
+    detail::checkObjLines(bytes, name);
     struct State {
         Mesh mesh;
         std::string name;

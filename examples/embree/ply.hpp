@@ -7,6 +7,7 @@
 #include "mesh.hpp"
 
 #include <charconv>
+#include <cmath>
 #include <cstring>
 #include <sstream>
 #include <string_view>
@@ -172,12 +173,13 @@ private:
                 continue;
             }
             const double count = number(property.countType, element, row);
-            if (!(count >= 0 && count <= static_cast<double>(bytes_.size() - at_)))
+            if (!(count >= 0 && count <= static_cast<double>(bytes_.size() - at_)) || count != std::floor(count))
                 fail("it ends early, or has a bad list, in " + element.name + ' ' + std::to_string(row));
             polygon_.clear();
             for (std::int64_t i = 0; i < static_cast<std::int64_t>(count); ++i) {
                 const double index = number(property.type, element, row);
-                polygon_.push_back(index >= 0 && index < 4294967296.0 ? static_cast<std::int64_t>(index) : -1);
+                const bool canBe = index >= 0 && index < 4294967296.0 && index == std::floor(index);
+                polygon_.push_back(canBe ? static_cast<std::int64_t>(index) : -1);
             }
             if (isFace && isIndexList(property))
                 addPolygon(mesh, polygon_, name_ + ": face " + std::to_string(row));

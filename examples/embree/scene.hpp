@@ -30,13 +30,13 @@ struct Placement {
     }
 };
 
-// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false or the box has no extent.
+// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false, or the box has no extent or
+// one that is lost beside its distance from 0.
 inline Placement fitToUnitCube(const Box& box, bool fit)
 {
     Placement placement;
-    const float extent = box.largestExtent();
-    if (fit && extent > 0) {
-        const float scale = 1 / extent;
+    const float extent = box.largestExtent(), scale = 1 / extent;
+    if (fit && extent > 0 && isUsable(box.lo * scale) && isUsable(box.hi * scale)) {
         placement.scale = {scale, scale, scale};
         placement.offset = Vec3(0.5f, 0.5f, 0.5f) - box.center() * scale;
     }

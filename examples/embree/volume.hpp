@@ -147,7 +147,14 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
     if (lo > hi)
         throw std::runtime_error(path + ": not one of its voxels is finite");
     info.minimum = lo < 0 && hi > 0 ? 0 : lo;
-    info.maximum = hi > info.minimum ? hi : info.minimum + 1;
+    info.maximum = hi;
+    if (hi == info.minimum) { // all alike: something above them, or else below
+        info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
+        if (!std::isfinite(info.maximum)) {
+            info.minimum = hi / 2;
+            info.maximum = hi;
+        }
+    }
     return info;
 }
 

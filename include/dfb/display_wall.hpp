@@ -84,7 +84,7 @@ public:
         messaging_ = std::make_unique<detail::Messaging<Transport>>(std::move(messenger), std::move(executor),
                                                                     std::max(poolBytes, 4 * largest), self);
         messaging_->start();
-        detail::Agreement mine{true, describe()};
+        detail::Agreement mine{true, describe(), messaging_->rank()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
             mine = {false, wrong};
         const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
@@ -132,7 +132,7 @@ public:
             messaging_->messenger().expectMessages(false);
             throw;
         }
-        detail::Agreement mine{complete, complete ? "" : missing};
+        detail::Agreement mine{complete, complete ? "" : missing, messaging_->rank()};
         const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         messaging_->messenger().expectMessages(false);
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -300,6 +300,8 @@ private:
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             picture.pixelsLeft -= static_cast<std::int64_t>(part.width()) * part.height();
+            if (picture.pixelsLeft < 0)
+                detail::failMalformed("more of a display than it has");
             complete = picture.pixelsLeft == 0;
         }
         if (complete)

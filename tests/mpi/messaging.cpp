@@ -344,6 +344,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     dfb::DistributedFrameBuffer<Counter> fb(MPI_COMM_WORLD, config);
     {
         auto frame = fb.begin(scene::paramsOf(s));
+        MPI_Barrier(MPI_COMM_WORLD); // rank 0 is done with what makes it move messages by itself
         const auto tile = std::make_unique<decltype(fb)::Tile>();
         if (rank > 0)
             for (const dfb::Brick& brick : scene::bricksOf(s, rank, size))

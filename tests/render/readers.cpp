@@ -311,6 +311,10 @@ TEST_CASE("The range of a volume is that of the whole file", "[readers]")
     CHECK(positive.maximum == 9.0f);
     const VolumeInfo constant = describe("a_2x2x2_float32.raw", bytesOf(std::vector<float>(8, 2.0f)));
     CHECK(constant.maximum > constant.minimum);
+    for (const float value : {1e30f, -1e30f, std::numeric_limits<float>::max()}) {
+        const VolumeInfo large = describe("a_2x2x2_float32.raw", bytesOf(std::vector<float>(8, value)));
+        CHECK((std::isfinite(large.maximum) && large.maximum > large.minimum));
+    }
     CHECK(isLineWith(errorOf([&] { describe("a_2x2x2_float32.raw", bytesOf(std::vector<float>(8, nan))); }), "finite"));
 }
 
@@ -399,6 +403,8 @@ TEST_CASE("PLY: bad headers, numbers, lists and indices", "[readers]")
         {"4 0 1 2 3", "4 0 1 2 -1"},
         {"4 0 1 2 3", "4 0 1 2 4294967296"},
         {"4 0 1 2 3", "4 0 1 2 nan"},
+        {"4 0 1 2 3", "4 0 1 2 2.5"},
+        {"4 0 1 2 3", "3.5 0 1 2"},
         {"4 0 1 2 3", "-4 0 1 2 3"},
         {"4 0 1 2 3", "1000000 0 1 2 3"},
         {"4 0 1 2 3", "2 0 1"},
@@ -448,6 +454,11 @@ TEST_CASE("OBJ: bad vertices and faces", "[readers]")
         INFO('\'' << from << "' becomes '" << to << '\'');
         CHECK(isLineWith(objRefusal(replaced(plainObj, from, to)), "the.file: "));
     }
+    // What tinyobjloader would cut to 32 bits, or to the digits; and where it sees the end of a line.
+    for (const char* face : {"f 1 2 4294967299", "f 1 2 3x", "f 1 2 3/x"})
+        CHECK(isLineWith(objRefusal(replaced(plainObj, "f -1 2 1", face)), "the.file: "));
+    for (const char* lines : {"v 1 nan 0\r", "#\rv 1 nan 0\n"})
+        CHECK(isLineWith(objRefusal(replaced(plainObj, "v 1 1 0\n", lines)), "the.file: "));
     CHECK(isLineWith(objRefusal(""), "the.file: "));
     CHECK(isLineWith(objRefusal("v 0 0 0\nv 1 0 0\nv 1 1 0\n"), "the.file: "));
     CHECK(isLineWith(objRefusal("f 1 2 3\n"), "the.file: "));
@@ -522,4 +533,15 @@ TEST_CASE("A scene takes files by their ending and says which one is wrong", "[r
         std::filesystem::create_directory(folder / ("d" + name)); // and folders
         CHECK(isLineWith(errorOf([&] { addFile(scene, folder / ("d" + name), true); }), folder / ("d" + name)));
     }
+}
+
+TEST_CASE("What is too small beside its place is left where it is", "[readers]")
+{
+    for (const float place : {1e14f, 0.0f})
+        for (const float size : {1e-38f, 1e-42f, 0.0f}) {
+            Scene scene;
+            scene.add(Mesh{{{0, place, 0}, {size, place, 0}, {0, place, size}}, {{0, 1, 2}}}, true);
+            for (const Vec3& p : scene.meshes.front().mesh.positions)
+                CHECK((std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z)));
+        }
 }

@@ -653,6 +653,22 @@ TEST_CASE("Credits that overtake each other, come twice or say nonsense", "[flow
     CHECK(link.flow->underWay() == 0);
 }
 
+TEST_CASE("More than a pool is neither granted nor asked for", "[flow]")
+{
+    Link link(2, 400);
+    for (int i = 0; i < 10; ++i)
+        link.send(50);
+    CHECK_THROWS_AS(link.flow->credited(1, {601, 200}), dfb::Error);
+    CHECK(link.transmitted.size() == 4);
+    CHECK_NOTHROW(link.flow->credited(1, {600, 200}));
+    const std::uint64_t most = ~std::uint64_t{0};
+    CHECK_THROWS_AS(link.flow->requested(1, {most, most}), dfb::Error);
+    CHECK_THROWS_AS(link.flow->requested(1, {300, 299}), dfb::Error);
+    link.flow->requested(1, {300, 350}); // and nobody waits behind them
+    REQUIRE(link.credits.size() == 1);
+    CHECK(link.credits[0].granted == 350);
+}
+
 TEST_CASE("drop() forgets what waits and keeps nothing more; a new epoch does again", "[flow]")
 {
     Link link(2, 400);
@@ -664,14 +680,14 @@ TEST_CASE("drop() forgets what waits and keeps nothing more; a new epoch does ag
     link.send(50);
     CHECK(link.transmitted.size() == 4);
     CHECK(link.flow->underWay() == 200);
-    link.flow->credited(1, {1000, 200});
+    link.flow->credited(1, {600, 200});
     CHECK(link.transmitted.size() == 4);
     CHECK(link.flow->underWay() == 0);
     link.flow->newEpoch();
     CHECK(link.flow->underWay() == 0);
     for (int i = 0; i < 5; ++i)
         link.send(50);
-    CHECK(link.transmitted.size() == 8); // the first part again, not the 1000 of the last epoch
+    CHECK(link.transmitted.size() == 8); // the first part again, not the 600 of the last epoch
     CHECK(link.flow->underWay() == 250);
 }
 

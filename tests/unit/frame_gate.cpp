@@ -22,6 +22,27 @@ TEST_CASE("Frames of several gates are numbered in turns", "[frame_gate]")
     }
 }
 
+TEST_CASE("A message is of this frame, the last, the next, or none that can be", "[frame_gate]")
+{
+    FrameGate gate(2, 3);
+    gate.open();
+    const auto enter = [&](std::int64_t number) {
+        dfb::detail::MessageHeader header;
+        header.number = number;
+        dfb::Buffer message;
+        return gate.enter(1, header, message);
+    };
+    CHECK(enter(2) == FrameGate::Entry::Inside);
+    gate.leave();
+    CHECK(enter(-1) == FrameGate::Entry::Late);
+    CHECK(enter(5) == FrameGate::Entry::Kept);
+    CHECK(enter(8) == FrameGate::Entry::Absurd);
+    CHECK(enter(std::int64_t{1} << 62) == FrameGate::Entry::Absurd);
+    gate.close();
+    CHECK(gate.open().size() == 1);
+    gate.close();
+}
+
 TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[frame_gate]")
 {
     FrameGate gate;

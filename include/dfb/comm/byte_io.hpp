@@ -55,19 +55,35 @@ public:
         const auto* first = reinterpret_cast<const char*>(take(length));
         return std::string(first, length);
     }
+    // The same when any are.
+    void end() const
+    {
+        if (left_ > 0)
+            fail("a control message is too long", 0);
+    }
+    // And when what was read can not be.
+    void require(bool canBe) const
+    {
+        if (!canBe)
+            fail("a control message says what can not be", 0);
+    }
     std::size_t left() const noexcept { return left_; }
 
 private:
+    [[noreturn]] void fail(const char* message, std::size_t expected) const
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::MalformedMessage;
+        info.expected = static_cast<std::int64_t>(expected);
+        info.got = static_cast<std::int64_t>(left_);
+        info.message = message;
+        throw Error(std::move(info));
+    }
+
     const std::byte* take(std::size_t count)
     {
-        if (count > left_) {
-            ErrorInfo info;
-            info.kind = ErrorKind::MalformedMessage;
-            info.expected = static_cast<std::int64_t>(count);
-            info.got = static_cast<std::int64_t>(left_);
-            info.message = "a control message is too short";
-            throw Error(std::move(info));
-        }
+        if (count > left_)
+            fail("a control message is too short", count);
         const std::byte* first = next_;
         next_ += count;
         left_ -= count;
@@ -91,6 +107,7 @@ inline ErrorInfo getErrorInfo(ByteReader& in)
 {
     ErrorInfo e;
     e.kind = in.get<ErrorKind>();
+    in.require(e.kind <= ErrorKind::Transport);
     e.rank = in.get<std::int32_t>();
     for (std::int64_t* v : {&e.frame, &e.tile, &e.pass, &e.generation, &e.source, &e.expected, &e.got})
         *v = in.get<std::int64_t>();

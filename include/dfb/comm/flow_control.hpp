@@ -124,8 +124,12 @@ public:
         return text;
     }
 
+    // Throws Error (MalformedMessage) for more than its pool.
     void credited(int from, const Credit& credit)
     {
+        if (credit.granted > credit.consumed && credit.granted - credit.consumed > pool_)
+            failMalformed("credit for more than a pool", static_cast<std::int64_t>(pool_),
+                          static_cast<std::int64_t>(credit.granted - credit.consumed));
         std::vector<Buffer> ready;
         Request request;
         {
@@ -185,10 +189,14 @@ public:
         serve(lock);
     }
 
+    // Throws Error (MalformedMessage) for what could never be met: others would wait behind it.
     void requested(int source, const Request& request)
     {
         std::unique_lock<std::mutex> lock(mutex_);
         Incoming& in = incomingFrom(source);
+        if (request.all < request.first || (request.all > in.granted && request.all - in.granted > pool_))
+            failMalformed("a request for more than a pool", static_cast<std::int64_t>(pool_),
+                          static_cast<std::int64_t>(request.all - in.granted));
         if (request.first <= in.granted || (in.asks && request.first <= in.request.first))
             return; // it has its answer, or a later one has overtaken it
         in.request = request;

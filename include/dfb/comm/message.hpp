@@ -33,7 +33,7 @@ enum class MessageKind : std::uint8_t {
 };
 
 struct MessageHeader {
-    static constexpr std::uint16_t magicNumber = 0x0dfb;
+    static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
     static constexpr std::uint8_t formatVersion = 5;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
@@ -71,12 +71,13 @@ inline MessageHeader readMessageHeader(const Buffer& message)
     if (message.size() < sizeof(MessageHeader))
         failMalformed("shorter than a header", sizeof(MessageHeader), static_cast<std::int64_t>(message.size()));
     const auto header = loadAs<MessageHeader>(message.data());
-    if (header.magic == 0xfb0d)
+    if (header.magic == MessageHeader::magicSwapped)
         failMalformed("the sender has another byte order");
     if (header.magic != MessageHeader::magicNumber)
         failMalformed("not a message of dfb");
     if (header.version != MessageHeader::formatVersion)
-        failMalformed("wire format version", MessageHeader::formatVersion, header.version);
+        failMalformed("the sender was built with another version of dfb, or of its wire format",
+                      MessageHeader::formatVersion, header.version);
     if (header.kind > MessageKind::Present)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;

@@ -205,6 +205,14 @@ public:
         reductions_.receive(source, keyOf(header, message), header.kind == MessageKind::ReduceUp, bytesOf(message));
     }
 
+    // For a message of rank `source` that nothing goes on without.
+    void giveUp(int source, ErrorInfo error)
+    {
+        error.rank = rank();
+        error.message += ", in a message from rank " + std::to_string(source);
+        messenger_->giveUp(error);
+    }
+
     // Wakes those in wait(), to ask again.
     void notify()
     {
@@ -262,13 +270,19 @@ public:
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         messenger_->expectMessages(true);
         reducing_ = true;
-        reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
-                          [this, result](const Bytes& bytes) {
-                              result->bytes = bytes;
-                              result->there = true;
-                              notify();
-                          });
         try {
+            try {
+                reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
+                                  [this, result](const Bytes& bytes) {
+                                      result->bytes = bytes;
+                                      result->there = true;
+                                      notify();
+                                  });
+            } catch (const Error& e) { // of what ranks below in the tree have sent before
+                ErrorInfo error = e.info();
+                error.rank = rank();
+                messenger_->giveUp(error);
+            }
             wait([&] { return result->there.load(); });
         } catch (...) {
             reducing_ = false;
@@ -402,15 +416,13 @@ private:
     }
 
     // A frame can fail; a reduction outside frames can not go on without the message that this may have been.
-    void undecodable(int source, ErrorInfo error)
+    void undecodable(int source, const ErrorInfo& error)
     {
         if (epoch_ > 0 && !reducing_) {
             handler_.undecodable(source, error);
             return;
         }
-        error.rank = rank();
-        error.message += ", in a message from rank " + std::to_string(source);
-        messenger_->giveUp(error);
+        giveUp(source, error);
     }
 
     void messengerFailed() override { notify(); }

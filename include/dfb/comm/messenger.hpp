@@ -319,11 +319,14 @@ private:
         try {
             header = detail::readMessageHeader(message);
             checkChecksum(header, message);
+            checkReceiver(header.receiver);
             if (!isNew(source, header))
                 return;
             if (header.kind == detail::MessageKind::Failure) {
                 detail::ByteReader body(std::as_const(message).data() + sizeof header, message.size() - sizeof header);
-                fail(detail::getErrorInfo(body));
+                const ErrorInfo error = detail::getErrorInfo(body);
+                body.end();
+                fail(error);
                 return;
             }
             if (header.kind == detail::MessageKind::AreYouThere || header.kind == detail::MessageKind::Present)
@@ -342,6 +345,15 @@ private:
             receiver->second->receive(source, header, std::move(message));
         else if (header.receiver >= addresses_)
             early_[header.receiver].push_back({source, header, std::move(message)});
+    }
+
+    // Objects are made in the same order on all ranks, so that no rank is far ahead.
+    void checkReceiver(std::uint32_t address)
+    {
+        constexpr std::uint32_t mostAhead = 1024;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (address >= addresses_ && address - addresses_ >= mostAhead)
+            detail::failMalformed("for an object that this rank is far from having", addresses_, address);
     }
 
     bool isNew(int source, const detail::MessageHeader& header)

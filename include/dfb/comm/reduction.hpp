@@ -72,16 +72,27 @@ public:
         advance(lock, key);
     }
 
+    // Throws Error (MalformedMessage) for what the tree has no place for, and what `combine` throws.
     void receive(int source, const ReductionKey& key, bool up, Bytes bytes)
     {
         std::unique_lock<std::mutex> lock(mutex_);
+        const bool isNeighbour = up ? std::find(children_.begin(), children_.end(), source) != children_.end()
+                                    : rank_ != 0 && source == parent();
+        if (!isNeighbour)
+            fail("a part of a reduction from a rank that has none", up ? -1 : parent(), source);
         const auto floor = forgotten_.find(key.scope);
         if (floor != forgotten_.end() && key.number <= floor->second)
             return;
         if (up) {
-            states_[key].parts.emplace_back(source, std::move(bytes));
+            auto& parts = states_[key].parts;
+            if (std::any_of(parts.begin(), parts.end(), [&](const auto& part) { return part.first == source; }))
+                fail("a second part of a reduction", -1, source);
+            parts.emplace_back(source, std::move(bytes));
             advance(lock, key);
         } else {
+            const auto place = states_.find(key);
+            if (place != states_.end() && !hasAll(place->second))
+                fail("a reduction's result before all of its parts", -1, source);
             finish(lock, key, bytes);
         }
     }
@@ -99,7 +110,7 @@ public:
                              [child](const auto& part) { return part.first == child; }))
                 ranks.push_back(child);
         if (ranks.empty() && rank_ != 0)
-            ranks.push_back(rank_ & (rank_ - 1));
+            ranks.push_back(parent());
         return ranks;
     }
 
@@ -114,6 +125,18 @@ public:
     }
 
 private:
+    int parent() const noexcept { return rank_ & (rank_ - 1); }
+
+    [[noreturn]] static void fail(const char* message, std::int64_t expected, std::int64_t got)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::MalformedMessage;
+        info.expected = expected;
+        info.got = got;
+        info.message = message;
+        throw Error(std::move(info));
+    }
+
     struct State {
         bool entered = false;
         std::vector<std::pair<int, Bytes>> parts; // of the children and our own
@@ -121,10 +144,13 @@ private:
         Done done;
     };
 
+    // All parts are here.
+    bool hasAll(const State& state) const { return state.entered && state.parts.size() > children_.size(); }
+
     void advance(std::unique_lock<std::mutex>& lock, const ReductionKey& key)
     {
         State& state = states_[key];
-        if (!state.entered || state.parts.size() < children_.size() + 1)
+        if (!hasAll(state))
             return;
         // In order of rank, so that the result does not depend on who came first.
         std::sort(state.parts.begin(), state.parts.end(),
@@ -137,7 +163,7 @@ private:
             return;
         }
         lock.unlock();
-        send_(rank_ & (rank_ - 1), key, true, result);
+        send_(parent(), key, true, result);
     }
 
     void finish(std::unique_lock<std::mutex>& lock, const ReductionKey& key, const Bytes& result)

@@ -43,6 +43,7 @@ class FinalGather {
 public:
     using Settings = GatherSettings;
     using Send = std::function<void(Buffer&&)>; // to the display rank
+    using OwnerOf = std::function<int(int tile)>;
 
     // Where a finished tile goes.
     struct Place : FinishedPlanes {
@@ -50,11 +51,13 @@ public:
         ImageWriter writer; // into the image of another rank
     };
 
-    // `senders`: which ranks have finished tiles for the display rank. `send`: to it, batches and the count of tiles.
+    // `senders`: which ranks have finished tiles for the display rank; `ownerOf(tile)`: which. `send`: to it, batches
+    // and the count of tiles.
     FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay, int rank,
-                std::vector<bool> senders, Send send)
+                std::vector<bool> senders, OwnerOf ownerOf, Send send)
         : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay), rank_(rank),
-          senders_(std::move(senders)), send_(std::move(send)), record_(settings_.format, settings_.channels)
+          senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
+          record_(settings_.format, settings_.channels)
     {
         if (isDisplay_ && enabled())
             tilesOf_ = std::vector<TilesOf>(senders_.size());
@@ -301,6 +304,9 @@ public:
         const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
         const std::byte* in = message.data() + prefix;
         std::size_t left = message.size() - prefix;
+        if (h.codec == 0 && h.rawBytes != left)
+            failMalformed("a batch of tiles has the wrong size", static_cast<std::int64_t>(h.rawBytes),
+                          static_cast<std::int64_t>(left));
         Buffer raw;
         if (h.codec != 0) {
             if (!settings_.codec || settings_.codec->id() != h.codec)
@@ -314,7 +320,8 @@ public:
             left = h.rawBytes;
         }
         while (left > 0) {
-            const std::size_t bytes = record_.read(in, left, layout_, [this](int tile, const Region& region) {
+            const std::size_t bytes = record_.read(in, left, layout_, [this, source](int tile, const Region& region) {
+                checkOwner(tile, source);
                 receiveOnce(tile);
                 return inImage(image_.planesAt(0), region);
             });
@@ -338,12 +345,14 @@ public:
             const auto tile = loadAs<std::int32_t>(in + sizeof count + at);
             if (tile < 0 || tile >= layout_.tileCount() || !imageGate_)
                 failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
+            checkOwner(tile, source);
             receiveOnce(tile);
             ++tilesOf_[static_cast<std::size_t>(source)].received;
             ++tilesReceived_;
         }
         std::int64_t expected = -1;
-        if (count < 0 || !tilesOf_[static_cast<std::size_t>(source)].announced.compare_exchange_strong(expected, count))
+        if (count < 0 || count > layout_.tileCount()
+            || !tilesOf_[static_cast<std::size_t>(source)].announced.compare_exchange_strong(expected, count))
             failMalformed("a count of tiles that can not be", -1, count);
         tilesAnnounced_ += count;
         ++ranksDone_; // after the count: who sees all ranks done sees all counts
@@ -474,6 +483,12 @@ private:
         return remote_;
     }
 
+    void checkOwner(int tile, int source) const
+    {
+        if (const int owner = ownerOf_(tile); owner != source)
+            failMalformed("a finished tile of another owner", owner, source);
+    }
+
     void receiveOnce(int tile)
     {
         if (state_[static_cast<std::size_t>(tile)].exchange(TileState::Received) == TileState::Received) {
@@ -535,6 +550,7 @@ private:
     bool isDisplay_;
     int rank_;
     std::vector<bool> senders_; // of finished tiles, rank by rank
+    OwnerOf ownerOf_;
     Send send_;
     const FinishedRecord record_;
     std::int64_t frame_ = 0;

@@ -74,8 +74,8 @@ public:
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of(config_, Tile::size, Tile::channels, layout().tileCount(),
-                                 [this](int tile) { return tileOwner(tile); });
+            mine = Agreement::of(config_, rank(), Tile::size, Tile::channels, Pipeline::travelling(config_),
+                                 layout().tileCount(), [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
         } catch (const std::exception& e) {
@@ -341,13 +341,17 @@ public:
             both.insert(both.end(), b.begin(), b.end());
             return both;
         });
-        std::vector<Bytes> result(static_cast<std::size_t>(size()));
-        for (ByteReader in(all); in.left() > 0;) {
-            const auto from = static_cast<std::size_t>(in.get<std::int32_t>());
-            result.at(from).resize(static_cast<std::size_t>(in.get<std::uint64_t>()));
-            for (std::byte& byte : result[from])
+        std::vector<Bytes> result;
+        ByteReader in(all);
+        for (int from = 0; from < size(); ++from) { // in order, as they were combined
+            const auto whose = in.get<std::int32_t>();
+            const auto byteCount = in.get<std::uint64_t>();
+            in.require(whose == from && byteCount <= in.left());
+            result.emplace_back(static_cast<std::size_t>(byteCount));
+            for (std::byte& byte : result.back())
                 byte = in.get<std::byte>();
         }
+        in.end();
         return result;
     }
 
@@ -382,6 +386,17 @@ private:
             if (hasCredit)
                 messaging_->flow().discarded(byteCount);
             return;
+        case FrameGate::Entry::Absurd: {
+            if (hasCredit)
+                messaging_->flow().discarded(byteCount);
+            ErrorInfo info;
+            info.kind = ErrorKind::MalformedMessage;
+            info.expected = gate_.next();
+            info.got = header.number;
+            info.message = "a message of a frame that no rank can have begun";
+            undecodable(source, info);
+            return;
+        }
         case FrameGate::Entry::Inside: break;
         }
         if (hasCredit)
@@ -399,7 +414,7 @@ private:
             return;
         const JobRequest request{count, config_.executor->concurrency(), 0};
         if (jobServer() == rank())
-            jobs_.receive(jobs_.give(request, size()));
+            guarded([&] { jobs_.receive(jobs_.give(request, size())); });
         else
             sendBody(jobServer(), MessageKind::JobRequest, request);
     }
@@ -483,7 +498,9 @@ private:
         const MessageKind kind = header.kind;
         if (kind == MessageKind::Abort) {
             ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
-            failElsewhere(getErrorInfo(body));
+            const ErrorInfo info = getErrorInfo(body);
+            body.end();
+            failElsewhere(info);
             return;
         }
         if (kind == MessageKind::CreditRequest) {
@@ -523,17 +540,18 @@ private:
             messaging_->send(source, MessageKind::ManifestAck, gate_.frame());
             break;
         case MessageKind::ManifestAck:
-            if (manifests_.acknowledged())
+            if (manifests_.acknowledged(source))
                 enterAllDeclared();
             break;
         case MessageKind::JobRequest: {
-            const auto request = bodyAs<JobRequest>(message);
-            if (request.count < 0 || request.workers < 1)
-                failMalformed("a request for jobs that can not be");
-            sendBody(source, MessageKind::Jobs, jobs_.give(request, size()));
+            if (rank() != jobServer())
+                failMalformed("a request for jobs to a rank that hands out none", jobServer(), rank());
+            sendBody(source, MessageKind::Jobs, jobs_.give(bodyAs<JobRequest>(message), size()));
             break;
         }
         case MessageKind::Jobs:
+            if (source != jobServer())
+                failMalformed("jobs from a rank that hands out none", jobServer(), source);
             jobs_.receive(bodyAs<JobRange>(message));
             messaging_->notify();
             break;
@@ -567,16 +585,29 @@ private:
     // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
+        const std::uint32_t scope = messaging_->keyOf(header, message).scope;
+        const bool isUp = header.kind == MessageKind::ReduceUp;
         bool differs = false;
-        if (header.kind == MessageKind::ReduceUp && messaging_->keyOf(header, message).scope == AllDeclared) {
-            differs = !wantsDeclaration_;
-        } else if (header.kind == MessageKind::ReduceUp) {
-            const Verdict partial = Verdict::from(messaging_->bytesOf(message));
-            differs = !partial.error && partial.paramsHash != fingerprintOf(params_);
+        try {
+            if (scope == FrameVerdict) {
+                const Verdict verdict = Verdict::from(messaging_->bytesOf(message));
+                if (!verdict.fits(layout().tileCount()))
+                    failMalformed("a verdict on tiles that there are not", layout().tileCount() - 1);
+                differs = isUp && !verdict.error && verdict.paramsHash != fingerprintOf(params_);
+            } else if (scope == AllDeclared) {
+                if (!messaging_->bytesOf(message).empty())
+                    failMalformed("a declaration's reduction that carries something");
+                differs = isUp && !wantsDeclaration_;
+            } else {
+                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
+            }
+            if (differs)
+                failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
+            messaging_->receiveReduction(source, header, message);
+        } catch (const Error& e) {
+            // Without this message there would never be a result.
+            messaging_->giveUp(source, e.info());
         }
-        if (differs)
-            failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
-        messaging_->receiveReduction(source, header, message);
     }
 
     // ---- tiles
@@ -641,6 +672,7 @@ private:
     // Every manifest is here: now it is known what each owned tile waits for.
     void applyDeclarations()
     {
+        manifests_.complete();
         if (outcome_->failed())
             return;
         // A pixel operation that is not pointwise sees background tiles too.

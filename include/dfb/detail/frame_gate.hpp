@@ -42,13 +42,16 @@ public:
 
     enum class Entry {
         Inside, // it may be worked on now; leave() must follow
-        Kept,   // it belongs to a frame to come
-        Late    // it is of no use any more, and has been counted
+        Kept,   // it belongs to the frame to come
+        Late,   // it is of no use any more, and has been counted
+        Absurd  // no rank can be so far ahead: a frame ends only when all ranks have begun it
     };
 
     Entry enter(int source, const MessageHeader& header, Buffer& message)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        if (header.number > next())
+            return Entry::Absurd;
         if (header.number > frame_) {
             early_.push_back({source, header, std::move(message)});
             return Entry::Kept;
@@ -80,8 +83,8 @@ public:
         return open_;
     }
 
-    // Once more, by somebody who is inside, for work that will go on after he has left: also while the gate closes, which
-    // then waits for that, too.
+    // Once more, by somebody who is inside, for work that will go on after he has left: also while the gate closes,
+    // which then waits for that, too.
     void enterAgain()
     {
         const std::lock_guard<std::mutex> lock(mutex_);

@@ -2,6 +2,8 @@
 // demand (guided self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with what is left.
 #pragma once
 
+#include <dfb/comm/message.hpp>
+
 #include <algorithm>
 #include <cstdint>
 #include <deque>
@@ -37,10 +39,13 @@ public:
         asked_ = began_ = exhausted_ = false;
     }
 
-    // On the rank that hands out.
+    // On the rank that hands out. Throws Error (MalformedMessage).
     JobRange give(const JobRequest& request, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        if (request.count < 0 || request.workers < 1 || (next_ >= 0 && request.count != handedOutOf_))
+            failMalformed("a request for jobs that can not be", next_ < 0 ? -1 : handedOutOf_, request.count);
+        handedOutOf_ = request.count;
         if (next_ < 0)
             next_ = fixedPart(request.count);
         const std::int64_t left = request.count - next_;
@@ -50,10 +55,12 @@ public:
         return {next_ - size, next_};
     }
 
-    // A range that was handed out to this rank; an empty one: there are no more.
+    // A range that was handed out to this rank; an empty one: there are no more. Throws Error (MalformedMessage).
     void receive(const JobRange& range)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        if (!asked_ || range.begin < 0 || range.end < range.begin || range.end > count_)
+            failMalformed("jobs that there are not", count_, range.end);
         asked_ = false;
         if (range.begin < range.end)
             mine_.push_back(range);
@@ -65,6 +72,7 @@ public:
     std::optional<JobRange> take(std::int64_t count, int rank, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        count_ = count;
         if (!began_) {
             began_ = true;
             const std::int64_t fixed = fixedPart(count);
@@ -102,6 +110,7 @@ private:
 
     mutable std::mutex mutex_;
     std::int64_t next_ = -1; // to hand out; -1: nobody has asked yet
+    std::int64_t handedOutOf_ = 0, count_ = 0;
     std::deque<JobRange> mine_;
     bool began_ = false, asked_ = false, exhausted_ = false;
 };

@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <map>
 #include <mutex>
+#include <set>
 #include <utility>
 #include <vector>
 
@@ -41,8 +42,8 @@ public:
     {
         std::lock_guard<std::mutex> lock(mutex_);
         expected_.clear();
-        acksMissing_ = 0;
-        declared_ = false;
+        acksMissing_.clear();
+        declared_ = isComplete_ = false;
     }
 
     // What to send to whom, for the inputs of this rank. `ownerOf(tile)` gives the owner.
@@ -66,7 +67,8 @@ public:
         std::map<int, std::vector<std::byte>> result;
         for (auto& [owner, writer] : writers)
             result.emplace(owner, writer.take());
-        acksMissing_ = result.size();
+        for (const auto& [owner, manifest] : result)
+            acksMissing_.insert(owner);
         return result;
     }
 
@@ -76,27 +78,32 @@ public:
     void receive(int from, ByteReader in, const IsMine& isMine)
     {
         std::lock_guard<std::mutex> lock(mutex_);
+        if (isComplete_)
+            fail("a manifest after all ranks have declared");
         while (in.left() > 0) {
             const int tile = in.get<std::int32_t>();
             const auto source = in.get<std::uint32_t>();
             const auto part = in.get<std::uint16_t>();
-            if (!isMine(tile)) {
-                ErrorInfo info;
-                info.kind = ErrorKind::MalformedMessage;
-                info.tile = tile;
-                info.source = source;
-                info.message = "a manifest names a tile of another owner";
-                throw Error(std::move(info));
-            }
+            if (!isMine(tile))
+                fail("a manifest names a tile of another owner", tile, source);
             expected_[tile].push_back({source, part, from});
         }
     }
 
-    // True if this was the last acknowledgement that was missing.
-    bool acknowledged()
+    // By rank `from`. True if this was the last acknowledgement that was missing. Throws Error (MalformedMessage).
+    bool acknowledged(int from)
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        return acksMissing_ > 0 && --acksMissing_ == 0;
+        if (acksMissing_.erase(from) == 0)
+            fail("an answer to a manifest that was not sent");
+        return acksMissing_.empty();
+    }
+
+    // The exchange is over: from now on expected() may be read.
+    void complete()
+    {
+        std::lock_guard<std::mutex> lock(mutex_);
+        isComplete_ = true;
     }
 
     bool declared() const
@@ -105,14 +112,24 @@ public:
         return declared_;
     }
 
-    // Per owned tile what will come. To be read when the exchange is complete.
+    // Per owned tile what will come. To be read after complete().
     const ExpectedInputs& expected() const { return expected_; }
 
 private:
+    [[noreturn]] static void fail(const char* message, std::int64_t tile = -1, std::int64_t source = -1)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::MalformedMessage;
+        info.tile = tile;
+        info.source = source;
+        info.message = message;
+        throw Error(std::move(info));
+    }
+
     mutable std::mutex mutex_;
     ExpectedInputs expected_;
-    std::size_t acksMissing_ = 0;
-    bool declared_ = false;
+    std::set<int> acksMissing_; // of these owners
+    bool declared_ = false, isComplete_ = false;
 };
 
 } // namespace dfb::detail

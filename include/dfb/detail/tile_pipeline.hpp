@@ -40,10 +40,12 @@ public:
         : pool_(std::move(pool)), config_(config), address_(address), pixelOp_(std::move(pixelOp)),
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
-          gather_(pool_, table_.layout(),
-                  {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd,
-                   config.dither},
-                  rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount), std::move(sendToDisplay)),
+          gather_(
+              pool_, table_.layout(),
+              {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd,
+               config.dither},
+              rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
+              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
           coder_(config.wire)
     {
     }
@@ -167,6 +169,12 @@ public:
         where.source = h.source;
         if (!table_.isMine(tile))
             failMalformed("an input for a tile of another owner");
+        if (const auto mine = static_cast<ChannelMask>(travelling(config_) | colorChannel); fragment.channels() != mine)
+            failMalformed("an input with other channels than this rank's", mine, fragment.channels());
+        if (fragment.colorFormat() != WireFormat::Float32 && fragment.colorFormat() != config_.wire.color
+            && config_.wire.budget == 0)
+            failMalformed("a colour in another format than this rank's", static_cast<std::int64_t>(config_.wire.color),
+                          static_cast<std::int64_t>(fragment.colorFormat()));
         if (isLossy())
             losses_.add(fragment, coder_);
         return table_.arrive(std::move(fragment)) ? tile : -1;

@@ -10,11 +10,13 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
 #include <exception>
 #include <iterator>
 #include <optional>
 #include <string>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -117,18 +119,34 @@ struct Verdict {
     {
         ByteReader in(bytes);
         Verdict v;
-        if (in.get<std::uint8_t>() != 0)
+        const auto failed = in.get<std::uint8_t>();
+        in.require(failed <= 1);
+        if (failed)
             v.error = getErrorInfo(in);
         v.paramsHash = in.get<std::uint64_t>();
         v.sums = in.get<decltype(v.sums)>();
         v.maxima = in.get<decltype(v.maxima)>();
         v.wireErrorBound = in.get<double>();
         for (auto* list : {&v.tileErrors, &v.figures, &v.mergeErrors})
-            for (auto left = in.get<std::uint32_t>(); left > 0; --left)
-                list->push_back(in.get<Figure>());
-        for (auto left = in.get<std::uint32_t>(); left > 0; --left)
+            for (auto left = in.get<std::uint32_t>(); left > 0; --left) {
+                const auto figure = in.get<Figure>();
+                in.require(list->empty() || list->back().key < figure.key);
+                list->push_back(figure);
+            }
+        for (auto left = in.get<std::uint32_t>(); left > 0; --left) {
             v.incomplete.push_back(in.get<std::int32_t>());
+            in.require(v.incomplete.back() >= 0);
+        }
+        in.end();
         return v;
+    }
+
+    // Whether what it says of tiles is of tiles that there are.
+    bool fits(int tileCount) const
+    {
+        const auto count = static_cast<std::uint64_t>(tileCount);
+        return (tileErrors.empty() || tileErrors.back().key < count)
+               && (mergeErrors.empty() || mergeErrors.back().key < count);
     }
 
     // What is the same on all ranks.
@@ -219,7 +237,8 @@ struct Verdict {
         if (!a.error && a.paramsHash != b.paramsHash)
             a.error = disagreement();
         for (std::size_t i = 0; i < a.sums.size(); ++i)
-            a.sums[i] += b.sums[i];
+            a.sums[i] = static_cast<std::int64_t>(static_cast<std::uint64_t>(a.sums[i])
+                                                  + static_cast<std::uint64_t>(b.sums[i]));
         for (std::size_t i = 0; i < a.maxima.size(); ++i)
             a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
         a.wireErrorBound = std::max(a.wireErrorBound, b.wireErrorBound);
@@ -234,35 +253,46 @@ struct Verdict {
 // What one rank was made with, or what was wrong with it; combined, whether all are fine and alike.
 struct Agreement {
     bool fine = true;
-    std::string text;
+    std::string text; // items parted by commas, or what is wrong
+    int rank = 0;     // whose; the lowest of those that are alike
 
-    // `tileSize`, `channels`: of the tile operation; `ownerOf(tile)`: the owner map's answers.
+    // `tileSize`, `channels`: of the tile operation; `sent`: those of them that travel; `ownerOf(tile)`: the owner
+    // map's answers.
     template <class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, int tileSize, ChannelMask channels, int tileCount,
-                        const OwnerOf& ownerOf)
+    static Agreement of(const FrameBufferConfig& c, int rank, int tileSize, ChannelMask channels, ChannelMask sent,
+                        int tileCount, const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
             owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
-        const auto text = [](auto value) { return std::to_string(value); };
-        return {true, "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width)
-                          + 'x' + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
-                          + ", format " + text(static_cast<int>(c.format)) + ", depth " + text(c.depth) + ", aux "
-                          + text(c.aux) + ", display rank " + text(c.displayRank) + ", frames in flight "
-                          + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0) + ", compression "
-                          + text(static_cast<int>(c.compression)) + ", gather " + text(static_cast<int>(c.gather))
-                          + ", wire colour " + nameOf(c.wire.color) + ", error budget " + text(c.wire.budget)
-                          + ", largest colour " + text(c.wire.maxColor) + ", wire depth " + nameOf(c.wire.depth)
-                          + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar) + ", least transmittance "
-                          + text(c.minTransmittance) + ", checksums " + text(c.checksums) + ", message pool "
-                          + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
-                          + text(c.dither)};
+        const auto text = [](auto value) {
+            if constexpr (!std::is_floating_point_v<decltype(value)>)
+                return std::to_string(value);
+            char digits[40]; // all of them
+            std::snprintf(digits, sizeof digits, "%.17g", static_cast<double>(value));
+            return std::string(digits);
+        };
+        return {true,
+                "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width) + 'x'
+                    + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
+                    + ", sent channels " + text(sent) + ", format " + text(static_cast<int>(c.format)) + ", depth "
+                    + text(c.depth) + ", aux " + text(c.aux) + ", display rank " + text(c.displayRank)
+                    + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
+                    + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
+                    + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
+                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", wire depth "
+                    + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar)
+                    + ", least transmittance " + text(c.minTransmittance) + ", checksums " + text(c.checksums)
+                    + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
+                    + text(c.dither),
+                rank};
     }
 
     std::vector<std::byte> bytes() const
     {
         ByteWriter out;
         out.put(static_cast<std::uint8_t>(fine));
+        out.put(static_cast<std::int32_t>(rank));
         out.putText(text);
         return out.take();
     }
@@ -271,8 +301,12 @@ struct Agreement {
     {
         ByteReader in(bytes);
         Agreement a;
-        a.fine = in.get<std::uint8_t>() != 0;
+        const auto fine = in.get<std::uint8_t>();
+        in.require(fine <= 1);
+        a.fine = fine != 0;
+        a.rank = in.get<std::int32_t>();
         a.text = in.getText();
+        in.end();
         return a;
     }
 
@@ -283,7 +317,32 @@ struct Agreement {
             return first;
         if (!b.fine)
             return second;
-        return Agreement{false, "ranks were configured differently: [" + a.text + "] and [" + b.text + "]"}.bytes();
+        return Agreement{false,
+                         "ranks " + std::to_string(a.rank) + " and " + std::to_string(b.rank)
+                             + " were configured differently: " + difference(a.text, b.text),
+                         a.rank}
+            .bytes();
+    }
+
+private:
+    // The items that are not the same in both; all, if they have not the same items.
+    static std::string difference(const std::string& a, const std::string& b)
+    {
+        const std::vector<std::string> as = itemsOf(a), bs = itemsOf(b);
+        std::string differing;
+        for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
+            if (as[i] != bs[i])
+                differing += (differing.empty() ? "[" : ", [") + as[i] + "] and [" + bs[i] + "]";
+        return differing.empty() ? "[" + a + "] and [" + b + "]" : differing;
+    }
+    static std::vector<std::string> itemsOf(const std::string& text)
+    {
+        std::vector<std::string> items;
+        for (std::size_t at = 0, end = 0; end != std::string::npos; at = end + 2) {
+            end = text.find(", ", at);
+            items.push_back(text.substr(at, end == std::string::npos ? end : end - at));
+        }
+        return items;
     }
 };
 

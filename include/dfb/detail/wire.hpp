@@ -289,6 +289,9 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     if (h.colorFormat > WireFormat::Unorm8 || h.depthFormat > WireFormat::Unorm8)
         failMalformed("unknown format of colour or depth", static_cast<std::int64_t>(WireFormat::Unorm8),
                       static_cast<std::int64_t>(std::max(h.colorFormat, h.depthFormat)));
+    if (h.depthFormat != coder.depth())
+        failMalformed("depth in another format than this rank's", static_cast<std::int64_t>(coder.depth()),
+                      static_cast<std::int64_t>(h.depthFormat));
 
     TileHeader header;
     header.frame = m.number;

@@ -1,0 +1,47 @@
+#!/bin/sh
+# sh tests/fuzz.sh [SECONDS [TARGET...]]
+# Installs what is missing, builds the fuzz targets for libFuzzer with the preset "fuzz", and runs each, or those that
+# are named, for so long (60 seconds if none are given), as many at once as there are cores. What is found anew stays in
+# build/fuzz/corpus, and an input that a run ends with in build/fuzz/crashes: it belongs into tests/fuzz/corpus.
+set -u
+
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
+cd "$root" || exit 1
+sh cmake/install_packages.sh clang || exit 1
+
+seconds=${1:-60}
+[ $# -eq 0 ] || shift
+jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+cmake --preset fuzz || exit 1
+# shellcheck disable=SC2046 # one word per target
+[ $# -gt 0 ] || set -- $(cmake --build --preset fuzz --target help | sed -nE 's/^test_fuzz_([a-z_]+): phony$/\1/p')
+
+programs=""
+for target; do
+    programs="$programs test_fuzz_$target"
+    mkdir -p "build/fuzz/corpus/$target" build/fuzz/crashes
+done
+# shellcheck disable=SC2086 # one word per program
+cmake --build --preset fuzz --parallel "$jobs" --target $programs || exit 1
+
+# A single input gets 10 seconds, 2 GB, and 256 MB at a time.
+export ASAN_OPTIONS="detect_stack_use_after_return=1" UBSAN_OPTIONS="print_stacktrace=1"
+printf '%s\n' "$@" | xargs -P "$jobs" -I{} sh -c '
+    build/fuzz/tests/test_fuzz_{} -max_total_time='"$seconds"' -timeout=10 -rss_limit_mb=2048 -malloc_limit_mb=256 -max_len=4096 \
+        -use_value_profile=1 -print_final_stats=1 -artifact_prefix=build/fuzz/crashes/{}- \
+        build/fuzz/corpus/{} tests/fuzz/corpus/{} >build/fuzz/{}.log 2>&1 || touch build/fuzz/{}.failed'
+
+verdict=passed
+for target; do
+    log=build/fuzz/$target.log
+    runs=$(sed -n 's/^stat::number_of_executed_units: *//p' "$log")
+    reached=$(sed -nE 's/.*(cov: [0-9]+ ft: [0-9]+).*/\1/p' "$log" | tail -n 1)
+    echo "fuzz.sh: $target: ${runs:-?} runs, ${reached:-}"
+    if [ -e "build/fuzz/$target.failed" ]; then
+        rm "build/fuzz/$target.failed"
+        tail -n 60 "$log"
+        verdict=FAILED
+    fi
+done
+echo "fuzz.sh: $verdict"
+[ $verdict = passed ]

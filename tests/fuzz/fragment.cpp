@@ -1,0 +1,246 @@
+// decodeFragment: what it takes can be read to its last pixel, lies within its tile, and comes back the same when it is
+// encoded and decoded once more.
+//
+// An input: how the coder is set up, flags, then a FragmentHeader and the payload.
+#include "fuzz.hpp"
+
+#include <dfb/detail/wire.hpp>
+#if defined(DFB_HAS_SNAPPY)
+#include <dfb/comm/snappy_codec.hpp>
+#endif
+
+#include <algorithm>
+#include <cmath>
+#include <limits>
+#include <memory>
+
+namespace {
+
+namespace d = dfb::detail;
+
+constexpr int side = 8;
+using Tile = dfb::Tile<dfb::allChannels, side>;
+enum Flags : std::uint8_t { HasCodec = 1, Compress = 2, NearDepth = 4, LargeColors = 8 };
+constexpr int passes = 3;
+
+const dfb::Codec* codec()
+{
+#if defined(DFB_HAS_SNAPPY)
+    static const dfb::SnappyCodec snappy;
+    return &snappy;
+#else
+    return nullptr;
+#endif
+}
+
+d::WireCoder coderFor(std::uint8_t depthFormat, std::uint8_t flags)
+{
+    dfb::WirePrecision precision;
+    precision.depth = static_cast<dfb::WireFormat>(depthFormat % 4);
+    precision.depthNear = flags & NearDepth ? 0.5f : -3;
+    precision.depthFar = 8;
+    precision.maxColor = flags & LargeColors ? 40.0f : 1.0f;
+    return d::WireCoder(precision);
+}
+
+const dfb::TileLayout& layout()
+{
+    static const dfb::TileLayout whole(20, 13, side); // those at the border are 4 wide and 5 high
+    return whole;
+}
+
+dfb::Fragment decode(dfb::MemoryPool& pool, dfb::Buffer&& message, const dfb::Codec* with, const d::WireCoder& coder)
+{
+    d::readMessageHeader(message);
+    return d::decodeFragment(
+        pool, std::move(message), layout(), [](int tile) { return tile == 2 ? 0 : passes; }, with, coder);
+}
+
+// The fragment as a tile; checks what may be relied on of spans and counts.
+std::unique_ptr<Tile> tileOf(const dfb::Fragment& fragment)
+{
+    auto tile = std::make_unique<Tile>();
+    static_cast<dfb::TileHeader&>(*tile) = fragment.header();
+    tile->clear();
+    const int width = tile->region.width(), height = tile->region.height();
+    const d::ConstPlanes planes = tile->planes();
+    dfb::FragmentCursor cursor(fragment);
+    std::uint32_t pixels = 0;
+    for (int y = 0; y < height; ++y) {
+        const dfb::FragmentRow row = cursor.next();
+        d::ConstPlanes from = row.aux;
+        from.at[d::Color] = reinterpret_cast<const std::byte*>(row.color);
+        from.at[d::Depth] = reinterpret_cast<const std::byte*>(row.depth);
+        int next = 0;
+        std::size_t k = 0;
+        for (int s = 0; s < row.spanCount; ++s) {
+            const dfb::Span span = row.spans[s];
+            fuzz::require(span.x >= next && span.count > 0 && span.x + span.count <= width,
+                          "spans are ordered and within their row");
+            next = span.x + span.count;
+            for (int x = span.x; x < next; ++x, ++k, ++pixels)
+                for (std::size_t c = 0; c < d::channelCount; ++c) {
+                    if (!d::hasChannel(fragment.channels(), c))
+                        continue;
+                    fuzz::require(from.at[c] != nullptr, "a channel of the mask is there");
+                    const std::size_t bytes = 4 * static_cast<std::size_t>(d::channelWords[c]);
+                    auto* to = const_cast<std::byte*>(planes.at[c]) + bytes * static_cast<std::size_t>(y * side + x);
+                    std::memcpy(to, from.at[c] + bytes * k, bytes);
+                }
+            if (row.depth)
+                for (std::size_t i = k - span.count; i < k; ++i)
+                    fuzz::require(!std::isnan(row.depth[i]), "no depth is NaN");
+        }
+    }
+    fuzz::require(pixels == fragment.activePixels(), "the count of active pixels is right");
+    return tile;
+}
+
+bool isActive(const float* p) { return p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0; }
+
+// The same words; 0 and -0 are, which rounding may turn into each other.
+bool areAlike(const std::byte* a, const std::byte* b, std::size_t words)
+{
+    for (std::size_t i = 0; i < 4 * words; i += 4) {
+        const auto x = d::loadAs<float>(a + i), y = d::loadAs<float>(b + i);
+        if (std::memcmp(a + i, b + i, 4) != 0 && !(x == 0 && y == 0))
+            return false;
+    }
+    return true;
+}
+
+bool areAlike(const Tile& a, const Tile& b, dfb::ChannelMask channels)
+{
+    const d::ConstPlanes as = a.planes(), bs = b.planes();
+    for (int y = 0; y < a.region.height(); ++y)
+        for (int x = 0; x < a.region.width(); ++x)
+            for (std::size_t c = 0; c < d::channelCount; ++c) {
+                const std::size_t words = static_cast<std::size_t>(d::channelWords[c]),
+                                  at = 4 * words * static_cast<std::size_t>(y * side + x);
+                if ((isActive(a.pixel(x, y)) || isActive(b.pixel(x, y))) && d::hasChannel(channels, c)
+                    && !areAlike(as.at[c] + at, bs.at[c] + at, words))
+                    return false;
+            }
+    return true;
+}
+
+bool isSame(const dfb::TileHeader& a, const dfb::TileHeader& b)
+{
+    return a.frame == b.frame && a.tile == b.tile && a.region == b.region && a.pass == b.pass
+           && a.generation == b.generation && a.children == b.children && a.source == b.source && a.part == b.part;
+}
+
+} // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
+{
+    static const auto pool = dfb::MemoryPool::create(false);
+    fuzz::Input in(data, size);
+    const auto depthFormat = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();
+    const d::WireCoder coder = coderFor(depthFormat, flags);
+    const dfb::Codec* with = flags & HasCodec ? codec() : nullptr;
+
+    d::MessageHeader m;
+    m.number = 7;
+    auto h = in.take<d::FragmentHeader>();
+    std::string payload = in.rest();
+    if (with && (flags & Compress)) {
+        std::string packed(with->bound(payload.size()), '\0');
+        packed.resize(
+            with->compress(fuzz::bytesOf(payload), payload.size(), reinterpret_cast<std::byte*>(packed.data())));
+        payload = packed;
+        h.codec = with->id();
+    }
+    const std::string message = fuzz::Output().put(m).put(h).text(payload).bytes();
+
+    dfb::Fragment fragment;
+    try {
+        fragment = decode(*pool, fuzz::ExactBlocks::copyOf(message), with, coder);
+    } catch (const dfb::Error& e) {
+        fuzz::require(e.info().kind == dfb::ErrorKind::MalformedMessage, "it is refused as malformed");
+        return 0;
+    }
+    const dfb::TileHeader& header = fragment.header();
+    fuzz::require(header.tile >= 0 && header.tile < layout().tileCount() && header.tile != 2
+                      && header.region == layout().region(header.tile),
+                  "the tile is one of the image");
+    fuzz::require(header.pass >= 0 && header.pass < passes, "the pass is one of the tile's");
+    fuzz::require(header.generation >= 0 && header.frame == 7, "generation and frame");
+    fuzz::require((fragment.channels() & dfb::colorChannel) && !(fragment.channels() & ~dfb::allChannels),
+                  "the channels are such that there are");
+    fuzz::require(fragment.hasDepth() == ((fragment.channels() & dfb::depthChannel) != 0) || fragment.empty(),
+                  "depth is there if the mask says so");
+    const auto tile = tileOf(fragment);
+
+    d::InputFaults faults;
+    dfb::Buffer again =
+        d::encodeFragment(*pool, *tile, fragment.channels(), 0, with, coder, fragment.colorFormat(), faults);
+    const dfb::Fragment second = decode(*pool, std::move(again), with, coder);
+    fuzz::require(isSame(header, second.header()), "the header comes back");
+    fuzz::require(fragment.channels() == second.channels(), "the channels come back");
+    fuzz::require(areAlike(*tile, *tileOf(second), fragment.channels()), "the pixels come back");
+    return 0;
+}
+
+std::vector<std::pair<std::string, std::string>> fuzz::seeds()
+{
+    const auto pool = dfb::MemoryPool::create(false);
+    std::vector<std::pair<std::string, std::string>> all;
+    const auto add = [&](const std::string& name, const Tile& tile, dfb::ChannelMask channels, dfb::WireFormat color,
+                         dfb::WireFormat depth, std::uint8_t flags) {
+        const auto depthFormat = static_cast<std::uint8_t>(depth);
+        d::InputFaults faults;
+        const dfb::Codec* with = (flags & HasCodec) && !(flags & Compress) ? codec() : nullptr;
+        const dfb::Buffer message =
+            d::encodeFragment(*pool, tile, channels, 0, with, coderFor(depthFormat, flags), color, faults);
+        const std::size_t prefix = sizeof(d::MessageHeader);
+        std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
+        all.emplace_back(name, fuzz::Output().put(depthFormat).put(flags).text(body).bytes());
+    };
+    const dfb::ChannelMask colorAndDepth = dfb::colorChannel | dfb::depthChannel;
+    const auto tileWith = [](int index, const auto& isThere) {
+        auto tile = std::make_unique<Tile>();
+        static_cast<dfb::TileHeader&>(*tile) = {7, index, layout().region(index), 1, 2, 3, 0xfedcba98u, 5};
+        tile->clear();
+        tile->forEachPixel([&](int x, int y, float* rgba, float& depth) {
+            const int px = x - tile->region.x0, py = y - tile->region.y0;
+            if (!isThere(px, py))
+                return;
+            const auto at = static_cast<float>(px + side * py);
+            for (int c = 0; c < 4; ++c)
+                rgba[c] = (c == 3 ? 0.75f : 0.25f) + at / 512;
+            depth = 1 + at / 16;
+            tile->farDepth[py * side + px] = 2 + at / 16;
+            tile->primitiveId[py * side + px] = 7;
+        });
+        return tile;
+    };
+    const auto empty = tileWith(0, [](int, int) { return false; });
+    const auto dots = tileWith(1, [](int x, int y) { return (x + y) % 5 == 1 && y > 1; });
+    const auto runs = tileWith(5, [](int x, int y) { return y % 3 != 0 && x < 3; });
+    const auto dense = tileWith(5, [](int, int) { return true; });
+    const auto constant = tileWith(3, [](int, int) { return true; });
+    constant->fill({0.5f, 0.25f, 0.125f, 1}, 3);
+    using Format = dfb::WireFormat;
+    add("empty", *empty, colorAndDepth, Format::Float32, Format::Float32, 0);
+    add("dots", *dots, colorAndDepth, Format::Float32, Format::Float32, 0);
+    add("runs", *runs, colorAndDepth, Format::Float32, Format::Float32, 0);
+    add("dense", *dense, colorAndDepth, Format::Float32, Format::Float32, 0);
+    add("constant", *constant, colorAndDepth, Format::Float32, Format::Float32, 0);
+    add("color_only", *dots, dfb::colorChannel, Format::Float32, Format::Float32, 0);
+    add("all_channels", *runs, dfb::allChannels, Format::Float32, Format::Float32, 0);
+    add("deep", *dots, colorAndDepth | dfb::farChannel, Format::Float32, Format::Float32, NearDepth);
+    add("half", *dots, colorAndDepth, Format::Float16, Format::Float16, 0);
+    add("unorm16", *dense, colorAndDepth, Format::Unorm16, Format::Unorm16, LargeColors);
+    add("unorm8", *runs, colorAndDepth, Format::Unorm8, Format::Unorm8, NearDepth);
+    add("constant_unorm8", *constant, colorAndDepth, Format::Unorm8, Format::Unorm16, NearDepth);
+    add("compressed", *dots, colorAndDepth, Format::Float32, Format::Float32, HasCodec);
+    add("compressed_half", *dense, colorAndDepth, Format::Float16, Format::Float32, HasCodec);
+    add("compressed_here", *runs, dfb::allChannels, Format::Unorm8, Format::Unorm16, HasCodec | Compress);
+    add("compressed_dense", *dense, colorAndDepth, Format::Float32, Format::Float32, HasCodec | Compress);
+    // The header says Float32, the coder another format.
+    all.push_back(all[2]);
+    all.back().first = "another_depth_format";
+    all.back().second[0] = static_cast<char>(Format::Unorm8);
+    return all;
+}

@@ -1,0 +1,299 @@
+// Ranks that were built differently, and messages that say what can not be: an error that says so, on every rank, and
+// none waits for ever. (That no bytes at all do harm is what tests/fuzz looks at.)
+#include "board.hpp"
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+namespace {
+
+using board::Board;
+using board::BoardTransport;
+using board::joined;
+using board::runOn;
+using dfb::detail::FragmentHeader;
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using scene::configOf;
+using scene::has;
+using scene::Loop;
+using scene::outcomeOf;
+using scene::Picture;
+using scene::Scene;
+
+template <class TileOp>
+using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, BoardTransport>;
+using Blend = dfb::BasicAlphaBlend<16>;
+constexpr std::size_t body = sizeof(MessageHeader);
+enum : std::uint32_t { OwnScope, AllDeclared, FrameVerdict };
+
+template <class T>
+void put(dfb::Buffer& message, std::size_t at, const T& value)
+{
+    if (message.size() < at + sizeof value)
+        throw std::logic_error("the message is too short for the test");
+    std::memcpy(message.data() + at, &value, sizeof value);
+}
+
+bool allSame(const std::vector<std::string>& texts)
+{
+    return std::all_of(texts.begin(), texts.end(), [&](const std::string& t) { return t == texts.front(); });
+}
+
+// What each of 4 ranks got out of making a framebuffer, rank 3 with another operation than the others.
+template <class Odd>
+std::vector<std::string> madeWith()
+{
+    std::vector<std::string> texts(4);
+    runOn(std::make_shared<Board>(), 4, [&](const BoardTransport::Communicator& communicator) {
+        const auto config = configOf(scene::makeScene(1));
+        texts[static_cast<std::size_t>(communicator.inner.rank())] = outcomeOf([&] {
+            if (communicator.inner.rank() == 3)
+                FrameBuffer<Odd>(communicator, config);
+            else
+                FrameBuffer<Blend>(communicator, config);
+        });
+    });
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("Ranks that were built differently learn what differs, and which ranks", "[wire_safety]")
+{
+    struct Case {
+        const char* name;
+        std::vector<std::string> texts, parts;
+    };
+    const dfb::ChannelMask more = dfb::colorChannel | dfb::depthChannel | dfb::albedoChannel;
+    const dfb::ChannelMask deep = dfb::colorChannel | dfb::depthChannel | dfb::farChannel;
+    const std::vector<Case> cases{
+        {"tile size", madeWith<dfb::BasicAlphaBlend<8>>(), {"[tiles of 16] and [tiles of 8]"}},
+        {"channels", madeWith<dfb::BasicAlphaBlend<16, more>>(), {"[channels 3] and [channels 11]"}},
+        {"channels that travel",
+         madeWith<dfb::BasicAlphaBlend<16, deep>>(),
+         {"[channels 3] and [channels 131]", "[sent channels 3] and [sent channels 131]"}},
+    };
+    for (const Case& c : cases) {
+        INFO(c.name << joined(c.texts));
+        CHECK(allSame(c.texts));
+        CHECK(has(c.texts[0], "InvalidArgument"));
+        CHECK(has(c.texts[0], "ranks 2 and 3"));
+        for (const std::string& part : c.parts)
+            CHECK(has(c.texts[0], part));
+        CHECK_FALSE(has(c.texts[0], "size 97x61")); // which is the same
+    }
+}
+
+TEST_CASE("Small differences of a configuration are found as well", "[wire_safety]")
+{
+    std::vector<std::string> texts(3);
+    runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
+        auto config = configOf(scene::makeScene(1));
+        config.minTransmittance = communicator.inner.rank() == 1 ? 1e-9f : 2e-9f;
+        texts[static_cast<std::size_t>(communicator.inner.rank())] =
+            outcomeOf([&] { FrameBuffer<Blend> fb(communicator, config); });
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "ranks 0 and 1 were configured differently: [least transmittance"));
+}
+
+TEST_CASE("A rank of another version or byte order is found when framebuffers are made", "[wire_safety]")
+{
+    for (const bool byteOrder : {false, true})
+        for (int odd = 0; odd < 4; ++odd) {
+            const auto watched = std::make_shared<Board>();
+            watched->inspect = [&](int from, int to, const MessageHeader& header, dfb::Buffer& message) {
+                // As either side sees the other.
+                if (byteOrder && (from == odd || to == odd))
+                    put(message, 0, MessageHeader::magicSwapped);
+                else if (from == odd || to == odd)
+                    put(message, offsetof(MessageHeader, version),
+                        static_cast<std::uint8_t>(header.version + (from == odd ? 1 : -1)));
+                return Board::What::Pass;
+            };
+            std::vector<std::string> texts(4);
+            runOn(watched, 4, [&](const BoardTransport::Communicator& communicator) {
+                texts[static_cast<std::size_t>(communicator.inner.rank())] =
+                    outcomeOf([&] { FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(1))); });
+            });
+            INFO("rank " << odd << joined(texts));
+            for (const std::string& text : texts) {
+                CHECK(has(text, "TransportError"));
+                CHECK(has(text, byteOrder ? "another byte order" : "another version of dfb"));
+                CHECK(has(text, "in a message from rank "));
+            }
+        }
+}
+
+namespace {
+
+// How a frame of 3 ranks ended, and whether the next one was right, when the first message of its kind (and scope, of a
+// reduction) from a rank was changed.
+struct Changed {
+    bool done = false;
+    std::vector<std::string> texts, after;
+    std::size_t wrong = 0;
+};
+
+Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::function<void(dfb::Buffer&)>& change)
+{
+    Changed result;
+    result.texts.resize(3);
+    result.after.resize(3);
+    const auto watched = std::make_shared<Board>();
+    std::atomic<bool> done{false};
+    watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+        const bool isReduction = header.kind == MessageKind::ReduceUp || header.kind == MessageKind::ReduceDown;
+        if (from == sender && header.kind == kind
+            && (!isReduction || dfb::detail::loadAs<std::uint32_t>(message.data() + body) == scope)
+            && !done.exchange(true))
+            change(message);
+        return Board::What::Pass;
+    };
+    const Scene s = scene::makeScene(6);
+    runOn(
+        watched, 3,
+        [&](const BoardTransport::Communicator& communicator) {
+            FrameBuffer<Blend> fb(communicator, configOf(s));
+            const auto frame = [&] {
+                return outcomeOf([&] {
+                    const auto report = scene::renderLoop(fb, s, Loop::Declared);
+                    if (fb.isDisplayRank())
+                        result.wrong += scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+                });
+            };
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            result.texts[rank] = frame();
+            result.after[rank] = frame();
+        },
+        std::nullopt, std::chrono::seconds(20));
+    result.done = done;
+    return result;
+}
+
+} // namespace
+
+TEST_CASE("A message that says what can not be fails its frame on every rank, and the next is right", "[wire_safety]")
+{
+    struct Lie {
+        const char* name;
+        MessageKind kind;
+        int sender;
+        std::function<void(dfb::Buffer&)> change;
+        std::string part; // of the error
+    };
+    const dfb::TileLayout layout(97, 61, 16);
+    std::int32_t ofDisplay = 0; // a tile that rank 1 does not own
+    while (dfb::latticeOwner(ofDisplay, layout, 3) == 1)
+        ++ofDisplay;
+    const std::vector<Lie> lies{
+        {"an input of a frame far ahead", MessageKind::Fragment, 2,
+         [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, number), std::int64_t{1000}); }, "no rank can have begun"},
+        {"an input for an object far ahead", MessageKind::Fragment, 2,
+         [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, receiver), std::uint32_t{5000}); }, "far from having"},
+        {"an input with other channels", MessageKind::Fragment, 2,
+         [](dfb::Buffer& m) {
+             auto h = dfb::detail::loadAs<FragmentHeader>(m.data() + body);
+             h.channels = dfb::colorChannel;
+             h.encoding = dfb::FragmentEncoding::Empty;
+             h.activePixels = h.rawPayloadBytes = 0;
+             put(m, body, h);
+             m.shrink(dfb::detail::fragmentPrefix);
+         },
+         "other channels"},
+        {"a manifest of another's tile", MessageKind::Manifest, 2,
+         [](dfb::Buffer& m) { put(m, body, std::int32_t{-1}); }, "a tile of another owner"},
+        {"a manifest cut short", MessageKind::Manifest, 2, [](dfb::Buffer& m) { m.shrink(m.size() - 1); }, "too short"},
+        {"a finished tile of another owner", MessageKind::FinishedTiles, 1,
+         [=](dfb::Buffer& m) { put(m, body + 16, ofDisplay); }, "a finished tile of another owner"},
+        {"a batch that is longer than it says", MessageKind::FinishedTiles, 1,
+         [](dfb::Buffer& m) { put(m, body, std::uint64_t{16}); }, "a batch of tiles has the wrong size"},
+        {"more finished tiles than there are", MessageKind::TilesDone, 1,
+         [](dfb::Buffer& m) { put(m, body, std::int64_t{1000}); }, "a count of tiles that can not be"},
+    };
+    for (const Lie& lie : lies) {
+        const Changed c = changed(lie.kind, 0, lie.sender, lie.change);
+        INFO(lie.name << joined(c.texts) << "\n after it" << joined(c.after));
+        CHECK(c.done);
+        CHECK(allSame(c.texts));
+        CHECK(has(c.texts[0], "FrameError: dfb: malformed message"));
+        CHECK(has(c.texts[0], lie.part));
+        CHECK(has(c.texts[0], "in a message from rank " + std::to_string(lie.sender)));
+        CHECK(c.after == std::vector<std::string>(3, "fine"));
+        CHECK(c.wrong == 0);
+    }
+}
+
+TEST_CASE("A vote or a verdict that is none ends the messenger, as there is no other", "[wire_safety]")
+{
+    struct Lie {
+        const char* name;
+        MessageKind kind;
+        std::uint32_t scope;
+        int sender;
+        std::function<void(dfb::Buffer&)> change;
+    };
+    const auto shorter = [](dfb::Buffer& m) { m.shrink(m.size() - 1); };
+    const std::vector<Lie> lies{
+        {"a vote cut short", MessageKind::ReduceUp, FrameVerdict, 2, shorter},
+        {"a vote that neither failed nor did not", MessageKind::ReduceUp, FrameVerdict, 1,
+         [](dfb::Buffer& m) { put(m, body + 4, std::uint8_t{7}); }},
+        {"a vote on something else", MessageKind::ReduceUp, FrameVerdict, 2,
+         [](dfb::Buffer& m) { put(m, body, std::uint32_t{9}); }},
+        {"all have declared, from below, as a result", MessageKind::ReduceUp, AllDeclared, 2,
+         [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, kind), MessageKind::ReduceDown); }},
+        {"a verdict cut short", MessageKind::ReduceDown, FrameVerdict, 0, shorter},
+    };
+    for (const Lie& lie : lies) {
+        const Changed c = changed(lie.kind, lie.scope, lie.sender, lie.change);
+        INFO(lie.name << joined(c.texts) << "\n after it" << joined(c.after));
+        CHECK(c.done);
+        CHECK(c.wrong == 0);
+        // Who has had the verdict already knows in the next frame.
+        for (std::size_t rank = 0; rank < 3; ++rank) {
+            CHECK((has(c.texts[rank], "TransportError")
+                   || (lie.kind == MessageKind::ReduceDown && c.texts[rank] == "fine")));
+            CHECK(has(c.after[rank], "TransportError"));
+        }
+    }
+}
+
+TEST_CASE("Bytes that are gathered wrongly are an error on every rank", "[wire_safety]")
+{
+    for (const bool isRank : {false, true}) {
+        std::atomic<bool> armed{false};
+        const auto watched = std::make_shared<Board>();
+        watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (from == 2 && header.kind == MessageKind::ReduceUp && armed.exchange(false)) {
+                if (isRank)
+                    put(message, body + 4, std::int32_t{3});
+                else
+                    put(message, body + 8, ~std::uint64_t{0});
+            }
+            return Board::What::Pass;
+        };
+        std::vector<std::string> texts(3);
+        runOn(watched, 3, [&](const BoardTransport::Communicator& communicator) {
+            FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(1)));
+            fb.allReduce({0}, FrameBuffer<Blend>::Reduce::Sum);
+            if (fb.rank() == 2)
+                armed = true;
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { fb.allGather(std::vector<std::byte>(5)); });
+            fb.allReduce({0}, FrameBuffer<Blend>::Reduce::Sum);
+        });
+        INFO(joined(texts));
+        CHECK(allSame(texts));
+        CHECK(has(texts[0], "malformed message"));
+    }
+}
