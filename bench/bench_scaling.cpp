@@ -175,6 +175,8 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         owns[static_cast<std::size_t>(owners[tile])] = true;
     }
 
+    const auto mostInput = static_cast<std::int64_t>(
+        dfb::detail::largestFragment(tileSize, tileSize, dfb::colorChannel | dfb::depthChannel));
     const std::int64_t allowance = static_cast<std::int64_t>(messagePoolBytes) / 2 / (ranks - 1);
     for (int rank = 0; rank < ranks; ++rank) {
         Expected& e = at(rank);
@@ -183,7 +185,8 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
             const int owner = owners[static_cast<std::size_t>(input.tile)];
             ++e.tiles;
             e.activePixels += input.activePixels;
-            e.poolBytes += blockOf(input.bytes);
+            // It is made in a block that has room for any input, and stays there if it fills three quarters of that.
+            e.poolBytes += blockOf(4 * input.bytes < 3 * mostInput ? input.bytes : mostInput);
             if (owner == rank)
                 continue;
             to[owner].add(input.bytes);
@@ -224,7 +227,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
                 e.verdict.add(157);
                 e.consensus.add(28);
             }
-        e.poolBytes += 64 << 10; // what is small, in blocks
+        e.poolBytes += blockOf(mostInput) + (64 << 10); // and what is small, in blocks
     }
     return all;
 }
