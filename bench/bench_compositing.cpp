@@ -89,7 +89,9 @@ public:
         for (const System& s : systems) {
             const auto has = [&](const char* text) { return s.config.find(text) != std::string::npos; };
             hasDfb = hasDfb || s.name == "dfb";
-            if (s.name == "dfb")
+            if (s.name == "limit")
+                sum += 16 * image_;
+            else if (s.name == "dfb")
                 sum += 4 * used_ + 16 * image_;
             else if (s.name == "plain")
                 sum += 33 * used_ + 8 * all_ + 20 * image_;
@@ -138,6 +140,7 @@ struct Best {
         : exact(
             fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, nameOf(dfb::WireFormat::Float32)); })),
           oneLevel(fastestOf(results, [](const Result& r) { return isDfb(r) && r.levels <= 1; })),
+          limit(fastestOf(results, [](const Result& r) { return r.system == "limit"; })),
           icetFloat(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "float, "); })),
           icetUbyte(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "ubyte, "); }))
     {
@@ -147,6 +150,7 @@ struct Best {
 
     const Result* exact;    // of dfb, whose inputs travel as float32
     const Result* oneLevel; // of dfb, with 8-bit values that are off by one at most
+    const Result* limit;    // what reading and writing memory once take
     const Result *icetFloat, *icetUbyte;
 };
 
@@ -192,6 +196,7 @@ public:
         if (o_.wants("icet"))
             bench::addIceT(systems, inputs);
 #endif
+        bench::addMemoryLimit(systems, inputs);
         bench::keepWanted(systems, o_.only);
         systems = measure(std::move(systems), inputs, exact);
         bench::takeErrorsOfFloats(systems);
@@ -299,12 +304,13 @@ private:
         const bool isNew = std::ifstream(o_.table).peek() == std::ifstream::traits_type::eof();
         std::ofstream file(o_.table, std::ios::app);
         if (isNew)
-            file << "| scene | size | ranks | to | dfb float32 [ms] | dfb within a level [ms] | IceT float [ms] "
+            file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb within a level [ms] | "
+                    "IceT float [ms] "
                     "| IceT ubyte [ms] | dfb float32 : IceT float | : ubyte | dfb within a level : IceT float "
-                    "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|\n";
+                    "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
         for (const std::string& text : what)
             file << "| " << text << ' ';
-        for (const Result* r : {best.exact, best.oneLevel, best.icetFloat, best.icetUbyte})
+        for (const Result* r : {best.limit, best.exact, best.oneLevel, best.icetFloat, best.icetUbyte})
             file << "| " << timeText(r) << ' ';
         for (const Result* mine : {best.exact, best.oneLevel})
             for (const Result* peer : {best.icetFloat, best.icetUbyte})

@@ -56,7 +56,7 @@ for ranks in 2 3 4 8 16; do
 done
 for ranks in 2 4 8; do
     mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
-        --only "in order, float32, tiles of 128|in order, unorm8|icet: float, direct|icet: ubyte, direct|tree" \
+        --only "limit|in order, float32, tiles of 128|in order, unorm8|icet: float, direct|icet: ubyte, direct|tree" \
         --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
 done
 

@@ -4,6 +4,7 @@
 
 #include "brick_images.hpp"
 #include "direct_send.hpp"
+#include "memory_limit.hpp"
 #include "radix_k.hpp"
 #include "results.hpp"
 #ifdef DFB_BENCH_HAS_ICET
@@ -58,7 +59,7 @@ struct Inputs {
 // What makes the image, and what is known of it.
 struct Compositor {
     std::function<void()> frame; // collective
-    // Of the last frame on rank 0: 4 a pixel, one of the two.
+    // Of the last frame on rank 0: 4 a pixel, one of the two; none, if it makes no image.
     std::function<const float*()> floats;
     std::function<const std::uint8_t*()> bytes;
     std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
@@ -167,6 +168,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& mess
                                               + static_cast<std::size_t>(view.region.x0);
                     view.color = &from->rgba[4 * first];
                     view.depth = &from->depth[first];
+                    const auto [left, top, columns, rows] = from->viewport; // as IceT has it
+                    view.valid = {left, top, left + columns, top + rows};
                 });
                 if constexpr (isOrdered<TileOp>) {
                     std::vector<int> places; // of bricks in the shared world, which has them by id
@@ -227,6 +230,24 @@ inline void addDirectSend(std::vector<System>& systems, const Inputs& inputs)
         return std::make_shared<DirectSend>(inputs.comm, inputs.order, inputs.viewports, inputs.image.width,
                                             inputs.image.height, toBytes);
     });
+}
+
+inline void addMemoryLimit(std::vector<System>& systems, const Inputs& inputs)
+{
+    for (const bool toBytes : {false, true}) {
+        System s;
+        s.name = "limit";
+        s.config = "inputs read, image written";
+        s.output = toBytes ? "8 bit" : "float";
+        s.start = [&inputs, toBytes] {
+            const auto limit = std::make_shared<MemoryLimit>(inputs.comm, inputs.viewports, toBytes);
+            Compositor compositor;
+            compositor.frame = [limit, &inputs] { limit->frame(inputs.image); };
+            compositor.traffic = [] { return std::make_pair(std::int64_t{0}, std::int64_t{0}); };
+            return compositor;
+        };
+        systems.push_back(std::move(s));
+    }
 }
 
 inline void addRadixK(std::vector<System>& systems, const Inputs& inputs, const std::string& name,
@@ -353,7 +374,7 @@ inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
         r.bytes = reduce(comm, r.bytes, MPI_SUM);
         r.messages = reduce(comm, r.messages, MPI_SUM);
     }
-    if (rank == 0) {
+    if (rank == 0 && (s.compositor.floats || s.compositor.bytes)) {
         const dfb::testing::ErrorReport e = errorOf(s.compositor.floats ? s.compositor.floats() : nullptr,
                                                     s.compositor.bytes ? s.compositor.bytes() : nullptr, exact);
         r.maxError = e.maxAbs;

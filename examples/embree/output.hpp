@@ -152,6 +152,7 @@ struct FrameStats {
     std::string wireColor; // the format of the colour on its way
     double wireErrorBound = 0;
     bool compressed = false;
+    std::int64_t compressedLinks = 0;
 };
 
 struct RunStats {
@@ -160,7 +161,7 @@ struct RunStats {
     int width = 0, height = 0;
     std::string imageHash; // of the last frame
     double meanAlpha = 0;
-    double runMs = 0; // from the start of the first frame to the end of the last
+    double runMs = 0;                                 // from the start of the first frame to the end of the last
     std::uint64_t samplesTaken = 0, samplesSaved = 0; // of pixels, in the last frame
     std::vector<FrameStats> frames;
 };
@@ -194,6 +195,7 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["wire_color"] = frame.wireColor;
         entry["wire_error_bound"] = frame.wireErrorBound;
         entry["compressed"] = frame.compressed;
+        entry["compressed_links"] = frame.compressedLinks;
         entry["tiles_rendered"] = frame.tilesRendered;
         entry["work_of_ranks"] = frame.workOfRanks;
         json["frames"].push_back(entry);

@@ -446,6 +446,7 @@ private:
             s.wireColor = dfb::nameOf(r.wireColor);
             s.wireErrorBound = r.wireErrorBound;
             s.compressed = r.compressed;
+            s.compressedLinks = r.compressedLinks;
             for (const auto& ofRank : rendered) {
                 s.tilesRendered.push_back(static_cast<std::uint64_t>(ofRank[2 * i]));
                 s.workOfRanks.push_back(static_cast<std::uint64_t>(ofRank[2 * i + 1]));

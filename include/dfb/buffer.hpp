@@ -2,13 +2,13 @@
 // mark of all it ever held.
 #pragma once
 
+#include <dfb/detail/fifo.hpp>
 #include <dfb/version.hpp>
 
 #include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
-#include <deque>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -127,7 +127,8 @@ public:
                 block = sizeClass.free.back();
                 sizeClass.free.pop_back();
             } else if (!(block = returned(sizeClass))) {
-                sizeClass.free.reserve(++sizeClass.blocks); // so that giving back never throws
+                if (++sizeClass.blocks > sizeClass.free.capacity()) // so that giving back never throws
+                    sizeClass.free.reserve(2 * sizeClass.blocks);
                 heldBytes_ += bytesOf(c);
                 shared = bytesOf(c) >= smallestShared ? shared_.get() : nullptr;
             }
@@ -167,7 +168,7 @@ public:
         std::lock_guard<std::mutex> lock(mutex_);
         if (buffer.owner_.get() != this || !shared_ || !shared_->holds(buffer.data_))
             return nullptr;
-        classes_[static_cast<std::size_t>(buffer.sizeClass_)].lent.push_back(buffer.data_);
+        classes_[static_cast<std::size_t>(buffer.sizeClass_)].lent.push(buffer.data_);
         shared_->lend(buffer.data_);
         buffer.size_ = 0;
         return std::exchange(buffer.data_, nullptr);
@@ -180,7 +181,7 @@ private:
 
     struct SizeClass {
         std::vector<std::byte*> free;
-        std::deque<std::byte*> lent; // the longest ago first
+        detail::Fifo<std::byte*> lent; // the longest ago first
         std::size_t blocks = 0;
     };
 
@@ -204,13 +205,12 @@ private:
     // A block that was lent and is back, or null. Does not look for it for long.
     std::byte* returned(SizeClass& sizeClass)
     {
-        std::deque<std::byte*>& lent = sizeClass.lent;
+        detail::Fifo<std::byte*>& lent = sizeClass.lent;
         for (std::size_t tries = std::min<std::size_t>(lent.size(), 8); tries > 0; --tries) {
-            std::byte* block = lent.front();
-            lent.pop_front();
+            std::byte* block = lent.pop();
             if (!shared_->isLent(block))
                 return block;
-            lent.push_back(block);
+            lent.push(block);
         }
         return nullptr;
     }

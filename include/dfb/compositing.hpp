@@ -63,6 +63,7 @@ struct CompositeRow {
     double minTransmittance = 0;           // what lets less through counts as opaque
     bool wantsDepth = true;                // else `depth` is empty
     bool wantsGaps = true;                 // else what no layer covers need not be cleared
+    bool wantsSingles = true;              // else what a single layer covers need not be there
 
     // Sizes it for `width` pixels, of which nothing is known then. `wanted`: of the auxiliary channels. `exactly`: in
     // twice the precision of double.

@@ -71,6 +71,18 @@ public:
         // InvalidArgument, too, if a channel that has to travel is null.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
+        // What nobody can see need not be rendered, with an operation that says so (TileOp::opaqueHides()): true if an
+        // opaque input of that tile, of a lower generation, is known to have been sent by this rank or another.
+        // setTile() drops what is hidden. From any thread, as the next two.
+        bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
+        // Whether `tile`, which has been set, hides those of a higher generation: if so, let the ranks know that have
+        // any.
+        bool hidesRest(const Tile& tile) const { return engine_->hidesRest(tile); }
+        bool hidesRest(const TileView& tile) const { return engine_->hidesRest(tile); }
+        // Lets `rank` know that inputs from this generation on can not be seen. What it has sent by then is dropped by
+        // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
+        void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
+
         // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
         // children that these announce need no declaration; it may say so after it sent some. A rank without any calls
         // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing.
@@ -81,6 +93,10 @@ public:
         // For a rendering loop to keep what it has declared its inputs from: it stays there as long as the declaration
         // holds (see FrameParams::declarationKey) and is empty in the first frame of each.
         std::any& declaredFrom() const noexcept { return engine_->declaredFrom(); }
+
+        // For a rendering loop to keep memory in that it needs in each frame: what it leaves there, a later frame finds
+        // there, unless another loop has come between.
+        std::any& loopMemory() const noexcept { return engine_->loopMemory(); }
 
         // As FrameParams::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
         void expectLayers(int layers) { engine_->expectLayers(layers); }
@@ -106,8 +122,9 @@ public:
         bool failed() const noexcept { return engine_->failed(); }
 
         // Makes the frame fail on all ranks, with the text of this exception; with FrameParams::allowPartial it goes on
-        // without what the exception was about. From any thread.
-        void abort(const std::exception_ptr& reason) { engine_->abort(reason); }
+        // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
+        // will name it. From any thread.
+        void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(reason, tileIndex); }
 
         // Makes the frame fail on all ranks with ErrorKind::Cancelled: nobody needs it any more. end() is called all
         // the same; tiles that are set meanwhile are dropped, those that come late counted. From any thread, also

@@ -20,7 +20,7 @@ enum class ErrorKind : std::uint32_t {
     UnannouncedInput, // an input of a generation or source that nobody announced
     NegativeChildren, // a tile announced fewer than zero children
     MalformedMessage, // bytes off the wire that are not a message of this framebuffer
-    Disagreement,     // ranks were given different configurations or frame parameters
+    Disagreement,     // ranks were given different configurations or frame parameters, or sent more than announced
     UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
     Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time

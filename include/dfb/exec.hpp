@@ -8,7 +8,6 @@
 #include <atomic>
 #include <condition_variable>
 #include <cstddef>
-#include <deque>
 #include <exception>
 #include <functional>
 #include <mutex>
@@ -26,7 +25,7 @@ public:
     using Task = std::function<void()>;
 
     virtual ~Executor() = default;
-    Executor() = default;
+    Executor() { tasks_.reserve(256); } // how many wait at once depends on time: mostly no more
     Executor(const Executor&) = delete;
     Executor& operator=(const Executor&) = delete;
 
@@ -57,7 +56,7 @@ public:
         std::exception_ptr error;
         std::mutex errorMutex;
         std::atomic<bool> stop{false};
-        run(count, [&](std::size_t i) {
+        const auto guarded = [&](std::size_t i) {
             if (stop.load(std::memory_order_relaxed))
                 return;
             try {
@@ -70,7 +69,8 @@ public:
             }
             while (runOne()) {
             }
-        });
+        };
+        run(count, std::ref(guarded)); // which, unlike a copy, takes no memory
         if (error)
             std::rethrow_exception(error);
     }
@@ -154,7 +154,7 @@ private:
         }
         Loop loop{count, &body};
         std::unique_lock<std::mutex> lock(mutex_);
-        loops_.push_back(&loop);
+        loops_.push(&loop);
         wakeUp_.notify_all();
         loopDone_.wait(lock, [&] { return loop.done == loop.count; });
     }
@@ -174,7 +174,7 @@ private:
                 Loop* loop = loops_.front();
                 const std::size_t i = loop->next++;
                 if (loop->next == loop->count)
-                    loops_.pop_front();
+                    loops_.pop();
                 lock.unlock();
                 (*loop->body)(i);
                 lock.lock();
@@ -195,7 +195,7 @@ private:
 
     std::mutex mutex_;
     std::condition_variable wakeUp_, loopDone_;
-    std::deque<Loop*> loops_;
+    detail::Fifo<Loop*> loops_;
     std::size_t signals_ = 0;
     bool stop_ = false;
     std::vector<std::thread> threads_;

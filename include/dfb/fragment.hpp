@@ -83,6 +83,19 @@ public:
         return parts_.encoding == FragmentEncoding::Constant ? parts_.fullRow.count : parts_.activePixels;
     }
 
+    // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region. Looks at no more of them than it
+    // must.
+    bool isOpaque() const noexcept
+    {
+        if (parts_.encoding != FragmentEncoding::Dense && parts_.encoding != FragmentEncoding::Constant)
+            return false;
+        const std::size_t count = storedPixels();
+        std::size_t i = 0;
+        while (i < count && parts_.color[4 * i + 3] == 1.0f)
+            ++i;
+        return i == count;
+    }
+
 private:
     friend class FragmentCursor;
     TileHeader header_;
@@ -110,8 +123,8 @@ public:
         return row;
     }
 
-    // The same without the channels beyond colour and depth, which are left as they are; false if the row has no pixels.
-    // To be followed by advance(row).
+    // The same without the channels beyond colour and depth, which are left as they are; false if the row has no
+    // pixels. To be followed by advance(row).
     bool next(FragmentRow& result)
     {
         const int row = row_++;

@@ -44,7 +44,7 @@ public:
     }
 
     // Composites the next row of all fragments into `row`, which has been sized for the region's width. With
-    // row.wantsGaps false only what lies in runs() is there then.
+    // row.wantsGaps or row.wantsSingles false only what runs() says is there then.
     void nextRow(CompositeRow& row)
     {
         runs_.clear();
@@ -59,21 +59,26 @@ public:
             const Span span = *active_.front().spans;
             clearGap(row, 0, span.x);
             clearGap(row, span.x + span.count, width);
-            runs_.push_back(span);
             layers_.resize(active_.size());
             for (std::size_t k = 0; k < layers_.size(); ++k)
                 layers_[k] = {active_[k].color, active_[k].depth, nullptr};
-            composite(row, span.x, span.count);
+            addRun(row, span.x, span.count);
         } else {
             compositeRuns(row, wantsAux);
         }
     }
 
-    // Of the last row, where there is anything: in order, not touching. What is between them is wide.
-    const std::vector<Span>& runs() const noexcept { return runs_; }
+    // Where there is anything in a row.
+    struct Run {
+        int x = 0, count = 0;
+        const float* color = nullptr; // of a single layer, and not in the row; or null
+    };
+    // Of the last row: in order, not overlapping. Narrow gaps between them are in the row.
+    const std::vector<Run>& runs() const noexcept { return runs_; }
 
 private:
-    static constexpr int narrowGap = 32; // to composite nothing costs less than to begin a run
+    static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
+    static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
 
     static void clearGap(CompositeRow& row, int begin, int end)
     {
@@ -106,8 +111,8 @@ private:
     {
         findEdges(static_cast<int>(row.transmittance.size()));
         clearGap(row, 0, edges_.front());
-        clearGap(row, edges_.back(), static_cast<int>(row.transmittance.size()));
-        for (std::size_t e = 0; e + 1 < edges_.size(); ++e) {
+        clearGap(row, edges_[edgeCount_ - 1], static_cast<int>(row.transmittance.size()));
+        for (std::size_t e = 0; e + 1 < edgeCount_; ++e) {
             const int x0 = edges_[e], x1 = edges_[e + 1];
             layers_.clear();
             aux_.resize(wantsAux ? active_.size() : 0); // before anybody points into it
@@ -135,12 +140,22 @@ private:
                     row.clear(x0, x1 - x0);
                 continue;
             }
-            composite(row, x0, x1 - x0);
-            if (!runs_.empty() && x0 - (runs_.back().x + runs_.back().count) < narrowGap)
-                runs_.back().count = static_cast<std::uint16_t>(x1 - runs_.back().x);
-            else
-                runs_.push_back({static_cast<std::uint16_t>(x0), static_cast<std::uint16_t>(x1 - x0)});
+            addRun(row, x0, x1 - x0);
         }
+    }
+
+    // Of layers_, which have `count` pixels each.
+    void addRun(CompositeRow& row, int x, int count)
+    {
+        if (!row.wantsSingles && layers_.size() == 1 && count >= wideSingle) {
+            runs_.push_back({x, count, layers_.front().color});
+            return;
+        }
+        composite(row, x, count);
+        if (!runs_.empty() && !runs_.back().color && x - (runs_.back().x + runs_.back().count) < narrowGap)
+            runs_.back().count = x + count - runs_.back().x;
+        else
+            runs_.push_back({x, count, nullptr});
     }
 
     // The places where spans begin or end: between two neighbouring ones the set of layers is constant.
@@ -153,12 +168,12 @@ private:
                 mark(r.spans[i].x);
                 mark(r.spans[i].x + r.spans[i].count);
             }
-        edges_.resize(static_cast<std::size_t>(width + 1));
+        edges_.resize(std::max(edges_.size(), static_cast<std::size_t>(width + 1))); // filled below
         int* next = edges_.data();
         for (std::size_t word = 0; word < isEdge_.size(); ++word)
             for (std::uint64_t bits = isEdge_[word]; bits != 0; bits &= bits - 1)
                 *next++ = static_cast<int>(64 * word) + detail::zerosBelow(bits);
-        edges_.resize(static_cast<std::size_t>(next - edges_.data()));
+        edgeCount_ = static_cast<std::size_t>(next - edges_.data());
     }
 
     // layers_, which are `count` pixels each.
@@ -176,8 +191,9 @@ private:
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
     std::vector<std::uint64_t> isEdge_;    // bit by bit
-    std::vector<int> edges_;
-    std::vector<Span> runs_;
+    std::vector<int> edges_;               // the first edgeCount_
+    std::size_t edgeCount_ = 0;
+    std::vector<Run> runs_;
     std::vector<Layer> layers_;
     std::vector<int> order_;
 };

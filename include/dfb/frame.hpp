@@ -30,7 +30,8 @@ enum class GatherMode : std::uint8_t {
 enum class CompressionMode : std::uint8_t {
     Always,
     Auto // between nodes, in frames in which that has turned out to be faster: a few frames with and without, then the
-         // better, and now and then a few of the other again; the same on all ranks
+         // better, and now and then a few of the other again, the same on all ranks; and then to those ranks for which
+         // messages become smaller by it, as each rank finds out by itself
 };
 
 // What a framebuffer is made with. Everything but executor, progress, peerTimeoutMs and onPeerLost must be the same on
@@ -95,9 +96,9 @@ struct FrameParams {
     // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
     int timeoutMs = 0;
     // A frame that fails has the tiles that were finished by then: end() throws nothing but says so in
-    // FrameReport::failure. An exception of a renderer or an operation costs no more than the tiles that it was about;
-    // what misses an input is given up after timeoutMs, which must not be 0. See also
-    // DistributedFrameBuffer::isComplete().
+    // FrameReport::failure. An exception of a renderer or an operation, or inputs at odds, cost no more than their
+    // tiles; what misses an input is given up after timeoutMs, which must not be 0. Ranks that disagree fail it all the
+    // same. See also DistributedFrameBuffer::isComplete().
     bool allowPartial = false;
 };
 
@@ -136,11 +137,14 @@ struct FrameReport {
     std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
+    std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained
     double wireErrorBound = 0; // all: how far a pixel may be off for WirePrecision and minTransmittance, from what came
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key
-    std::int64_t lateMessages = 0;     // all: with pixels, of frames that failed, dropped since the last verdict
+    // All: with pixels, of frames that failed, or hidden by others that were there sooner, dropped since the last
+    // verdict.
+    std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // all: came twice, dropped since the last verdict
     std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messagePoolBytes
     std::int64_t peakMemoryBytes = 0;  // all: most that one rank's framebuffer ever held in message and image memory

@@ -114,6 +114,17 @@ struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
     }
 };
 
+// Looks at no more pixels than it must.
+template <class AnyTile>
+bool isOpaque(const AnyTile& tile) noexcept
+{
+    for (int y = 0; y < tile.region.height(); ++y)
+        for (int x = 0; x < tile.region.width(); ++x)
+            if (tile.pixel(x, y)[3] != 1.0f)
+                return false;
+    return true;
+}
+
 } // namespace detail
 
 // Pixel (x, y) of the tile, counted from region.x0 and region.y0, is pixel i = y * size + x: color[4 * i], and as far
@@ -187,11 +198,14 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
     static constexpr std::size_t rowStride() noexcept { return Size; }
+    Region validRegion() const noexcept { return region; }
+    // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region.
+    bool isOpaque() const noexcept { return detail::isOpaque(*this); }
 };
 
-// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself: they are read there, and are
-// as those of a Tile. All pointers are to the first pixel of the region; what is not read may be null: channels that
-// neither the operation nor the image needs. Without colour there is nothing in the tile.
+// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself: they are read there, and
+// are as those of a Tile. All pointers are to the first pixel of the region; what is not read may be null: channels
+// that neither the operation nor the image needs. Without colour there is nothing in the tile.
 template <ChannelMask Channels, int Size>
 struct TileView : TileHeader {
     static constexpr int size = Size;
@@ -201,6 +215,11 @@ struct TileView : TileHeader {
     const float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
+    // Pixels of the image outside of it have nothing, and are not read: for a renderer that knows where its data
+    // project to. To begin with there is no such limit.
+    Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
+                 std::numeric_limits<int>::max()};
+    Region validRegion() const noexcept { return intersection(region, valid); }
 
     detail::ConstPlanes planes() const noexcept
     {
@@ -216,6 +235,7 @@ struct TileView : TileHeader {
         return color + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
     }
     std::size_t rowStride() const noexcept { return stride; }
+    bool isOpaque() const noexcept { return color && validRegion() == region && detail::isOpaque(*this); }
 };
 
 } // namespace dfb

@@ -16,6 +16,8 @@
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
+//   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
+//                                                isComplete() does not wait for them: nobody need render them
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
 //                                                in a frame, and the image keeps its pixels
 //   static constexpr bool emptyIsBackground = true;   out of inputs without any pixel it makes the background: then it
@@ -23,6 +25,7 @@
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
+#include <dfb/detail/background_pixels.hpp>
 #include <dfb/dither.hpp>
 #include <dfb/fragment.hpp>
 
@@ -64,9 +67,10 @@ struct AuxRow {
 class FinishedTile {
 public:
     // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
+    // `background`: what is known of these pixels; may be null.
     FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
-                 bool dither = false)
-        : region_(region), format_(format), to_(to), stride_(stride), dither_(dither)
+                 bool dither = false, detail::BackgroundPixels* background = nullptr)
+        : region_(region), format_(format), to_(to), stride_(stride), dither_(dither), background_(background)
     {
     }
 
@@ -83,6 +87,7 @@ public:
     double setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
     {
         const std::size_t first = static_cast<std::size_t>(y) * stride_;
+        overwrites(0, y, width());
         double farthest = 0;
         if (std::byte* color = to_.at[detail::Color]; color) {
             color += first * bytesPerPixel(format_);
@@ -114,24 +119,38 @@ public:
     double setPixels(int x, int y, int count, const double* rgba, const float* depth)
     {
         const std::size_t first = pixelAt(x, y);
+        overwrites(x, y, count);
         if (float* out = detail::floatsOf(to_.at[detail::Depth]))
             std::copy(depth, depth + count, out + first);
         std::byte* color = to_.at[detail::Color];
         return color ? convertPixels(rgba, count, format_, color + first * bytesPerPixel(format_)) : 0;
     }
-    // The same with one colour, as it is stored: bytesPerPixel(format()) bytes. Depth becomes +infinity.
+    // The same without depth, for floats, which are rounded as they are: the exact values, but for -0, which becomes 0.
+    void setPixels(int x, int y, int count, const float* rgba)
+    {
+        overwrites(x, y, count);
+        std::byte* color = to_.at[detail::Color];
+        if (!color)
+            return;
+        color += pixelAt(x, y) * bytesPerPixel(format_);
+        if (format_ != OutputFormat::RGBA32F) {
+            convertPixels(rgba, count, format_, color);
+            return;
+        }
+        float* out = detail::floatsOf(color);
+        for (int i = 0; i < 4 * count; ++i)
+            out[i] = rgba[i] + 0.0f;
+    }
+    // The same with the background, as it is stored: bytesPerPixel(format()) bytes. Depth becomes +infinity. What is
+    // known to be the background already is not written.
     void fillPixels(int x, int y, int count, const std::byte* stored)
     {
-        const std::size_t first = pixelAt(x, y), bytes = bytesPerPixel(format_);
-        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
-            std::fill_n(out + first, count, std::numeric_limits<float>::infinity());
-        if (std::byte* out = to_.at[detail::Color]; out && count > 0) {
-            out += first * bytes;
-            std::memcpy(out, stored, bytes);
-            for (std::size_t done = 1, all = static_cast<std::size_t>(count); done < all; done *= 2)
-                std::memcpy(out + done * bytes, out, std::min(done, all - done) * bytes);
-        }
+        if (background_)
+            background_->add(x, y, count, [&](int from, int some) { writeBackground(from, y, some, stored); });
+        else
+            writeBackground(x, y, count, stored);
     }
+    std::int64_t writtenPixels() const noexcept { return writtenPixels_; }
 
     // What setRow() has made of a row; null if the colour is not wanted.
     const std::byte* colorRow(int y) const noexcept
@@ -153,11 +172,34 @@ private:
         return static_cast<std::size_t>(y) * stride_ + static_cast<std::size_t>(x);
     }
 
+    void overwrites(int x, int y, int count)
+    {
+        writtenPixels_ += count;
+        if (background_)
+            background_->remove(x, y, count);
+    }
+
+    void writeBackground(int x, int y, int count, const std::byte* stored)
+    {
+        writtenPixels_ += count;
+        const std::size_t first = pixelAt(x, y), bytes = bytesPerPixel(format_);
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+            std::fill_n(out + first, count, std::numeric_limits<float>::infinity());
+        if (std::byte* out = to_.at[detail::Color]; out && count > 0) {
+            out += first * bytes;
+            std::memcpy(out, stored, bytes);
+            for (std::size_t done = 1, all = static_cast<std::size_t>(count); done < all; done *= 2)
+                std::memcpy(out + done * bytes, out, std::min(done, all - done) * bytes);
+        }
+    }
+
     Region region_;
     OutputFormat format_;
     detail::Planes to_;
     std::size_t stride_;
     bool dither_;
+    detail::BackgroundPixels* background_;
+    std::int64_t writtenPixels_ = 0;
 };
 
 // What a TileOp says of a tile that it has finished, if it has a member report().
@@ -241,6 +283,13 @@ struct EmptyIsBackground : std::false_type {
 };
 template <class T>
 struct EmptyIsBackground<T, std::void_t<decltype(T::emptyIsBackground)>> : std::bool_constant<T::emptyIsBackground> {
+};
+
+template <class T, class = void>
+struct OpaqueHides : std::false_type {
+};
+template <class T>
+struct OpaqueHides<T, std::void_t<decltype(T::opaqueHides(std::declval<const TileInfo&>()))>> : std::true_type {
 };
 
 template <class T, class = void>

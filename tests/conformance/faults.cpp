@@ -318,3 +318,47 @@ TEST_CASE("A nap is not longer than what is held")
     CHECK(time < std::chrono::seconds(5));
     CHECK(inbox.messages.size() == 1);
 }
+
+namespace {
+
+// One that can do what transports need not: end the job, and let others see its memory.
+struct Able : InprocTransport {
+    struct Communicator {
+        InprocCommunicator inner;
+        std::string* said;
+    };
+    Able(const Communicator& c, std::shared_ptr<MemoryPool> pool, Progress progress)
+        : InprocTransport(c.inner, std::move(pool), progress), said(c.said)
+    {
+    }
+    void abort(const std::string& text) { *said = text; }
+    bool lendsTo(int other) const { return other == 1; }
+    std::int32_t placeOf(const std::byte* block) const { return block ? 7 : -1; }
+    std::byte* blockAt(int, std::int32_t place, std::size_t) const { return place == 7 ? &byte : nullptr; }
+
+    std::string* said;
+    mutable std::byte byte{};
+};
+
+} // namespace
+
+TEST_CASE("What a transport need not have is passed on if the one below has it, and is not there else")
+{
+    using Passing = testing::FaultTransport<Able>;
+    STATIC_REQUIRE(detail::CanAbort<Passing>::value);
+    STATIC_REQUIRE(detail::SharesMemory<Passing>::value);
+    STATIC_REQUIRE_FALSE(detail::CanAbort<Faulty>::value);
+    STATIC_REQUIRE_FALSE(detail::SharesMemory<Faulty>::value);
+    std::string said;
+    bool right = false;
+    runRanks(1, [&](InprocCommunicator communicator) {
+        Passing transport({{communicator, &said}, {}}, MemoryPool::create(), Progress::Thread);
+        std::byte byte{};
+        std::byte* block = transport.blockAt(1, 7, 1);
+        right = transport.lendsTo(1) && !transport.lendsTo(2) && transport.placeOf(&byte) == 7
+                && transport.placeOf(nullptr) == -1 && block && !transport.blockAt(1, 8, 1);
+        transport.abort("rank 3 is lost");
+    });
+    CHECK(right);
+    CHECK(said == "rank 3 is lost");
+}

@@ -8,9 +8,11 @@
 #include <algorithm>
 #include <chrono>
 #include <cstddef>
+#include <cstdint>
 #include <cstring>
 #include <memory>
 #include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -153,4 +155,45 @@ TEST_CASE("A message that comes twice is found on all ranks")
     const std::string text = check<Faulty>({MPI_COMM_WORLD, faults}, options);
     INFO(text);
     CHECK((contains(text, "came twice") || contains(text, "came once more, ")));
+}
+
+TEST_CASE("A rank that was built with another packet format is named on all ranks, and the communicator stays usable")
+{
+    STATIC_REQUIRE(detail::CanAbort<Faulty>::value);
+    STATIC_REQUIRE(detail::SharesMemory<Faulty>::value);
+    const int size = rankCount(), rank = rankIn(MPI_COMM_WORLD);
+    for (const int odd : {0, size - 1}) {
+        std::string text;
+        if (rank == odd) {
+            // What any version does first, see mpi_transport.hpp.
+            const std::uint64_t format = 12345;
+            std::vector<std::uint64_t> all(static_cast<std::size_t>(size));
+            MPI_Comm own = MPI_COMM_NULL;
+            for (int step = 0; step < 2; ++step) {
+                MPI_Request request = MPI_REQUEST_NULL;
+                if (step == 0)
+                    MPI_Comm_idup(MPI_COMM_WORLD, &own, &request);
+                else
+                    MPI_Iallgather(&format, 8, MPI_BYTE, all.data(), 8, MPI_BYTE, own, &request);
+                for (int done = 0; MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done;)
+                    std::this_thread::sleep_for(std::chrono::microseconds(100));
+            }
+            CHECK(std::count(all.begin(), all.end(), detail::packetFormat) == size - 1);
+            MPI_Comm_free(&own);
+        } else {
+            try {
+                const MpiTransport transport(MPI_COMM_WORLD, MemoryPool::create(), Progress::Thread);
+                text = "no exception";
+            } catch (const TransportError& e) {
+                text = e.what();
+            }
+            INFO(text);
+            CHECK(contains(text, "can not read each other"));
+            CHECK(contains(text, "rank 0 sends packets of format "
+                                     + std::to_string(odd == 0 ? 12345 : detail::packetFormat)));
+            CHECK(contains(text, "rank " + std::to_string(odd == 0 ? 1 : odd) + " of format "
+                                     + std::to_string(odd == 0 ? detail::packetFormat : 12345)));
+        }
+        CHECK(check<MpiTransport>(MPI_COMM_WORLD, quick()) == "");
+    }
 }

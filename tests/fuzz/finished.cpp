@@ -122,7 +122,7 @@ void gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     settings.channels = channels;
     settings.codec = flags & HasCodec ? codec() : nullptr;
     d::FinalGather display(pool, layout(), settings, true, 0, {false, true}, ownerOf, [](dfb::Buffer&&) {});
-    display.newFrame(1, false);
+    display.newFrame(1, false, {});
     auto& image = const_cast<dfb::Image&>(display.image());
     const std::size_t pixelBytes = dfb::bytesPerPixel(format);
     std::memset(image.bytes(), 0xa5, pixelBytes * image.pixelCount());

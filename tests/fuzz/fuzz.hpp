@@ -96,7 +96,11 @@ inline std::string textOf(const std::byte* bytes, std::size_t count)
 {
     return std::string(reinterpret_cast<const char*>(bytes), count);
 }
-inline std::string textOf(const std::vector<std::byte>& bytes) { return textOf(bytes.data(), bytes.size()); }
+template <class Bytes>
+std::string textOf(const Bytes& bytes)
+{
+    return textOf(bytes.data(), bytes.size());
+}
 
 // Blocks of exactly the size that is asked for, so that AddressSanitizer sees who reads beyond; those of a MemoryPool
 // are larger.

@@ -168,7 +168,7 @@ std::string messageOf(MessageKind kind, std::int64_t number, const std::string& 
     return fuzz::Output().put(header).text(body).bytes();
 }
 
-std::string reductionOf(std::uint32_t scope, const std::vector<std::byte>& bytes)
+std::string reductionOf(std::uint32_t scope, const d::SmallBytes& bytes)
 {
     return fuzz::Output().put(scope).text(fuzz::textOf(bytes)).bytes();
 }
@@ -341,14 +341,14 @@ std::pair<std::string, std::string> finished(std::uint8_t flags)
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });
-    gather.newFrame(1, config.codec != nullptr);
+    gather.newFrame(1, config.codec != nullptr, {});
     for (const int tile : {1, 3, 5}) {
         auto place = gather.reserve(tile);
         const dfb::Region region = layout.region(tile);
         for (int i = 0; i < region.width() * region.height(); ++i)
             for (const auto c : {d::Color, d::Depth})
                 std::memset(place.planes.at[c] + 4 * i, i % 5 == 2 ? 9 : 1, 4);
-        gather.commit(tile, std::move(place));
+        gather.commit(tile, std::move(place), region.width() * region.height());
     }
     gather.flush();
     return {bodies.at(0), bodies.at(1)};
@@ -418,6 +418,9 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     verdict.paramsHash = d::fingerprintOf(paramsFor(0));
     verdict.tileErrors = {{99, 1.0}};
     add("vote_on_no_tile", 0, of(MessageKind::ReduceUp, reductionOf(FrameVerdict, verdict.bytes())));
+    for (const int tile : {2, -2})
+        add("hidden" + std::to_string(tile), 0,
+            of(MessageKind::Hidden, Output().put(tile).put(1).bytes()) + inputs(0, 1, 9));
     add("image_place", 0, of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));
     add("image_place_of_the_display", DisplayElsewhere,
         of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));

@@ -7,6 +7,7 @@
 #include <dfb/comm/snappy_codec.hpp>
 
 #include <algorithm>
+#include <atomic>
 #include <cstdint>
 #include <memory>
 #include <mutex>
@@ -41,5 +42,63 @@ TEST_CASE("Frames with and without compression take turns until all ranks have c
     CHECK(first == std::vector<bool>{false, true, false, true, false, true, false, true, false, true});
     CHECK(std::count(hashes.begin(), hashes.end(), hashes.front()) == frames);
     CHECK(bytes[1] < bytes[0]);
+}
+
+namespace {
+
+// Counts its calls; on some ranks it finds nothing to gain.
+class CountingCodec final : public dfb::Codec {
+public:
+    explicit CountingCodec(bool gains) : gains_(gains) {}
+    std::uint8_t id() const noexcept override { return snappy_.id(); }
+    std::size_t bound(std::size_t byteCount) const override { return snappy_.bound(byteCount); }
+    std::size_t compress(const std::byte* in, std::size_t byteCount, std::byte* out) const override
+    {
+        ++calls;
+        const std::size_t bytes = snappy_.compress(in, byteCount, out);
+        return gains_ ? bytes : byteCount;
+    }
+    bool decompress(const std::byte* in, std::size_t byteCount, std::byte* out, std::size_t rawByteCount) const override
+    {
+        return snappy_.decompress(in, byteCount, out, rawByteCount);
+    }
+    mutable std::atomic<int> calls{0};
+
+private:
+    dfb::SnappyCodec snappy_;
+    bool gains_;
+};
+
+} // namespace
+
+TEST_CASE("A rank for which nothing is gained gets its messages as they are", "[compression]")
+{
+    const scene::Scene s = scene::makeScene(4, 8);
+    std::vector<int> calls(2), firstCalls(2);
+    std::vector<std::int64_t> links;
+    std::size_t wrong = 0;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = scene::configOf(s);
+        const auto rank = static_cast<std::size_t>(communicator.rank());
+        const auto codec = std::make_shared<CountingCodec>(rank == 1);
+        config.codec = codec;
+        config.compression = dfb::CompressionMode::Auto;
+        using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
+        Fb fb(communicator, config);
+        for (int frame = 0; frame < 10; ++frame) { // those with odd numbers are with the codec
+            const auto report = scene::renderLoop(fb, s, scene::Loop::Listing3);
+            if (fb.isDisplayRank()) {
+                links.push_back(report.compressed ? report.compressedLinks : -1);
+                wrong += scene::wrongValues(scene::Picture(fb.image(), report), scene::referenceOf(s));
+            }
+            if (frame == 1)
+                firstCalls[rank] = codec->calls;
+        }
+        calls[rank] = codec->calls;
+    });
+    CHECK((firstCalls[0] > 0 && calls[0] == firstCalls[0]));
+    CHECK(calls[1] == 5 * firstCalls[1]);
+    CHECK(links == std::vector<std::int64_t>{-1, 1, -1, 1, -1, 1, -1, 1, -1, 1});
+    CHECK(wrong == 0);
 }
 #endif

@@ -1,8 +1,11 @@
 // Edges: images and tiles of every odd size, data on few ranks, framebuffers made and gone in any order, user code that
 // has threads of its own.
 #include "catch.hpp"
+#include "large_image.hpp"
 #include "scene.hpp"
 
+#include <algorithm>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -93,6 +96,69 @@ TEST_CASE("An image of 16384 x 16384 pixels of which little is touched", "[edges
     CHECK(report.tilesTotal == 256 * 256);
     CHECK(report.tilesTouched == 6 * 5);
     CHECK(report.bytesSent < 4 << 20);
+}
+
+TEST_CASE("Sizes and counts of the largest images are right: none is a number of 32 bits", "[edges]")
+{
+    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{65536, 32768}, {65536, 65536}}) {
+        const std::uint64_t pixels = static_cast<std::uint64_t>(width) * static_cast<std::uint64_t>(height);
+        INFO(width << "x" << height);
+        CHECK(dfb::Image(*dfb::MemoryPool::create(), width, height, dfb::OutputFormat::None, 0).pixelCount() == pixels);
+        CHECK(pixels * dfb::bytesPerPixel(dfb::OutputFormat::RGBA32F) == std::uint64_t{16} * pixels);
+        for (const int size : {8, 64, 256}) {
+            const dfb::TileLayout layout(width, height, size);
+            const int count = layout.tileCount();
+            CHECK(static_cast<std::uint64_t>(count) * static_cast<std::uint64_t>(size * size) == pixels);
+            const dfb::Region last = layout.region(count - 1);
+            CHECK((last.x0 == width - size && last.y0 == height - size && last.x1 == width && last.y1 == height));
+            for (const auto& owner : {dfb::latticeOwner, dfb::linearOwner, dfb::hashOwner})
+                for (const int tile : {0, count / 2, count - 1}) {
+                    const int rank = owner(tile, layout, 100000);
+                    CHECK((rank >= 0 && rank < 100000));
+                }
+            CHECK(dfb::linearOwner(count - 1, layout, 100000) == 100000 - (100000 + count - 1) / count);
+        }
+    }
+}
+
+TEST_CASE("A frame of 65536 x 32768 pixels, 32 GiB in float, that no rank displays", "[edges]")
+{
+    const int width = 65536, height = 32768;
+    scene::Scene s;
+    s.width = width, s.height = height;
+    s.bricks.push_back({7, {{65000, 32500, 0}, {65536, 32768, 1}}}); // the last corner
+    std::vector<dfb::FrameReport> reports(2);
+    std::atomic<std::int64_t> pixels{0};
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(s);
+        config.format = dfb::OutputFormat::None;
+        config.depth = false;
+        FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
+        reports[static_cast<std::size_t>(fb.rank())] =
+            dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
+                                    [&](const dfb::Brick& b, auto& tile) {
+                                        const dfb::Region r =
+                                            dfb::intersection(tile.region, scene::FlatCamera().project(b.bounds, 0, 0));
+                                        pixels += static_cast<std::int64_t>(r.width()) * r.height();
+                                        renderBrick(s, b, tile);
+                                    });
+    });
+    for (const dfb::FrameReport& report : reports) {
+        CHECK(report.tilesTotal == 256 * 128);
+        CHECK(report.tilesTouched == 3 * 2);
+    }
+    CHECK(pixels == 536 * 268);
+}
+
+TEST_CASE("A float image of 2.25 GiB travels to the display rank", "[edges][.stress]")
+{
+    std::string wrong = "no image";
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        const std::string mine = largeImage<Inproc>(communicator, true);
+        if (communicator.rank() == 0)
+            wrong = mine;
+    });
+    CHECK(wrong == "");
 }
 
 TEST_CASE("Framebuffers on one messenger are made and gone in any order", "[edges]")

@@ -215,6 +215,12 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
         {"a manifest of another's tile", MessageKind::Manifest, 2,
          [](dfb::Buffer& m) { put(m, body, std::int32_t{-1}); }, "a tile of another owner"},
         {"a manifest cut short", MessageKind::Manifest, 2, [](dfb::Buffer& m) { m.shrink(m.size() - 1); }, "too short"},
+        {"hidden inputs where everything counts", MessageKind::Manifest, 2,
+         [](dfb::Buffer& m) {
+             put(m, offsetof(MessageHeader, kind), MessageKind::Hidden);
+             m.shrink(body + 8);
+         },
+         "word of hidden inputs"},
         {"a finished tile of another owner", MessageKind::FinishedTiles, 1,
          [=](dfb::Buffer& m) { put(m, body + 16, ofDisplay); }, "a finished tile of another owner"},
         {"a batch that is longer than it says", MessageKind::FinishedTiles, 1,

@@ -1,4 +1,5 @@
 // The image of the display rank, into which the owners of its node write themselves.
+#include "../inproc/large_image.hpp"
 #include "../inproc/scene.hpp"
 #include "catch.hpp"
 #include "ranks.hpp"
@@ -123,4 +124,13 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
     for (int i = 0; i < 3; ++i)
         CHECK(goodFrame(fb, s, report));
     CHECK(report.messagesSent > messagesBefore); // tiles are sent again
+}
+
+// More than the ranks of a node share (NodeMemory::capacity): finished tiles are lent, or go through MPI.
+TEST_CASE("A float image of 2.25 GiB gets to the display rank, lent and through MPI", "[.stress]")
+{
+    for (const bool shared : {false, true}) {
+        INFO((shared ? "lent" : "through MPI"));
+        CHECK(largeImage<dfb::MpiTransport>(MPI_COMM_WORLD, shared) == "");
+    }
 }

@@ -115,3 +115,42 @@ TEST_CASE("Spans reach over the places where a row is cut for the search", "[wir
         CHECK(active.pixels == static_cast<std::uint32_t>(2 * width - gaps));
     }
 }
+
+TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
+{
+    constexpr int size = 256, stride = 300;
+    using View = dfb::TileView<dfb::colorChannel, size>;
+    std::mt19937 random(11);
+    std::vector<float> image(4 * stride * size), colors(4 * size * size), expectedColors(colors);
+    const dfb::Region places[] = {{100, 40, 100 + size, 40 + size}, {0, 0, 70, 33}};
+    for (int round = 0; round < 60; ++round) {
+        View view;
+        view.region = places[round % 2];
+        view.stride = stride;
+        view.color = image.data();
+        const auto place = [&](int begin, int end) {
+            return begin - 10 + static_cast<int>(random() % static_cast<unsigned>(end - begin + 20));
+        };
+        const dfb::Region& r = view.region;
+        view.valid = {place(r.x0, r.x1), place(r.y0, r.y1), place(r.x0, r.x1), place(r.y0, r.y1)};
+        const dfb::Region valid = view.validRegion();
+        for (int y = 0; y < size; ++y)
+            for (int x = 0; x < stride; ++x)
+                for (int c = 0; c < 4; ++c)
+                    image[static_cast<std::size_t>(4 * (y * stride + x) + c)] =
+                        valid.contains(r.x0 + x, r.y0 + y) ? (random() % 8 ? 0.5f : 0.0f) : notANumber;
+        dfb::detail::ActivePixels narrow, wide;
+        narrow.gather(view, dfb::colorChannel, colors.data());
+        CHECK_FALSE(narrow.mayBeFaulty());
+        for (float& value : image)
+            value = std::isnan(value) ? 0 : value;
+        view.valid = view.region;
+        wide.gather(view, dfb::colorChannel, expectedColors.data());
+        REQUIRE(narrow.pixels == wide.pixels);
+        CHECK((narrow.pixels == 0 || (narrow.rowBegin == wide.rowBegin && narrow.rowEnd == wide.rowEnd)));
+        CHECK(narrow.rowCounts == wide.rowCounts);
+        CHECK(std::equal(narrow.spans.begin(), narrow.spans.end(), wide.spans.begin(), wide.spans.end(),
+                         [](const dfb::Span& a, const dfb::Span& b) { return a.x == b.x && a.count == b.count; }));
+        CHECK(std::equal(colors.begin(), colors.begin() + 4 * narrow.pixels, expectedColors.begin()));
+    }
+}

@@ -313,3 +313,91 @@ TEST_CASE("Where colour is dithered alpha is the exact result rounded all the sa
     CHECK(wrong == 0);
     CHECK(other == 3); // 0.49 is 124.95: 61 of 64 places take 125, as all do when it is rounded
 }
+
+TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take it", "[ops]")
+{
+    using Op = dfb::BasicOrderedBlend<8>;
+    constexpr int inputs = 5;
+    // A bit for each input that is opaque; the others have a hole, or let something through.
+    for (unsigned opaque = 0; opaque < 1u << inputs; ++opaque) {
+        TileInputs<8> in;
+        for (int g = 0; g < inputs; ++g) {
+            auto& tile = in.add(0, static_cast<std::uint32_t>(g), 0);
+            const bool isOpaque = (opaque >> g) & 1;
+            tile.fill({0.125f * static_cast<float>(g + 1), 0, 0, isOpaque || g % 2 ? 1.0f : 0.5f}, 1.0f);
+            if (!isOpaque)
+                std::fill_n(tile.pixel(g, g), 4, 0.0f);
+            tile.generation = g;
+            tile.children = g + 1 < inputs;
+        }
+        int first = 0; // that is opaque
+        while (first < inputs && !((opaque >> first) & 1))
+            ++first;
+        if (first + 1 < inputs)
+            in.tiles.back()->pixel(0, 0)[0] = infinity; // which would show
+        auto expected = [&] {
+            auto order = in.order();
+            order.resize(std::min<std::size_t>(order.size(), static_cast<std::size_t>(first) + 1));
+            return dfb::testing::runTileOp<Op>(in, order, dfb::OutputFormat::RGBA32F, false);
+        }();
+        auto order = in.order();
+        do {
+            const TileOutput out = dfb::testing::runTileOp<Op>(in, order, dfb::OutputFormat::RGBA32F, false);
+            REQUIRE(out == expected);
+
+            const auto pool = dfb::MemoryPool::create();
+            dfb::TileInfo info;
+            info.region = in.region();
+            info.passes = 1;
+            Op op;
+            op.newFrame(info);
+            std::vector<bool> there(inputs, false);
+            for (const std::size_t i : order) {
+                dfb::detail::InputFaults faults;
+                const dfb::detail::WireCoder coder{dfb::WirePrecision()};
+                op.add(dfb::detail::decodeFragment(
+                    *pool,
+                    dfb::detail::encodeFragment(*pool, *in.tiles[i], dfb::colorChannel, 0, nullptr, coder,
+                                                dfb::WireFormat::Float32, faults),
+                    in.layout, [](int) { return 1; }, nullptr, coder));
+                there[i] = true;
+                const bool isEnough =
+                    first < inputs && std::all_of(there.begin(), there.begin() + first + 1, [](bool b) { return b; });
+                REQUIRE(op.isComplete() == isEnough);
+            }
+        } while (std::next_permutation(order.begin(), order.end()));
+    }
+}
+
+TEST_CASE("What a single layer covers comes out the same whether it is taken as it is or composited", "[ops]")
+{
+    using Op = dfb::BasicAlphaBlend<64>;
+    for (std::uint64_t seed = 900; seed < 924; ++seed) {
+        Random random(seed);
+        TileInputs<64> in;
+        in.background = {};
+        for (std::uint32_t source = 0; source < 3; ++source) {
+            auto& tile = in.add(0, source, 0);
+            for (int y = 0; y < 64; ++y)
+                for (int x = 0; x < 64;) { // runs and gaps of all lengths
+                    const int end = std::min(64, x + 1 + static_cast<int>(random() % (seed % 2 ? 60 : 20)));
+                    for (const bool isThere = random() % 2; x < end; ++x) {
+                        float* p = tile.pixel(x, y);
+                        p[3] = isThere ? (random() % 4 ? uniform(random) : 0.5f) : 0.0f;
+                        for (int c = 0; c < 3 && isThere; ++c) // up to thresholds, where levels change
+                            p[c] = random() % 8 ? p[3] * uniform(random)
+                                                : std::nextafter(static_cast<float>(random() % 510) / 510, 1.0f);
+                        if (isThere && random() % 64 == 0)
+                            p[0] = random() % 2 ? -0.0f : notANumber;
+                        tile.depth[y * 64 + x] = static_cast<float>(source);
+                    }
+                }
+        }
+        for (const auto format : {dfb::OutputFormat::RGBA32F, dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8}) {
+            const TileOutput taken = dfb::testing::runTileOp<Op>(in, in.order(), format, false);
+            const TileOutput composited = dfb::testing::runTileOp<Op>(in, in.order(), format, true);
+            INFO("seed " << seed << ", format " << static_cast<int>(format));
+            CHECK(taken.color == composited.color);
+        }
+    }
+}

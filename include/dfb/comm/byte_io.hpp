@@ -2,6 +2,7 @@
 // reads beyond its end.
 #pragma once
 
+#include <dfb/detail/small_bytes.hpp>
 #include <dfb/error.hpp>
 
 #include <cstddef>
@@ -9,7 +10,6 @@
 #include <cstring>
 #include <string>
 #include <type_traits>
-#include <vector>
 
 namespace dfb::detail {
 
@@ -20,25 +20,25 @@ public:
     {
         static_assert(std::is_trivially_copyable_v<T>);
         const auto* first = reinterpret_cast<const std::byte*>(&value);
-        bytes_.insert(bytes_.end(), first, first + sizeof value);
+        bytes_.append(first, first + sizeof value);
     }
     void putText(const std::string& text)
     {
         put(static_cast<std::uint32_t>(text.size()));
         const auto* first = reinterpret_cast<const std::byte*>(text.data());
-        bytes_.insert(bytes_.end(), first, first + text.size());
+        bytes_.append(first, first + text.size());
     }
-    const std::vector<std::byte>& bytes() const noexcept { return bytes_; }
-    std::vector<std::byte> take() { return std::move(bytes_); }
+    void clear() noexcept { bytes_.clear(); }
+    const SmallBytes& bytes() const noexcept { return bytes_; }
 
 private:
-    std::vector<std::byte> bytes_;
+    SmallBytes bytes_;
 };
 
 class ByteReader {
 public:
     ByteReader(const std::byte* data, std::size_t size) : next_(data), left_(size) {}
-    explicit ByteReader(const std::vector<std::byte>& bytes) : ByteReader(bytes.data(), bytes.size()) {}
+    explicit ByteReader(const SmallBytes& bytes) : ByteReader(bytes.data(), bytes.size()) {}
 
     // Throws Error (MalformedMessage) when fewer bytes are left.
     template <class T>

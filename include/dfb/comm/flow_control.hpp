@@ -9,17 +9,16 @@
 #pragma once
 
 #include <dfb/comm/message.hpp>
+#include <dfb/detail/fifo.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <deque>
 #include <functional>
 #include <mutex>
 #include <string>
 #include <unordered_map>
 #include <utility>
-#include <vector>
 
 namespace dfb::detail {
 
@@ -57,8 +56,10 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         free_ += extraInUse_;
         extraInUse_ = 0;
-        outgoing_.clear();
-        incoming_.clear();
+        for (auto& [destination, out] : outgoing_)
+            out.reset(allowance_);
+        for (auto& [source, in] : incoming_)
+            in.reset(allowance_);
         asking_.clear();
         underWay_ = 0;
         peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
@@ -91,7 +92,7 @@ public:
             underWay_ += message.size();
             if (!out.queue.empty() || out.sent + message.size() > out.granted) {
                 out.queuedBytes += message.size();
-                out.queue.push_back(std::move(message));
+                out.queue.push(std::move(message));
                 if (out.asked)
                     return;
                 request = requestOf(out);
@@ -130,32 +131,31 @@ public:
         if (credit.granted > credit.consumed && credit.granted - credit.consumed > pool_)
             failMalformed("credit for more than a pool", static_cast<std::int64_t>(pool_),
                           static_cast<std::int64_t>(credit.granted - credit.consumed));
-        std::vector<Buffer> ready;
-        Request request;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            Outgoing& out = outgoingTo(from);
-            out.granted = std::max(out.granted, credit.granted);
-            if (credit.consumed > out.consumed) {
-                const std::uint64_t more = std::min(credit.consumed, out.sent) - out.consumed;
-                out.consumed += more;
-                underWay_ -= more;
-            }
-            if (out.granted >= out.askedFor)
-                out.asked = false;
-            while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
-                out.sent += out.queue.front().size();
-                out.queuedBytes -= out.queue.front().size();
-                ready.push_back(std::move(out.queue.front()));
-                out.queue.pop_front();
-            }
-            if (!out.queue.empty() && !out.asked)
-                request = requestOf(out);
+        std::unique_lock<std::mutex> lock(mutex_);
+        Outgoing& out = outgoingTo(from);
+        out.granted = std::max(out.granted, credit.granted);
+        if (credit.consumed > out.consumed) {
+            const std::uint64_t more = std::min(credit.consumed, out.sent) - out.consumed;
+            out.consumed += more;
+            underWay_ -= more;
         }
-        for (Buffer& message : ready)
+        for (;;) {
+            if (out.granted >= out.askedFor) // each time: others may have asked for what has just been sent
+                out.asked = false;
+            if (out.queue.empty() || out.sent + out.queue.front().size() > out.granted)
+                break;
+            Buffer message = out.queue.pop();
+            out.sent += message.size();
+            out.queuedBytes -= message.size();
+            lock.unlock();
             callbacks_.transmit(from, std::move(message));
-        if (request.first > 0)
-            callbacks_.request(from, request);
+            lock.lock();
+        }
+        if (out.queue.empty() || out.asked)
+            return;
+        const Request request = requestOf(out);
+        lock.unlock();
+        callbacks_.request(from, request);
     }
 
     // ---- the receiver's side
@@ -201,7 +201,7 @@ public:
             return; // it has its answer, or a later one has overtaken it
         in.request = request;
         if (!in.asks)
-            asking_.push_back(source);
+            asking_.push(source);
         in.asks = true;
         serve(lock);
     }
@@ -216,10 +216,19 @@ public:
 private:
     struct Outgoing {
         std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
-        std::deque<Buffer> queue;
+        Fifo<Buffer> queue;
         std::size_t queuedBytes = 0;
         std::uint64_t askedFor = 0; // Request::first, as long as `asked`
         bool asked = false;
+
+        void reset(std::uint64_t allowance)
+        {
+            granted = allowance;
+            sent = consumed = askedFor = 0;
+            queue.clear();
+            queuedBytes = 0;
+            asked = false;
+        }
     };
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
@@ -227,13 +236,19 @@ private:
         std::uint64_t extra = 0;                 // of what is granted and not consumed, that beyond the allowance
         Request request;
         bool asks = false;
+
+        void reset(std::uint64_t allowance)
+        {
+            *this = Incoming();
+            granted = allowance;
+        }
     };
 
     Outgoing& outgoingTo(int rank)
     {
         const auto [place, isNew] = outgoing_.try_emplace(rank);
         if (isNew)
-            place->second.granted = allowance_;
+            place->second.reset(allowance_);
         return place->second;
     }
 
@@ -241,7 +256,7 @@ private:
     {
         const auto [place, isNew] = incoming_.try_emplace(rank);
         if (isNew)
-            place->second.granted = allowance_;
+            place->second.reset(allowance_);
         return place->second;
     }
 
@@ -284,7 +299,7 @@ private:
         if (in.asks && in.granted >= in.request.first)
             in.asks = false; // it will ask again if it wants more
         in.told = in.consumed;
-        grants_.push_back({source, {in.granted, in.consumed}});
+        grants_.push({source, {in.granted, in.consumed}});
     }
 
     // Answers who has asked, the first one first, as far as the pool reaches; then tells what was granted.
@@ -302,23 +317,25 @@ private:
                 else
                     break;
             }
-            asking_.pop_front();
+            asking_.pop();
         }
-        std::vector<std::pair<int, Credit>> grants;
-        grants.swap(grants_);
-        lock.unlock();
-        for (const auto& [source, credit] : grants)
+        while (!grants_.empty()) {
+            const auto [source, credit] = grants_.pop();
+            lock.unlock();
             callbacks_.credit(source, credit);
+            lock.lock();
+        }
     }
 
     const std::size_t pool_, allowance_;
     mutable std::mutex mutex_;
     std::size_t free_;           // of the half that is granted on request
     std::size_t extraInUse_ = 0; // the rest of it
+    // Of each rank since it was first met:
     std::unordered_map<int, Outgoing> outgoing_;
     std::unordered_map<int, Incoming> incoming_;
-    std::deque<int> asking_;
-    std::vector<std::pair<int, Credit>> grants_; // to be told
+    Fifo<int> asking_;
+    Fifo<std::pair<int, Credit>> grants_; // to be told
     std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;
     bool dropping_ = false;
     Callbacks callbacks_;

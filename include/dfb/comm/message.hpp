@@ -29,12 +29,13 @@ enum class MessageKind : std::uint8_t {
     ImagePlace,    // where in shared memory the image of the display rank lies
     Failure,       // the sender's messenger can not go on, nor can anybody who waits for it
     AreYouThere,   // to be answered at once with the next
-    Present        // the sender is there, and answers whenever it is asked
+    Present,       // the sender is there, and answers whenever it is asked
+    Hidden         // from which generation on inputs of a tile can not be seen
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 5;
+    static constexpr std::uint8_t formatVersion = 6;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
@@ -78,7 +79,7 @@ inline MessageHeader readMessageHeader(const Buffer& message)
     if (header.version != MessageHeader::formatVersion)
         failMalformed("the sender was built with another version of dfb, or of its wire format",
                       MessageHeader::formatVersion, header.version);
-    if (header.kind > MessageKind::Present)
+    if (header.kind > MessageKind::Hidden)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;
 }

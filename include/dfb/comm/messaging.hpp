@@ -59,6 +59,7 @@ public:
                           sendReduction(to, key, up, bytes);
                       })
     {
+        inbox_.reserve(256); // how many wait at once depends on time: mostly no more
     }
 
     // From here on the handler is called. Collective, in the same order for all objects of a messenger.
@@ -362,9 +363,9 @@ private:
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
-        Bytes body(sizeof key.scope + bytes.size());
-        std::memcpy(body.data(), &key.scope, sizeof key.scope);
-        std::copy(bytes.begin(), bytes.end(), body.begin() + sizeof key.scope);
+        const auto* scope = reinterpret_cast<const std::byte*>(&key.scope);
+        Bytes body(scope, scope + sizeof key.scope);
+        body.append(bytes.begin(), bytes.end());
         send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
     }
 

@@ -63,6 +63,8 @@ class SequenceWindow {
 public:
     enum class Result { New, Duplicate, Absurd };
 
+    SequenceWindow() { holes_.reserve(16); }
+
     Result arrive(std::uint32_t sequence)
     {
         const auto ahead = static_cast<std::int32_t>(sequence - next_);
@@ -70,11 +72,17 @@ public:
             if (ahead > maxHoles)
                 return Result::Absurd;
             for (; next_ != sequence; ++next_)
-                holes_.insert(next_);
+                holes_.push_back(next_);
             ++next_;
             return Result::New;
         }
-        return holes_.erase(sequence) == 1 ? Result::New : Result::Duplicate;
+        const auto hole = std::lower_bound(holes_.begin(), holes_.end(), sequence, [this](auto a, auto b) {
+            return next_ - a > next_ - b; // also where the numbers have begun again
+        });
+        if (hole == holes_.end() || *hole != sequence)
+            return Result::Duplicate;
+        holes_.erase(hole);
+        return Result::New;
     }
 
     // Messages that later ones have overtaken, or that are lost.
@@ -83,7 +91,7 @@ public:
 private:
     static constexpr std::int32_t maxHoles = 1 << 20;
     std::uint32_t next_ = 0;
-    std::set<std::uint32_t> holes_;
+    std::vector<std::uint32_t> holes_; // the oldest first
 };
 
 } // namespace detail

@@ -9,6 +9,9 @@
 // says where it lies in memory that both see (comm/node_memory.hpp), and nothing is copied. Otherwise it is sent on its
 // own under the tag that the announcement names, so that it goes straight into the block that the handler gets.
 // Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
+//
+// What ranks built with any version of this do first: duplicate the communicator, and gather on it the 8 bytes of their
+// packetFormat. That must stay as it is.
 #pragma once
 
 #include <dfb/comm/node_memory.hpp>
@@ -83,8 +86,8 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // at a lower thread level than `progress` needs. At MPI_THREAD_FUNNELED to be called by the thread that initialised
-    // MPI.
+    // at a lower thread level than `progress` needs; and on all ranks if they were built with different packet formats.
+    // At MPI_THREAD_FUNNELED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
@@ -122,6 +125,12 @@ public:
         check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
 
+        try {
+            compareFormats();
+        } catch (...) {
+            MPI_Comm_free(&comm_);
+            throw;
+        }
         peers_.resize(static_cast<std::size_t>(size_));
         meetNode();
 
@@ -231,7 +240,33 @@ public:
     }
 
 private:
-    // What a rank tells all others at the beginning.
+    // The first thing that ranks say to each other, see above. Throws the same TransportError on all.
+    void compareFormats() const
+    {
+        const std::uint64_t mine = detail::packetFormat;
+        std::vector<std::uint64_t> all(static_cast<std::size_t>(size_));
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
+              "MPI_Iallgather");
+        for (detail::Patience patience; !completed(request);)
+            patience.nap();
+        const auto differs = std::find_if(all.begin(), all.end(), [&](std::uint64_t f) { return f != all.front(); });
+        if (differs == all.end())
+            return;
+        const int other = static_cast<int>(differs - all.begin());
+        std::string text = "ranks were built with versions of dfb that can not read each other: rank 0 sends packets "
+                           "of format "
+                           + std::to_string(all.front());
+        int named = 0; // those that differ from rank 0
+        for (std::size_t rank = 0; rank < all.size(); ++rank)
+            if (all[rank] != all.front() && ++named <= 8)
+                text += ", rank " + std::to_string(rank) + " of format " + std::to_string(all[rank]);
+        if (named > 8)
+            text += ", and " + std::to_string(named - 8) + " more of others than rank 0";
+        throw TransportError(std::move(text), other);
+    }
+
+    // What a rank tells all others then.
     struct Card {
         std::uint64_t host;
         detail::NodeMemory::Address memory;

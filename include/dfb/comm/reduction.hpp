@@ -5,17 +5,17 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
+#include <dfb/detail/small_bytes.hpp>
 #include <dfb/error.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <deque>
 #include <functional>
-#include <limits>
 #include <map>
 #include <mutex>
-#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -24,13 +24,13 @@ namespace dfb {
 struct ReductionKey {
     std::uint32_t scope = 0; // what it is for
     std::int64_t number = 0; // which one
-    bool operator<(const ReductionKey& o) const { return std::tie(scope, number) < std::tie(o.scope, o.number); }
+    bool operator==(const ReductionKey& o) const { return scope == o.scope && number == o.number; }
 };
 
 // All members may be called from any thread. The callbacks are called without a lock held, on the calling thread.
 class ReductionTable {
 public:
-    using Bytes = std::vector<std::byte>;
+    using Bytes = detail::SmallBytes;
     using Combine = std::function<Bytes(const Bytes&, const Bytes&)>; // associative
     using Done = std::function<void(const Bytes&)>;
     // Sends a partial result up to the parent or the result down to a child.
@@ -41,6 +41,10 @@ public:
         for (int bit = 1; bit < size_ && !(rank_ & bit); bit <<= 1)
             if (rank_ + bit < size_)
                 children_.push_back(rank_ + bit);
+        for (int i = 0; i < 4; ++i) { // more are hardly under way at once
+            states_.emplace_back();
+            states_.back().parts.reserve(children_.size() + 1);
+        }
     }
 
     // Combines arrays of int64 element by element. Arrays of different lengths give one byte, which is no array.
@@ -64,12 +68,12 @@ public:
     void enter(const ReductionKey& key, Bytes own, Combine combine, Done done)
     {
         std::unique_lock<std::mutex> lock(mutex_);
-        State& state = states_[key];
+        State& state = stateOf(key);
         state.entered = true;
         state.parts.emplace_back(rank_, std::move(own));
         state.combine = std::move(combine);
         state.done = std::move(done);
-        advance(lock, key);
+        advance(lock, state);
     }
 
     // Throws Error (MalformedMessage) for what the tree has no place for, and what `combine` throws.
@@ -84,16 +88,16 @@ public:
         if (floor != forgotten_.end() && key.number <= floor->second)
             return;
         if (up) {
-            auto& parts = states_[key].parts;
-            if (std::any_of(parts.begin(), parts.end(), [&](const auto& part) { return part.first == source; }))
+            State& state = stateOf(key);
+            if (std::any_of(state.parts.begin(), state.parts.end(),
+                            [&](const auto& part) { return part.first == source; }))
                 fail("a second part of a reduction", -1, source);
-            parts.emplace_back(source, std::move(bytes));
-            advance(lock, key);
-        } else {
-            const auto place = states_.find(key);
-            if (place != states_.end() && !hasAll(place->second))
+            state.parts.emplace_back(source, std::move(bytes));
+            advance(lock, state);
+        } else if (State* state = find(key)) {
+            if (!hasAll(*state))
                 fail("a reduction's result before all of its parts", -1, source);
-            finish(lock, key, bytes);
+            finish(lock, *state, bytes);
         }
     }
 
@@ -101,12 +105,12 @@ public:
     std::vector<int> missing(const ReductionKey& key)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        const auto place = states_.find(key);
-        if (place == states_.end())
+        const State* state = find(key);
+        if (!state)
             return {};
         std::vector<int> ranks;
         for (int child : children_)
-            if (std::none_of(place->second.parts.begin(), place->second.parts.end(),
+            if (std::none_of(state->parts.begin(), state->parts.end(),
                              [child](const auto& part) { return part.first == child; }))
                 ranks.push_back(child);
         if (ranks.empty() && rank_ != 0)
@@ -118,10 +122,11 @@ public:
     void forget(std::uint32_t scope, std::int64_t number)
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        auto& floor = forgotten_.emplace(scope, number).first->second;
+        auto& floor = forgotten_.try_emplace(scope, number).first->second;
         floor = std::max(floor, number);
-        states_.erase(states_.lower_bound({scope, std::numeric_limits<std::int64_t>::min()}),
-                      states_.upper_bound({scope, number}));
+        for (State& state : states_)
+            if (state.isUsed && state.key.scope == scope && state.key.number <= number)
+                state.reset();
     }
 
 private:
@@ -137,19 +142,48 @@ private:
         throw Error(std::move(info));
     }
 
+    // Those that are over are used again.
     struct State {
-        bool entered = false;
+        ReductionKey key;
+        bool isUsed = false, entered = false;
         std::vector<std::pair<int, Bytes>> parts; // of the children and our own
         Combine combine;
         Done done;
+
+        void reset()
+        {
+            isUsed = entered = false;
+            parts.clear();
+            combine = nullptr;
+            done = nullptr;
+        }
     };
+
+    State* find(const ReductionKey& key)
+    {
+        for (State& state : states_)
+            if (state.isUsed && state.key == key)
+                return &state;
+        return nullptr;
+    }
+    // Its place, which stays, or a new one.
+    State& stateOf(const ReductionKey& key)
+    {
+        if (State* state = find(key))
+            return *state;
+        auto place = std::find_if(states_.begin(), states_.end(), [](const State& s) { return !s.isUsed; });
+        if (place == states_.end())
+            place = states_.emplace(place);
+        place->key = key;
+        place->isUsed = true;
+        return *place;
+    }
 
     // All parts are here.
     bool hasAll(const State& state) const { return state.entered && state.parts.size() > children_.size(); }
 
-    void advance(std::unique_lock<std::mutex>& lock, const ReductionKey& key)
+    void advance(std::unique_lock<std::mutex>& lock, State& state)
     {
-        State& state = states_[key];
         if (!hasAll(state))
             return;
         // In order of rank, so that the result does not depend on who came first.
@@ -159,20 +193,19 @@ private:
         for (std::size_t i = 1; i < state.parts.size(); ++i)
             result = state.combine(result, state.parts[i].second);
         if (rank_ == 0) {
-            finish(lock, key, result);
+            finish(lock, state, result);
             return;
         }
+        const ReductionKey key = state.key;
         lock.unlock();
         send_(parent(), key, true, result);
     }
 
-    void finish(std::unique_lock<std::mutex>& lock, const ReductionKey& key, const Bytes& result)
+    void finish(std::unique_lock<std::mutex>& lock, State& state, const Bytes& result)
     {
-        const auto place = states_.find(key);
-        if (place == states_.end())
-            return;
-        const Done done = std::move(place->second.done);
-        states_.erase(place);
+        const ReductionKey key = state.key;
+        const Done done = std::move(state.done);
+        state.reset();
         lock.unlock();
         for (auto child = children_.rbegin(); child != children_.rend(); ++child)
             send_(*child, key, false, result);
@@ -184,7 +217,7 @@ private:
     Send send_;
     std::vector<int> children_;
     std::mutex mutex_;
-    std::map<ReductionKey, State> states_;
+    std::deque<State> states_; // few
     std::map<std::uint32_t, std::int64_t> forgotten_;
 };
 

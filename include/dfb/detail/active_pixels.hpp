@@ -196,12 +196,14 @@ struct ActivePixels {
         spans.clear();
         rowBegin = rowEnd = 0;
         pixels = 0;
-        const int width = tile.region.width(), height = tile.pixel(0, 0) ? tile.region.height() : 0;
-        for (int y = 0; y < height; ++y) {
+        const Region valid = tile.validRegion();
+        const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
+        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
+        for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
             const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.rowStride();
-            if (y + 1 < height)
-                prefetch(tile.pixel(0, y + 1), width);
-            findSpans(tile.pixel(0, y), width);
+            if (y + 1 < yEnd)
+                prefetch(tile.pixel(x0, y + 1), width);
+            findSpans(tile.pixel(0, y), x0, x0 + width);
             for (std::size_t i = before; i < spans.size(); ++i) {
                 f(begin + spans[i].x, static_cast<int>(spans[i].count));
                 pixels += spans[i].count;
@@ -241,11 +243,12 @@ private:
 #endif
     }
 
-    void findSpans(const float* row, int width)
+    // Of pixels [begin, end) of a row.
+    void findSpans(const float* row, int begin, int end)
     {
         const std::size_t before = spans.size();
-        for (int x0 = 0; x0 < width; x0 += 64) {
-            const int count = std::min(64, width - x0);
+        for (int x0 = begin; x0 < end; x0 += 64) {
+            const int count = std::min(64, end - x0);
             const float* from = row + 4 * static_cast<std::ptrdiff_t>(x0);
             std::uint64_t bits = activePixelBits(from, count);
             for (int x = x0; bits != 0;) {

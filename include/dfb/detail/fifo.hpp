@@ -11,9 +11,18 @@ template <class T>
 class Fifo {
 public:
     bool empty() const noexcept { return first_ == items_.size(); }
+    std::size_t size() const noexcept { return items_.size() - first_; }
+    void reserve(std::size_t count) { items_.reserve(count); }
     void push(T&& item) { items_.push_back(std::move(item)); }
+    void push(const T& item) { items_.push_back(item); }
+    void clear() noexcept
+    {
+        items_.clear();
+        first_ = 0;
+    }
 
     // The oldest; there must be one.
+    T& front() noexcept { return items_[first_]; }
     T pop()
     {
         T item = std::move(items_[first_++]);
@@ -23,6 +32,10 @@ public:
         }
         return item;
     }
+
+    // From the oldest on.
+    const T* begin() const noexcept { return items_.data() + first_; }
+    const T* end() const noexcept { return items_.data() + items_.size(); }
 
 private:
     std::vector<T> items_;

@@ -49,6 +49,8 @@ public:
     struct Place : FinishedPlanes {
         Buffer own;         // of the planes, if they are to be sent
         ImageWriter writer; // into the image of another rank
+        // In the image: see BackgroundPixels. Else 0.
+        std::int64_t imageEpoch = 0;
     };
 
     // `senders`: which ranks have finished tiles for the display rank; `ownerOf(tile)`: which. `send`: to it, batches
@@ -67,20 +69,26 @@ public:
             for (auto& s : state_)
                 s = TileState::Undefined;
         }
+        if (!isDisplay_ && enabled())
+            for (int i = 0; i < 3; ++i) // as many as one worker and a thread that waits have at once
+                spareBatches_.push_back(std::make_shared<Batch>());
     }
 
     const Image& image() const noexcept { return image_; }
     bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
 
-    // `compresses`: whether the codec, if there is one, is used.
-    void newFrame(std::int64_t frame, bool compresses)
+    // `compresses`: whether the codec, if there is one, is used. `background`: what the image shows beside the tiles.
+    void newFrame(std::int64_t frame, bool compresses, const std::array<float, 4>& background)
     {
         frame_ = frame;
+        imageEpoch_ += std::memcmp(&background, &lastBackground_, sizeof background) != 0;
+        lastBackground_ = background;
         compresses_ = compresses && settings_.codec;
         batch_.reset();
         flushed_ = false;
         tilesSent_ = 0;
         placed_.clear();
+        placedPixels_ = 0;
         held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
@@ -122,6 +130,13 @@ public:
         return places;
     }
 
+    // Of a message with finished tiles that a codec was to make smaller, what it had before; else 0.
+    static std::size_t rawBytesOf(const Buffer& message)
+    {
+        const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
+        return h.isTried ? prefix + h.rawBytes : 0;
+    }
+
     // On another rank. `blockAt(place, byteCount)`: what lies there, or null. Throws Error (MalformedMessage).
     template <class BlockAt>
     void useImage(const ImagePlaces& places, const BlockAt& blockAt)
@@ -144,14 +159,11 @@ public:
         remote_ = image;
     }
 
-    // Bytes of the finished tiles that this rank has put into the image of another in this frame.
+    // Bytes that this rank has written into the image of another in this frame.
     std::int64_t placedBytes() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        std::size_t bytes = 0;
-        for (const int tile : placed_)
-            bytes += record_.mostBytes(pixelsIn(layout_.region(tile)));
-        return static_cast<std::int64_t>(bytes);
+        return placedPixels_ * static_cast<std::int64_t>(record_.pixelBytes());
     }
 
     // The frame is over: nobody writes into the image any more.
@@ -165,6 +177,7 @@ public:
         pool_->lend(gateMemory_);
         imageGate_ = nullptr;
         image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+        ++imageEpoch_;
         for (auto& s : state_)
             s = TileState::Undefined;
     }
@@ -176,7 +189,7 @@ public:
         return std::max(batchBytes, prefix + FinishedRecord(format, channels).mostBytes(pixels));
     }
 
-    // Room for a finished tile. write() it, then commit().
+    // Room for a finished tile. Write it, then commit().
     Place reserve(int tile)
     {
         Place place;
@@ -205,8 +218,8 @@ public:
         return place;
     }
 
-    // False if it comes too late, after flush().
-    bool commit(int tile, Place&& place)
+    // `writtenPixels`: the others, in the image, are what they were. False if it comes too late, after flush().
+    bool commit(int tile, Place&& place, std::int64_t writtenPixels)
     {
         if (!enabled())
             return true;
@@ -219,6 +232,7 @@ public:
             if (flushed_)
                 return false;
             placed_.push_back(tile);
+            placedPixels_ += writtenPixels;
             ++tilesSent_;
             return true; // and with `place` the writer leaves
         }
@@ -237,7 +251,7 @@ public:
                 batch_.reset();
             }
             if (!batch_) {
-                batch_ = std::make_shared<Batch>();
+                batch_ = takeSpare();
                 batch_->message = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
                 batch_->used = prefix;
             }
@@ -248,7 +262,7 @@ public:
             ++tilesSent_;
         }
         if (full)
-            sendBatch(*full);
+            sendBatch(std::move(full));
         record_.write(plan, record);
         bool isLast = false;
         {
@@ -256,7 +270,7 @@ public:
             isLast = --batch->writers == 0 && batch->closed;
         }
         if (isLast)
-            sendBatch(*batch);
+            sendBatch(std::move(batch));
         return true;
     }
 
@@ -267,7 +281,6 @@ public:
         if (!enabled() || !senders_[static_cast<std::size_t>(rank_)])
             return;
         std::shared_ptr<Batch> last;
-        std::vector<Buffer> held;
         Buffer done;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
@@ -280,7 +293,6 @@ public:
                     last = batch_;
                 batch_.reset();
             }
-            held.swap(held_);
             const MessageHeader header = messageHeader(MessageKind::TilesDone);
             done = pool_->acquire(sizeof header + sizeof tilesSent_ + sizeof(std::int32_t) * placed_.size());
             std::memcpy(done.data(), &header, sizeof header);
@@ -288,10 +300,10 @@ public:
             std::copy(placed_.begin(), placed_.end(),
                       reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof tilesSent_));
         }
-        for (Buffer& message : held)
+        for (Buffer& message : held_) // nobody else touches them any more
             send_(std::move(message));
         if (last)
-            sendBatch(*last);
+            sendBatch(std::move(last));
         send_(std::move(done));
     }
 
@@ -423,6 +435,11 @@ public:
         state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
         incomplete_.insert(tile);
     }
+    // The same: nothing has come for it in this frame.
+    bool hasNothing(int tile) const
+    {
+        return isDisplay_ && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+    }
     bool isComplete(int tile) const { return incomplete_.count(tile) == 0; }
 
     // The frame has failed: nothing in the image can be relied on.
@@ -449,7 +466,7 @@ private:
     struct BatchHeader {
         std::uint64_t rawBytes = 0;
         std::uint32_t codec = 0;
-        std::uint32_t reserved = 0;
+        std::uint32_t isTried = 0; // whether one was to be used
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
@@ -468,6 +485,7 @@ private:
     Place inImage(const Planes& planes, const Region& region) const
     {
         Place place;
+        place.imageEpoch = imageEpoch_;
         place.stride = static_cast<std::size_t>(layout_.width());
         const std::size_t first =
             static_cast<std::size_t>(region.y0) * place.stride + static_cast<std::size_t>(region.x0);
@@ -500,12 +518,29 @@ private:
         }
     }
 
-    void sendBatch(Batch& batch)
+    // Under mutex_.
+    std::shared_ptr<Batch> takeSpare()
+    {
+        if (spareBatches_.empty())
+            return std::make_shared<Batch>();
+        std::shared_ptr<Batch> batch = std::move(spareBatches_.back());
+        spareBatches_.pop_back();
+        return batch;
+    }
+
+    // Nobody else may have the batch any more.
+    void sendBatch(std::shared_ptr<Batch> batch)
     {
         BatchHeader h;
-        h.rawBytes = batch.used - prefix;
-        Buffer message = std::move(batch.message);
-        message.shrink(batch.used);
+        h.rawBytes = batch->used - prefix;
+        Buffer message = std::move(batch->message);
+        message.shrink(batch->used);
+        *batch = Batch();
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            spareBatches_.push_back(std::move(batch));
+        }
+        h.isTried = compresses_;
         if (compresses_) {
             Buffer packed = pool_->acquire(prefix + settings_.codec->bound(h.rawBytes));
             const std::size_t bytes =
@@ -553,21 +588,23 @@ private:
     OwnerOf ownerOf_;
     Send send_;
     const FinishedRecord record_;
-    std::int64_t frame_ = 0;
+    std::int64_t frame_ = 0, imageEpoch_ = 1;
     bool compresses_ = false;
 
     mutable std::mutex mutex_;
     std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
+    std::vector<std::shared_ptr<Batch>> spareBatches_;
     bool flushed_ = false;
-    std::vector<Buffer> held_;
+    std::vector<Buffer> held_; // does not change after flush()
     std::int64_t tilesSent_ = 0;
     SharedImage remote_;               // of the display rank, if this one sees it
     std::vector<std::int32_t> placed_; // tiles that are in it
+    std::int64_t placedPixels_ = 0;
 
     Image image_;
     Buffer gateMemory_;
     ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
-    std::array<float, 4> background_{};
+    std::array<float, 4> background_{}, lastBackground_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::set<int> incomplete_;                  // of the last frame
     std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};

@@ -55,6 +55,14 @@ public:
 
     // Of a pixel in a channel; 0 if the image does not have it.
     std::size_t pixelBytes(std::size_t channel) const noexcept { return pixelBytes_[channel]; }
+    // In all channels; a multiple of 4, as all are.
+    std::size_t pixelBytes() const noexcept
+    {
+        std::size_t bytes = 0;
+        for (const std::size_t each : pixelBytes_)
+            bytes += each;
+        return bytes;
+    }
     // Of a record with so many pixels, the most.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + planesBytes(pixels)); }
 
@@ -93,7 +101,7 @@ public:
             stored += findRuns(plan, y);
             plan.rowCounts_.push_back(static_cast<std::uint16_t>(plan.spans_.size() - before));
         }
-        const std::size_t bytes = alignedTo16(sizeof(Header) + fillerBytes() + planesBytes(stored)
+        const std::size_t bytes = alignedTo16(sizeof(Header) + pixelBytes() + planesBytes(stored)
                                               + tableBytes(plan.spans_.size(), plan.rowCounts_.size()));
         if (bytes < h.bytes && plan.spans_.size() <= 0xffff) {
             h.form = Form::Runs;
@@ -158,12 +166,12 @@ public:
             failMalformed("a finished tile with more or fewer pixels than it has", static_cast<std::int64_t>(pixels),
                           h.pixels);
         const std::size_t bytes =
-            alignedTo16(sizeof h + planesBytes(h.pixels) + (hasRuns ? fillerBytes() + tableBytes(h.spans, rows) : 0));
+            alignedTo16(sizeof h + planesBytes(h.pixels) + (hasRuns ? pixelBytes() + tableBytes(h.spans, rows) : 0));
         if (h.bytes != bytes || left < bytes)
             failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes),
                           static_cast<std::int64_t>(std::min<std::size_t>(h.bytes, left)));
         const std::byte* filler = in + sizeof h;
-        const std::byte* plane = filler + (hasRuns ? fillerBytes() : 0);
+        const std::byte* plane = filler + (hasRuns ? pixelBytes() : 0);
         const auto* spans = reinterpret_cast<const Span*>(plane + planesBytes(h.pixels));
         const auto* counts = reinterpret_cast<const std::uint16_t*>(spans + h.spans);
         if (hasRuns)
@@ -192,14 +200,7 @@ public:
 
 private:
     static std::size_t wordsOf(std::size_t channel) { return static_cast<std::size_t>(channelWords[channel]); }
-    std::size_t fillerBytes() const // of one pixel; a multiple of 4, as all are
-    {
-        std::size_t bytes = 0;
-        for (const std::size_t each : pixelBytes_)
-            bytes += each;
-        return bytes;
-    }
-    std::size_t planesBytes(std::size_t pixels) const { return fillerBytes() * pixels; }
+    std::size_t planesBytes(std::size_t pixels) const { return pixelBytes() * pixels; }
     static std::size_t tableBytes(std::size_t spans, std::size_t rows)
     {
         return sizeof(Span) * spans + sizeof(std::uint16_t) * rows;

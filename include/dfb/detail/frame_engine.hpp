@@ -2,10 +2,12 @@
 // layer, the declarations and the verdict into frames.
 #pragma once
 
+#include <dfb/comm/compression_gains.hpp>
 #include <dfb/comm/compression_trial.hpp>
 #include <dfb/comm/messaging.hpp>
 #include <dfb/detail/frame_figures.hpp>
 #include <dfb/detail/frame_gate.hpp>
+#include <dfb/detail/hidden_tiles.hpp>
 #include <dfb/detail/job_share.hpp>
 #include <dfb/detail/manifest.hpp>
 #include <dfb/detail/outcome.hpp>
@@ -55,6 +57,7 @@ public:
         messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
                                                             config_.messagePoolBytes, self);
         outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
+        gains_.emplace(config_.codec ? size() : 0);
         messaging_->start();
         Agreement mine;
         try {
@@ -148,8 +151,11 @@ public:
             userError = std::current_exception();
         }
         jobs_.newFrame();
+        if (OpaqueHides<TileOp>::value)
+            hidden_.newFrame(layout().tileCount());
         outcome_->newFrame();
         ownTilesDone_ = endCalled_ = false;
+        inputsSent_ = 0;
         bytesBefore_ = messaging_->bytesSent();
         messagesBefore_ = messaging_->messagesSent();
         renderNs_ = 0;
@@ -168,10 +174,12 @@ public:
         frameOpen_ = true;
         messaging_->newEpoch(info.frame);
         messaging_->messenger().expectMessages(true);
-        for (auto& early : gate_.open())
-            incoming(early.source, early.header, std::move(early.bytes));
+        auto& early = gate_.open();
         if (userError)
-            failWith(userError); // comes out of end(), on all ranks
+            failWhole(userError); // comes out of end(), on all ranks; nothing is made with half of the frame's data
+        for (FrameGate::Message& message : early)
+            incoming(message.source, message.header, std::move(message.bytes));
+        early.clear(); // some may still be there, if the frame has failed
         failForStray();
         for (const int tile : kept)
             if (gate_.enter(info.frame)) {
@@ -196,10 +204,14 @@ public:
         checkTile(tile, layout(), pipeline_->table().frameInfo(),
                   [this](int index) { return pipeline_->table().samples(index).count; });
         pipeline_->checkPlanes(tile);
-        if (outcome_->failed())
+        if (outcome_->failed() || isHidden(tile.tile, tile.generation))
             return;
         const int owner = tileOwner(tile.tile);
-        Buffer message = pipeline_->encode(tile, codecFor(owner));
+        const Codec* codec = codecFor(owner);
+        Buffer message = pipeline_->encode(tile, codec);
+        if (codec)
+            gains_->add(owner, rawFragmentBytes(message), message.size());
+        ++inputsSent_;
         if (owner != rank()) {
             messaging_->sendWithCredit(owner, std::move(message));
             waitForRoom();
@@ -210,6 +222,22 @@ public:
     }
 
     // See Frame.
+    bool isHidden(int tile, int generation) const { return generation >= hidden_.from(tile); }
+    template <class AnyTile>
+    bool hidesRest(const AnyTile& tile) const
+    {
+        return pipeline_->opaqueHides(tile.tile) && tile.isOpaque();
+    }
+    void hide(int tile, int generation, int other)
+    {
+        if (!pipeline_->opaqueHides(tile))
+            throw InvalidArgument("hide() with a tile operation or a frame to which everything counts");
+        if (other == rank())
+            hidden_.hide(tile, generation);
+        else
+            sendBody(other, MessageKind::Hidden, HiddenTiles::Message{tile, generation});
+    }
+
     void expectLayers(int layers) { pipeline_->setLayers(layers); }
     TileSamples samples(int tile) const { return pipeline_->table().samples(tile); }
 
@@ -258,16 +286,24 @@ public:
                                       + std::to_string(layout().tileCount()) + " tiles");
         if (outcome_->failed())
             return;
-        const auto manifests = manifests_.split(inputs, rank(), [this](int tile) { return tileOwner(tile); });
-        for (const auto& [owner, bytes] : manifests)
-            messaging_->send(owner, MessageKind::Manifest, gate_.frame(), bytes);
-        if (manifests.empty())
+        const bool sent = manifests_.split(
+            inputs, rank(), [this](int tile) { return tileOwner(tile); },
+            [this](int owner, const Bytes& manifest) {
+                messaging_->send(owner, MessageKind::Manifest, gate_.frame(), manifest);
+            });
+        if (!sent)
             enterAllDeclared();
     }
 
     std::any& declaredFrom() noexcept { return declaredFrom_; }
+    std::any& loopMemory() noexcept { return loopMemory_; }
 
-    void abort(const std::exception_ptr& reason) { failWith(reason); }
+    void abort(const std::exception_ptr& reason, int tile)
+    {
+        ErrorInfo where;
+        where.tile = tile;
+        failWith(reason, where);
+    }
 
     bool poll() { return messaging_->messenger().poll(); }
 
@@ -285,6 +321,7 @@ public:
         if (!verdict.error) {
             if (config_.codec)
                 compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
+            gains_->endFrame();
             lastKey_ = params_.declarationKey;
             lastAccumulationId_ = params_.accumulationId;
         }
@@ -314,9 +351,10 @@ public:
     void leave() noexcept
     {
         try {
-            const ErrorInfo info = cancelled("the frame was left without end()");
-            outcome_->fail(std::make_exception_ptr(Error(info)), {});
-            messaging_->flow().drop();
+            if (outcome_->failed())
+                dropRest();
+            else
+                failWhole(std::make_exception_ptr(Error(cancelled("the frame was left without end()"))));
             conclude();
         } catch (const TransportError&) {
             // begin() will say so.
@@ -329,19 +367,19 @@ public:
         return messaging_->allReduce(values, operation);
     }
 
-    std::vector<Bytes> allGather(const Bytes& own)
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
     {
         ByteWriter out; // of each rank: which it is, the size, the bytes
         out.put(static_cast<std::int32_t>(rank()));
         out.put(static_cast<std::uint64_t>(own.size()));
-        Bytes mine = out.take();
-        mine.insert(mine.end(), own.begin(), own.end());
+        Bytes mine = out.bytes();
+        mine.append(own.data(), own.data() + own.size());
         const Bytes all = messaging_->reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
             Bytes both = a;
-            both.insert(both.end(), b.begin(), b.end());
+            both.append(b.begin(), b.end());
             return both;
         });
-        std::vector<Bytes> result;
+        std::vector<std::vector<std::byte>> result;
         ByteReader in(all);
         for (int from = 0; from < size(); ++from) { // in order, as they were combined
             const auto whose = in.get<std::int32_t>();
@@ -370,8 +408,11 @@ private:
     // What messages with pixels to that rank are compressed with in this frame, or null.
     const Codec* codecFor(int other) const
     {
-        const bool isNear = config_.compression == CompressionMode::Auto && messaging_->messenger().isSeenBy(other);
-        return other == rank() || isNear || !compresses() ? nullptr : config_.codec.get();
+        if (other == rank() || !compresses())
+            return nullptr;
+        const bool isLeftOut = config_.compression == CompressionMode::Auto
+                               && (messaging_->messenger().isSeenBy(other) || !gains_->isWorthwhile(other));
+        return isLeftOut ? nullptr : config_.codec.get();
     }
 
     // ---- messages
@@ -439,9 +480,11 @@ private:
 
     void sendToDisplay(Buffer&& message)
     {
-        if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind))
+        if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
+            if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
+                gains_->add(config_.displayRank, raw, message.size());
             messaging_->sendWithCredit(config_.displayRank, std::move(message));
-        else
+        } else
             messaging_->send(config_.displayRank, std::move(message));
     }
 
@@ -549,6 +592,14 @@ private:
             sendBody(source, MessageKind::Jobs, jobs_.give(bodyAs<JobRequest>(message), size()));
             break;
         }
+        case MessageKind::Hidden: {
+            const auto body = bodyAs<HiddenTiles::Message>(message);
+            if (body.tile < 0 || body.tile >= layout().tileCount() || body.generation < 1
+                || !pipeline_->opaqueHides(body.tile))
+                failMalformed("word of hidden inputs of a tile that has none", layout().tileCount() - 1, body.tile);
+            hidden_.hide(body.tile, body.generation);
+            return;
+        }
         case MessageKind::Jobs:
             if (source != jobServer())
                 failMalformed("jobs from a rank that hands out none", jobServer(), source);
@@ -617,13 +668,14 @@ private:
     void arrive(Buffer&& message, int source)
     {
         ErrorInfo where;
-        guarded(
-            [&] {
-                const int ready = pipeline_->arrive(std::move(message), where);
-                if (ready >= 0)
-                    submitFinish(ready);
-            },
-            where, source);
+        typename TileTable<TileOp>::Arrival arrival;
+        guarded([&] { pipeline_->arrive(std::move(message), where, arrival); }, where, source);
+        if (arrival.spoilt) {
+            pipeline_->table().saidWhy();
+            tryVote();
+        }
+        if (arrival.ready)
+            guarded([&] { submitFinish(static_cast<int>(where.tile)); }, where);
     }
 
     void submitFinish(int tile)
@@ -678,14 +730,15 @@ private:
         // A pixel operation that is not pointwise sees background tiles too.
         const bool all = !IsPointwise<PixelOp>::value;
         ErrorInfo where;
-        guarded(
+        const bool declared = guarded(
             [&] {
                 pipeline_->table().declare(
                     manifests_.expected(), all, where, [this](int) { ++tilesLeft_; },
                     [this](int tile) { submitFinish(tile); });
-                tilesLess(countUnknown);
             },
             where);
+        if (declared || params_.allowPartial)
+            guarded([&] { tilesLess(countUnknown); });
     }
 
     // ---- failure, verdict, end
@@ -726,10 +779,17 @@ private:
     // False if this rank has voted.
     bool failWith(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
-        if (isBearable(reason)) {
-            outcome_->note(reason, where);
-            return true;
-        }
+        if (!isBearable(reason))
+            return failWhole(reason, where);
+        const bool inTime = outcome_->note(reason, where);
+        if (!inTime && !outcome_->failed())
+            gate_.countLate(); // the verdict will not say it
+        return inTime;
+    }
+
+    // The same where the frame can not go on, whether or not it may be partial.
+    bool failWhole(const std::exception_ptr& reason, const ErrorInfo& where = {})
+    {
         const bool inTime = outcome_->fail(reason, where);
         if (!inTime)
             gate_.countLate(); // too late to matter to this frame
@@ -794,31 +854,36 @@ private:
     // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
     void tryVote()
     {
-        outcome_->vote([this] { return endCalled_ && ownTilesDone_ && pipeline_->gather().complete(); },
-                       [this] {
-                           Verdict v;
-                           const std::int64_t repeated = messaging_->messenger().duplicates();
-                           v.paramsHash = fingerprintOf(params_);
-                           const auto reports = pipeline_->reports();
-                           v.sums = {messaging_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
-                                     messaging_->messagesSent() - messagesBefore_,
-                                     ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
-                                     pipeline_->nonFinitePixels(),
-                                     gate_.takeLateCount(),
-                                     repeated - repeatedBefore_,
-                                     reports.orderUndefinedPixels,
-                                     pipeline_->alphaOutsidePixels()};
-                           v.wireErrorBound = reports.wireErrorBound;
-                           v.tileErrors = FrameFigures::of(reports.errors);
-                           figures_.addTo(v);
-                           if (params_.allowPartial)
-                               v.incomplete = pipeline_->table().unfinished(params_.declared);
-                           repeatedBefore_ = repeated;
-                           v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
-                                       static_cast<std::int64_t>(messaging_->flow().peakInboxBytes()),
-                                       std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
-                           return v;
-                       });
+        outcome_->vote(
+            [this] {
+                return endCalled_ && ownTilesDone_ && pipeline_->table().isSaid() && pipeline_->gather().complete();
+            },
+            [this] {
+                Verdict v;
+                const std::int64_t repeated = messaging_->messenger().duplicates();
+                v.paramsHash = fingerprintOf(params_);
+                const auto reports = pipeline_->reports();
+                v.sums = {messaging_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
+                          messaging_->messagesSent() - messagesBefore_,
+                          ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
+                          pipeline_->nonFinitePixels(),
+                          gate_.takeLateCount(),
+                          repeated - repeatedBefore_,
+                          reports.orderUndefinedPixels,
+                          pipeline_->alphaOutsidePixels(),
+                          gains_->links(),
+                          HasIsComplete<TileOp>::value ? 0 : inputsSent_ - pipeline_->table().arrivedCount()};
+                v.wireErrorBound = reports.wireErrorBound;
+                v.tileErrors = FrameFigures::of(reports.errors);
+                figures_.addTo(v);
+                if (params_.allowPartial)
+                    v.incomplete = pipeline_->table().unfinished(params_.declared);
+                repeatedBefore_ = repeated;
+                v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
+                            static_cast<std::int64_t>(messaging_->flow().peakInboxBytes()),
+                            std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
+                return v;
+            });
     }
 
     void checkWire() const
@@ -863,6 +928,8 @@ private:
         try {
             tryVote();
             verdict = params_.timeoutMs > 0 ? waitInTime() : *outcome_->wait();
+            if (!verdict.error && verdict.sums[9] != 0)
+                verdict.error = Verdict::strayInputs(verdict.sums[9]);
             if (verdict.error && params_.allowPartial) // finished tiles may still be on their way
                 messaging_->wait([this] { return pipeline_->gather().complete(); },
                                  Clock::now() + std::chrono::milliseconds(params_.timeoutMs));
@@ -910,8 +977,9 @@ private:
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
     ManifestExchange manifests_;
-    std::any declaredFrom_; // see Frame
+    std::any declaredFrom_, loopMemory_; // see Frame
     JobShare jobs_;
+    HiddenTiles hidden_;
 
     // The frame.
     FrameGate gate_;
@@ -922,10 +990,12 @@ private:
     bool frameOpen_ = false, lastFailed_ = false;
     FrameFigures figures_;
     CompressionTrial compressionTrial_;
+    std::optional<CompressionGains> gains_; // per rank that this one sends to
     std::mutex strayMutex_;
     std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
+    std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};
     std::atomic<std::int64_t> renderNs_{0};
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;

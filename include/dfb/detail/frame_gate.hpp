@@ -23,7 +23,11 @@ public:
     };
 
     // Frames are numbered from `first`, every `step`.
-    explicit FrameGate(std::int64_t first = 1, std::int64_t step = 1) : frame_(first - step), step_(step) {}
+    explicit FrameGate(std::int64_t first = 1, std::int64_t step = 1) : frame_(first - step), step_(step)
+    {
+        for (std::vector<Message>* messages : {&early_, &opened_})
+            messages->reserve(256); // how many come early depends on time: mostly no more
+    }
 
     // The last frame that was opened; not positive before the first. And the one that comes next.
     std::int64_t frame() const noexcept { return frame_; }
@@ -31,13 +35,15 @@ public:
     void countLate() noexcept { ++late_; }
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
-    // Opens the next frame and returns the messages that came too early for it.
-    std::vector<Message> open()
+    // Opens the next frame and returns the messages that came too early for it, to be taken before the next open().
+    std::vector<Message>& open()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         frame_ += step_;
         open_ = true;
-        return std::move(early_);
+        opened_.clear();
+        opened_.swap(early_);
+        return opened_;
     }
 
     enum class Entry {
@@ -113,7 +119,7 @@ private:
     std::int64_t step_;
     bool open_ = false;
     int inside_ = 0;
-    std::vector<Message> early_;
+    std::vector<Message> early_, opened_; // for the next frame; for the one that is open
 };
 
 } // namespace dfb::detail

@@ -3,10 +3,10 @@
 #pragma once
 
 #include <dfb/comm/message.hpp>
+#include <dfb/detail/fifo.hpp>
 
 #include <algorithm>
 #include <cstdint>
-#include <deque>
 #include <mutex>
 #include <optional>
 
@@ -63,7 +63,7 @@ public:
             failMalformed("jobs that there are not", count_, range.end);
         asked_ = false;
         if (range.begin < range.end)
-            mine_.push_back(range);
+            mine_.push(range);
         else
             exhausted_ = true;
     }
@@ -78,13 +78,10 @@ public:
             const std::int64_t fixed = fixedPart(count);
             const JobRange share{fixed * rank / rankCount, fixed * (rank + 1) / rankCount};
             if (share.begin < share.end)
-                mine_.push_back(share);
+                mine_.push(share);
         }
-        if (!mine_.empty()) {
-            const JobRange range = mine_.front();
-            mine_.pop_front();
-            return range;
-        }
+        if (!mine_.empty())
+            return mine_.pop();
         return exhausted_ ? std::optional<JobRange>(JobRange{}) : std::nullopt;
     }
 
@@ -111,7 +108,7 @@ private:
     mutable std::mutex mutex_;
     std::int64_t next_ = -1; // to hand out; -1: nobody has asked yet
     std::int64_t handedOutOf_ = 0, count_ = 0;
-    std::deque<JobRange> mine_;
+    Fifo<JobRange> mine_;
     bool began_ = false, asked_ = false, exhausted_ = false;
 };
 

@@ -7,11 +7,10 @@
 
 #include <dfb/comm/byte_io.hpp>
 
+#include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <map>
 #include <mutex>
-#include <set>
 #include <utility>
 #include <vector>
 
@@ -30,11 +29,46 @@ namespace dfb::detail {
 
 // Something that will come for a tile.
 struct ExpectedInput {
+    int tile = 0;
     std::uint32_t source = 0;
     std::uint16_t part = 0;
     int rank = 0; // that has said so
 };
-using ExpectedInputs = std::map<int, std::vector<ExpectedInput>>; // per tile
+
+// All that will come, by tile.
+class ExpectedInputs {
+public:
+    struct Range {
+        const ExpectedInput *first = nullptr, *last = nullptr;
+        const ExpectedInput* begin() const noexcept { return first; }
+        const ExpectedInput* end() const noexcept { return last; }
+        bool empty() const noexcept { return first == last; }
+    };
+
+    void clear() { inputs_.clear(); }
+    void add(const ExpectedInput& input) { inputs_.push_back(input); }
+    // All have been added: from now on they can be looked up.
+    void sort()
+    {
+        std::sort(inputs_.begin(), inputs_.end(),
+                  [](const ExpectedInput& a, const ExpectedInput& b) { return a.tile < b.tile; });
+    }
+
+    auto begin() const noexcept { return inputs_.begin(); }
+    auto end() const noexcept { return inputs_.end(); }
+    Range of(int tile) const
+    {
+        const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), tile,
+                                            [](const ExpectedInput& input, int t) { return input.tile < t; });
+        auto last = first;
+        while (last != inputs_.end() && last->tile == tile)
+            ++last;
+        return {inputs_.data() + (first - inputs_.begin()), inputs_.data() + (last - inputs_.begin())};
+    }
+
+private:
+    std::vector<ExpectedInput> inputs_;
+};
 
 class ManifestExchange {
 public:
@@ -46,30 +80,40 @@ public:
         declared_ = isComplete_ = false;
     }
 
-    // What to send to whom, for the inputs of this rank. `ownerOf(tile)` gives the owner.
-    template <class OwnerOf>
-    std::map<int, std::vector<std::byte>> split(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf)
+    // For the inputs of this rank: calls send(owner, bytes) with what is to be sent to whom. `ownerOf(tile)` gives the
+    // owner. False if nothing is. By one thread at a time.
+    template <class OwnerOf, class Send>
+    bool split(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
     {
-        std::map<int, ByteWriter> writers;
-        std::lock_guard<std::mutex> lock(mutex_);
-        declared_ = true;
-        for (const TileInput& input : inputs) {
-            const int owner = ownerOf(input.tile);
-            if (owner == rank) {
-                expected_[input.tile].push_back({input.source, input.part, rank});
-                continue;
+        toSend_.clear();
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            declared_ = true;
+            for (std::size_t i = 0; i < inputs.size(); ++i) {
+                const TileInput& input = inputs[i];
+                const int owner = ownerOf(input.tile);
+                if (owner == rank)
+                    expected_.add({input.tile, input.source, input.part, rank});
+                else
+                    toSend_.emplace_back(owner, i);
             }
-            ByteWriter& out = writers[owner];
-            out.put(static_cast<std::int32_t>(input.tile));
-            out.put(input.source);
-            out.put(input.part);
+            std::sort(toSend_.begin(), toSend_.end());
+            for (const auto& [owner, input] : toSend_) // all of them, before the first can answer
+                if (acksMissing_.empty() || acksMissing_.back() != owner)
+                    acksMissing_.push_back(owner);
         }
-        std::map<int, std::vector<std::byte>> result;
-        for (auto& [owner, writer] : writers)
-            result.emplace(owner, writer.take());
-        for (const auto& [owner, manifest] : result)
-            acksMissing_.insert(owner);
-        return result;
+        for (std::size_t i = 0; i < toSend_.size();) {
+            const int owner = toSend_[i].first;
+            manifest_.clear();
+            for (; i < toSend_.size() && toSend_[i].first == owner; ++i) {
+                const TileInput& input = inputs[toSend_[i].second];
+                manifest_.put(static_cast<std::int32_t>(input.tile));
+                manifest_.put(input.source);
+                manifest_.put(input.part);
+            }
+            send(owner, manifest_.bytes());
+        }
+        return !toSend_.empty();
     }
 
     // The owner's side, with a manifest of rank `from`. Throws Error (MalformedMessage); `isMine(tile)` tells which
@@ -86,7 +130,7 @@ public:
             const auto part = in.get<std::uint16_t>();
             if (!isMine(tile))
                 fail("a manifest names a tile of another owner", tile, source);
-            expected_[tile].push_back({source, part, from});
+            expected_.add({tile, source, part, from});
         }
     }
 
@@ -94,8 +138,10 @@ public:
     bool acknowledged(int from)
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        if (acksMissing_.erase(from) == 0)
+        const auto place = std::find(acksMissing_.begin(), acksMissing_.end(), from);
+        if (place == acksMissing_.end())
             fail("an answer to a manifest that was not sent");
+        acksMissing_.erase(place);
         return acksMissing_.empty();
     }
 
@@ -103,7 +149,8 @@ public:
     void complete()
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        isComplete_ = true;
+        if (!std::exchange(isComplete_, true))
+            expected_.sort();
     }
 
     bool declared() const
@@ -128,8 +175,12 @@ private:
 
     mutable std::mutex mutex_;
     ExpectedInputs expected_;
-    std::set<int> acksMissing_; // of these owners
+    std::vector<int> acksMissing_; // of these owners
     bool declared_ = false, isComplete_ = false;
+
+    // Only split() uses them: to which owner which of the inputs goes, and what one owner is sent.
+    std::vector<std::pair<int, std::size_t>> toSend_;
+    ByteWriter manifest_;
 };
 
 } // namespace dfb::detail

@@ -62,8 +62,9 @@ public:
         return !late;
     }
 
-    // Something was lost, but the frame goes on: the verdict will say so.
-    void note(const std::exception_ptr& reason, const ErrorInfo& where)
+    // Something was lost, but the frame goes on: the verdict will say so. False if this rank has voted: then it will
+    // not.
+    bool note(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);
         info.rank = messaging_.rank();
@@ -71,6 +72,7 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         if (!error_)
             error_ = info;
+        return !voted_;
     }
 
     // Another rank says that it has failed, and why. vote() must follow.

@@ -74,21 +74,24 @@ public:
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
-    // `compresses`: whether finished tiles are compressed.
+    // `compresses`: whether finished tiles are compressed. Throws what user code throws: then all is ready but its
+    // data.
     void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses,
                   const typename FrameDataOf<TileOp>::type& tileData,
                   const typename FrameDataOf<PixelOp>::type& pixelData)
     {
         nonFinite_ = alphaOutside_ = 0;
         reports_ = {};
-        gather_.newFrame(info.frame, compresses);
+        gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
         info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
-        table_.newFrame(info, plan, tileData);
         background_ = info.background;
+        backgroundIsFine_ = true;
+        table_.newFrame(info, plan);
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.wire.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(maxLayers);
+        table_.setData(tileData);
         if constexpr (HasPixelNewFrame<PixelOp>::value)
             pixelOp_.newFrame(pixelData);
         else
@@ -119,6 +122,19 @@ public:
             if (tile.color && !planes.at[c] && hasChannel(travelling(config_), c))
                 throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without channel "
                                       + std::to_string(c) + ", which is needed");
+    }
+
+    // Whether inputs of a tile are hidden by an opaque one.
+    bool opaqueHides(int tile) const
+    {
+        if constexpr (OpaqueHides<TileOp>::value) {
+            TileInfo info = table_.frameInfo();
+            info.passes = table_.samples(tile).count;
+            return TileOp::opaqueHides(info);
+        } else {
+            (void)tile;
+            return false;
+        }
     }
 
     TileHeader headerOf(int index, int pass) const
@@ -154,9 +170,8 @@ public:
         return message;
     }
 
-    // Takes an input. Returns the tile if its inputs are now complete: call finish() for it, once; else -1. `where`
-    // gets what is known of the place when this throws Error.
-    int arrive(Buffer&& message, ErrorInfo& where)
+    // Takes an input. `where` gets what is known of the place: the tile. See TileTable::arrive() for the rest.
+    void arrive(Buffer&& message, ErrorInfo& where, typename TileTable<TileOp>::Arrival& arrival)
     {
         Fragment fragment = decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
@@ -177,12 +192,14 @@ public:
                           static_cast<std::int64_t>(fragment.colorFormat()));
         if (isLossy())
             losses_.add(fragment, coder_);
-        return table_.arrive(std::move(fragment)) ? tile : -1;
+        table_.arrive(std::move(fragment), arrival);
     }
 
     // Runs both operations on a complete tile and hands it on.
     void finish(int tile)
     {
+        if (table_.isSpoilt(tile))
+            return; // why has been said
         // The display rank knows how the background looks.
         if (EmptyIsBackground<TileOp>::value && IsPointwise<PixelOp>::value && !table_.hasPixels(tile)) {
             table_.setFinished(tile);
@@ -191,11 +208,13 @@ public:
         bool inTime = true;
         const FloatEnvironment floatEnvironment;
         const Region region = table_.layout().region(tile);
+        BackgroundPixels& background = table_.backgroundPixels(tile);
         if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {
             auto place = gather_.reserve(tile);
-            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither);
+            background.newFrame(region.width(), region.height(), place.imageEpoch);
+            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither, &background);
             table_.finish(tile, out);
-            inTime = gather_.commit(tile, std::move(place));
+            inTime = gather_.commit(tile, std::move(place), out.writtenPixels());
         } else {
             const auto width = static_cast<std::size_t>(region.width()),
                        height = static_cast<std::size_t>(region.height());
@@ -220,6 +239,7 @@ public:
                           idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
             std::as_const(pixelOp_).process(pixels);
             auto place = gather_.reserve(tile);
+            background.newFrame(region.width(), region.height(), 0);
             for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
                 const float* row = pixels.color + 4 * width * y;
                 std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format);
@@ -234,7 +254,7 @@ public:
                                     width * bytes);
                 }
             }
-            inTime = gather_.commit(tile, std::move(place));
+            inTime = gather_.commit(tile, std::move(place), static_cast<std::int64_t>(width * height));
         }
         if (inTime)
             table_.setFinished(tile);
@@ -273,7 +293,9 @@ public:
             pixel.region = {0, 0, 1, 1};
             pixel.color = background_.data();
             pixel.depth = config_.depth ? &depth : nullptr;
+            backgroundIsFine_ = false; // if it throws
             std::as_const(pixelOp_).process(pixel);
+            backgroundIsFine_ = true;
         }
     }
 
@@ -283,12 +305,16 @@ public:
         gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
     }
 
-    // The frame has ended without these tiles; on the display rank also without those that have not come.
+    // The frame has ended without these tiles; on the display rank also without those that have not come, and those
+    // that are background if that could not be made.
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
         for (int tile = 0; tile < table_.layout().tileCount(); ++tile)
-            if (gather_.isOnItsWay(tile, table_.owner(tile)))
+            if (gather_.isOnItsWay(tile, table_.owner(tile))
+                || (!backgroundIsFine_ && gather_.hasNothing(tile) && table_.samples(tile).count > 0))
                 tiles.push_back(tile);
+        std::sort(tiles.begin(), tiles.end()); // an owner may have said so already
+        tiles.erase(std::unique(tiles.begin(), tiles.end()), tiles.end());
         for (const std::int32_t tile : tiles)
             gather_.setIncomplete(tile);
     }
@@ -349,6 +375,7 @@ private:
     TileTable<TileOp> table_;
     FinalGather gather_;
     std::array<float, 4> background_{};
+    bool backgroundIsFine_ = true; // see finishBackground()
     const WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;

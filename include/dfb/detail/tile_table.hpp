@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/dependency_tracker.hpp>
+#include <dfb/detail/background_pixels.hpp>
 #include <dfb/detail/manifest.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/tile_layout.hpp>
@@ -13,6 +14,7 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -86,13 +88,23 @@ public:
     const TileInfo& frameInfo() const noexcept { return info_; }
 
     // `info` is what all tiles have in common. No other member may be running.
-    void newFrame(const TileInfo& info, const SamplePlan& plan, const FrameData& data)
+    void newFrame(const TileInfo& info, const SamplePlan& plan)
     {
         expected_ = nullptr;
         info_ = info;
         plan_ = plan;
-        data_ = data;
+        arrived_ = 0;
     }
+    // Belongs to it. Throws what copying throws.
+    void setData(const FrameData& data) { data_ = data; }
+
+    // Why the tile of an arrival is spoilt is known. Whether it is of all: before that the frame must not end.
+    void saidWhy() { --unsaid_; }
+    bool isSaid() const noexcept { return unsaid_ == 0; }
+
+    // How many inputs have come to tiles of this rank that nothing was wrong with. Where all tiles are complete, there
+    // were as many as all ranks have sent; else one too many has come before one that was meant.
+    std::int64_t arrivedCount() const noexcept { return arrived_; }
 
     // What a tile gets in this frame.
     TileSamples samples(int tile) const
@@ -100,53 +112,90 @@ public:
         return plan_ ? (*plan_)[static_cast<std::size_t>(tile)] : TileSamples{info_.firstSample, info_.passes};
     }
 
-    // Hands an input to its tile. True if the tile's inputs are now complete: call finish() once.
-    // Throws what the tracker and the op throw.
-    bool arrive(Fragment&& fragment)
+    struct Arrival {
+        bool ready = false;  // the tile's inputs are now complete: call finish() once
+        bool spoilt = false; // the tile is: call saidWhy() when it is known why
+    };
+
+    // Hands an input to its tile. Throws what the tracker and the op throw: then the tile is spoilt, and no more is
+    // waited for, so that both may be set in `arrival`.
+    void arrive(Fragment&& fragment, Arrival& arrival)
     {
         const TileHeader h = fragment.header();
         const std::lock_guard<std::mutex> lock(mutexOf(h.tile));
-        Slot& slot = slotFor(h.tile);
-        DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
-        tree.arrive(h.generation, h.source, h.part, h.children);
-        slot.touched = true;
-        if (slot.ready)
-            return false; // the op had enough
-        slot.hasPixels = slot.hasPixels || !fragment.empty();
-        slot.op.add(std::move(fragment));
-        bool enough = false;
-        if constexpr (HasIsComplete<TileOp>::value)
-            enough = slot.op.isComplete();
-        return becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
+        try {
+            Slot& slot = slotFor(h.tile);
+            DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
+            tree.arrive(h.generation, h.source, h.part, h.children);
+            slot.touched = true;
+            if (slot.ready) {
+                ++arrived_;
+                return; // the op had enough
+            }
+            slot.hasPixels = slot.hasPixels || !fragment.empty();
+            slot.op.add(std::move(fragment));
+            bool enough = false;
+            if constexpr (HasIsComplete<TileOp>::value)
+                enough = slot.op.isComplete();
+            arrival.ready = becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
+            ++arrived_;
+        } catch (...) {
+            if (const auto& slot = slotOf(h.tile)) {
+                slot->spoilt = arrival.spoilt = true;
+                ++unsaid_; // before declare() can see it
+                arrival.ready =
+                    becomesReady(*slot, slot->counted || !expected_); // else declare() will see it, or nobody waits
+            }
+            throw;
+        }
     }
 
     // What will come for each tile, in each pass; nothing for a tile that is not named. Calls `ready(tile)` for those
     // whose inputs are already all there, and before that `counted(tile)` for each tile that is waited for. `all`: also
-    // for the tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker
-    // throws; `where` then names the tile.
+    // for the tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker and
+    // the op throw, when all tiles have been counted; `where` then names the first one that is spoilt by it.
     template <class Counted, class Ready>
     void declare(const ExpectedInputs& expected, bool all, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {
         expected_ = &expected; // from now on slotFor() knows
+        std::exception_ptr failure;
         for (std::size_t i = 0; i < owned_.size(); ++i) {
-            const auto inputs = expected.find(owned_[i]);
-            const bool named = inputs != expected.end();
+            const ExpectedInputs::Range inputs = expected.of(owned_[i]);
+            const bool named = !inputs.empty();
             bool complete = false;
-            where.tile = owned_[i];
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
                 const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
                 if ((!named && !all && !touched) || samples(owned_[i]).count == 0)
                     continue;
-                Slot& slot = slotFor(owned_[i]);
-                if (!slot.declared)
-                    declareSlot(slot, named ? &inputs->second : nullptr);
-                complete = becomesReady(slot, allComplete(slot));
+                try {
+                    Slot& slot = slotFor(owned_[i]);
+                    if (!slot.declared)
+                        declareSlot(slot, inputs);
+                } catch (...) {
+                    if (!slots_[i])
+                        throw;
+                    slots_[i]->spoilt = true;
+                    if (!failure)
+                        where.tile = owned_[i];
+                    failure = failure ? failure : std::current_exception();
+                }
+                slots_[i]->counted = true;
+                complete = becomesReady(*slots_[i], slots_[i]->spoilt || allComplete(*slots_[i]));
             }
             counted(owned_[i]);
             if (complete)
                 ready(owned_[i]);
         }
+        if (failure)
+            std::rethrow_exception(failure);
+    }
+
+    // Something was wrong with its inputs: it is not to be finished. The tile must be complete.
+    bool isSpoilt(int tile)
+    {
+        const std::lock_guard<std::mutex> lock(mutexOf(tile));
+        return slotFor(tile).spoilt;
     }
 
     // Whether any input had a pixel. The tile must be complete.
@@ -155,6 +204,9 @@ public:
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
 
+    // Of the tile's place in the image; for whoever finishes it.
+    BackgroundPixels& backgroundPixels(int tile) { return slotFor(tile).background; }
+
     // A complete tile has been finished, and is on its way.
     void setFinished(int tile)
     {
@@ -162,7 +214,8 @@ public:
         slotFor(tile).finished = true;
     }
 
-    // The tiles of this rank that are to be finished in this frame and are not. `declared`: see missing().
+    // The tiles of this rank that are to be finished in this frame and are not, or are spoilt. `declared`: see
+    // missing().
     std::vector<std::int32_t> unfinished(bool declared)
     {
         std::vector<std::int32_t> tiles;
@@ -171,8 +224,8 @@ public:
             const int tile = owned_[i];
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-            const bool isBackground = declared && expected && !expected->count(tile);
-            if (touched ? !slots_[i]->finished && !(isBackground && !slots_[i]->touched)
+            const bool isBackground = declared && expected && expected->of(tile).empty();
+            if (touched ? slots_[i]->spoilt || (!slots_[i]->finished && (!isBackground || slots_[i]->counted))
                         : !isBackground && samples(tile).count > 0)
                 tiles.push_back(tile);
         }
@@ -198,13 +251,10 @@ public:
         std::string text;
         for (std::size_t i = 0; i < owned_.size(); ++i) {
             const int tile = owned_[i];
-            const std::vector<ExpectedInput>* inputs = nullptr;
-            if (expected)
-                if (const auto named = expected->find(tile); named != expected->end())
-                    inputs = &named->second;
+            const ExpectedInputs::Range inputs = expected ? expected->of(tile) : ExpectedInputs::Range{};
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-            if (touched ? slots_[i]->ready : (declared && !inputs) || samples(tile).count == 0)
+            if (touched ? slots_[i]->ready : (declared && inputs.empty()) || samples(tile).count == 0)
                 continue;
             const DependencyTracker untouched;
             for (int pass = 0; pass < samples(tile).count; ++pass) {
@@ -251,64 +301,76 @@ private:
     struct Slot {
         std::int64_t frame = -1;
         bool ready = false, touched = false, declared = false, hasPixels = false, finished = false;
-        std::vector<DependencyTracker> trees; // one per pass
+        bool spoilt = false;  // an input has contradicted the others, or the op can not do with it; also if finished
+        bool counted = false; // by declare()
+        std::vector<DependencyTracker> trees;                       // one per pass
+        std::vector<std::pair<std::uint32_t, std::uint16_t>> names; // of the inputs that were declared
         TileOp op;
+        BackgroundPixels background;
     };
 
     std::mutex& mutexOf(int tile) { return mutexes_[static_cast<std::size_t>(tile) % mutexes_.size()]; }
 
+    std::unique_ptr<Slot>& slotOf(int tile)
+    {
+        return slots_[static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)])];
+    }
+
+    // Of this frame. Throws what the op's newFrame() throws, the first time: then the tile is spoilt.
     Slot& slotFor(int tile)
     {
-        auto& slot = slots_[static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)])];
+        auto& slot = slotOf(tile);
         if (!slot)
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
             slot->frame = info_.frame;
             slot->ready = slot->touched = slot->declared = slot->hasPixels = slot->finished = false;
+            slot->spoilt = slot->counted = false;
             slot->trees.resize(static_cast<std::size_t>(samples(tile).count));
             for (DependencyTracker& tree : slot->trees)
                 tree.reset();
+            const ExpectedInputs* expected = expected_;
+            if (expected && expected->of(tile).empty())
+                declareSlot(*slot, {});
             TileInfo info = info_;
             info.tile = tile;
             info.region = layout_.region(tile);
             info.passes = samples(tile).count;
             info.firstSample = samples(tile).first;
-            if constexpr (HasNewFrameWithData<TileOp>::value)
-                slot->op.newFrame(info, data_);
-            else
-                slot->op.newFrame(info);
-            const ExpectedInputs* expected = expected_;
-            if (expected && !expected->count(tile))
-                declareSlot(*slot, nullptr);
+            try {
+                if constexpr (HasNewFrameWithData<TileOp>::value)
+                    slot->op.newFrame(info, data_);
+                else
+                    slot->op.newFrame(info);
+            } catch (...) {
+                slot->spoilt = true; // the op is of no use in this frame
+                throw;
+            }
         }
         return *slot;
     }
 
-    // `inputs`: null where none will come.
-    static void declareSlot(Slot& slot, const std::vector<ExpectedInput>* inputs)
+    static void declareSlot(Slot& slot, const ExpectedInputs::Range& inputs)
     {
         slot.declared = true;
-        static thread_local std::vector<std::pair<std::uint32_t, std::uint16_t>> names;
-        names.clear();
-        if (inputs)
-            for (const ExpectedInput& input : *inputs)
-                names.emplace_back(input.source, input.part);
+        slot.names.clear();
+        for (const ExpectedInput& input : inputs)
+            slot.names.emplace_back(input.source, input.part);
         for (DependencyTracker& tree : slot.trees)
-            tree.declare(names);
+            tree.declare(slot.names);
     }
 
     // In words: which of the inputs are missing, and from whom.
-    static std::string namesOf(const DependencyTracker::Missing& missing, const std::vector<ExpectedInput>* expected)
+    static std::string namesOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
     {
         std::string text;
         for (const auto& [source, part] : missing.inputs) {
             text += (text.empty() ? "; missing source " : ", ") + std::to_string(source);
             if (part > 0)
                 text += " part " + std::to_string(part);
-            if (expected)
-                for (const ExpectedInput& input : *expected)
-                    if (input.source == source && input.part == part)
-                        text += " of rank " + std::to_string(input.rank);
+            for (const ExpectedInput& input : expected)
+                if (input.source == source && input.part == part)
+                    text += " of rank " + std::to_string(input.rank);
         }
         return text;
     }
@@ -337,7 +399,9 @@ private:
     std::array<std::mutex, 64> mutexes_;
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;
-    SamplePlan plan_; // null: all tiles as info_ says
+    std::atomic<std::int64_t> arrived_{0};
+    std::atomic<int> unsaid_{0}; // spoilt tiles of which it is not known yet why
+    SamplePlan plan_;            // null: all tiles as info_ says
     FrameData data_{};
 };
 

@@ -84,8 +84,8 @@ struct Verdict {
     std::optional<ErrorInfo> error;
     std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
     // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
-    // pixels with alpha outside [0, 1].
-    std::array<std::int64_t, 8> sums{};
+    // pixels with alpha outside [0, 1], compressed links, inputs that were sent without those that have come.
+    std::array<std::int64_t, 10> sums{};
     // Peak memory in bytes, rendering in ns, peak of the inbox in bytes, ns from begin() until all is done here.
     std::array<std::int64_t, 4> maxima{};
     double wireErrorBound = 0;            // a maximum
@@ -94,7 +94,7 @@ struct Verdict {
     std::vector<Figure> mergeErrors;      // by tile; sums
     std::vector<std::int32_t> incomplete; // tiles that their owners have not finished, of a frame that may be partial
 
-    std::vector<std::byte> bytes() const
+    SmallBytes bytes() const
     {
         ByteWriter out;
         out.put(static_cast<std::uint8_t>(error.has_value()));
@@ -112,10 +112,10 @@ struct Verdict {
         out.put(static_cast<std::uint32_t>(incomplete.size()));
         for (const std::int32_t tile : incomplete)
             out.put(tile);
-        return out.take();
+        return out.bytes();
     }
 
-    static Verdict from(const std::vector<std::byte>& bytes)
+    static Verdict from(const SmallBytes& bytes)
     {
         ByteReader in(bytes);
         Verdict v;
@@ -163,6 +163,7 @@ struct Verdict {
         report.peakInboxBytes = maxima[2];
         report.orderUndefinedPixels = sums[6];
         report.alphaOutsidePixels = sums[7];
+        report.compressedLinks = sums[8];
         report.wireErrorBound = wireErrorBound;
         report.mergeErrorBound = 0;
         for (const Figure& f : mergeErrors)
@@ -208,6 +209,17 @@ struct Verdict {
         return info;
     }
 
+    // An input that its owner did not wait for, and that came too late, may have had its place taken by another.
+    static ErrorInfo strayInputs(std::int64_t count)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::Disagreement;
+        info.expected = 0;
+        info.got = count;
+        info.message = "more inputs were sent than had been announced: so many came when their tiles were finished";
+        return info;
+    }
+
     // How much an error says about why the frame failed.
     static int weight(const ErrorInfo& e)
     {
@@ -228,7 +240,7 @@ struct Verdict {
         return info;
     }
 
-    static std::vector<std::byte> combine(const std::vector<std::byte>& first, const std::vector<std::byte>& second)
+    static SmallBytes combine(const SmallBytes& first, const SmallBytes& second)
     {
         Verdict a = from(first);
         const Verdict b = from(second);
@@ -288,16 +300,16 @@ struct Agreement {
                 rank};
     }
 
-    std::vector<std::byte> bytes() const
+    SmallBytes bytes() const
     {
         ByteWriter out;
         out.put(static_cast<std::uint8_t>(fine));
         out.put(static_cast<std::int32_t>(rank));
         out.putText(text);
-        return out.take();
+        return out.bytes();
     }
 
-    static Agreement from(const std::vector<std::byte>& bytes)
+    static Agreement from(const SmallBytes& bytes)
     {
         ByteReader in(bytes);
         Agreement a;
@@ -310,7 +322,7 @@ struct Agreement {
         return a;
     }
 
-    static std::vector<std::byte> combine(const std::vector<std::byte>& first, const std::vector<std::byte>& second)
+    static SmallBytes combine(const SmallBytes& first, const SmallBytes& second)
     {
         const Agreement a = from(first), b = from(second);
         if (!a.fine || (b.fine && a.text == b.text))

@@ -232,6 +232,12 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     return message;
 }
 
+// Of a fragment message that encodeFragment() has made, what it had without a codec.
+inline std::size_t rawFragmentBytes(const Buffer& message)
+{
+    return fragmentPrefix + loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader)).rawPayloadBytes;
+}
+
 // Where the planes of `pixels` pixels are that start at `data`.
 inline ConstPlanes planesAt(const std::byte* data, ChannelMask channels, std::size_t pixels)
 {

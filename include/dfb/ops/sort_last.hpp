@@ -123,6 +123,14 @@ public:
             fragments_.push_back(std::move(fragment));
     }
 
+    // Forgets what is behind a generation.
+    void removeBehind(int generation)
+    {
+        fragments_.erase(std::remove_if(fragments_.begin(), fragments_.end(),
+                                        [&](const Fragment& f) { return f.header().generation > generation; }),
+                         fragments_.end());
+    }
+
     // Calls passDone(y, pass, row) for each row and pass, row by row, with the background below.
     template <class PassDone>
     void compositePasses(const PassDone& passDone)
@@ -182,6 +190,13 @@ private:
         std::vector<std::uint8_t> isUndefined;
     };
 
+    struct Exact {
+        std::vector<DoubleDouble> mean;
+        CompositeRow row;
+        std::vector<const Fragment*> pointers;
+        FragmentCompositor compositor{Rule};
+    };
+
     // Brings the fragments into their order, and a compositor for each pass to their first row.
     Scratch& start()
     {
@@ -205,7 +220,7 @@ private:
             scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
         }
         scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
-        scratch.row.wantsGaps = true;
+        scratch.row.wantsGaps = scratch.row.wantsSingles = true;
         scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
         scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
         scratch.row.resize(info_.region.width(), tracked_);
@@ -218,6 +233,7 @@ private:
         Scratch& scratch = start();
         CompositeRow& row = scratch.row;
         row.wantsGaps = false;
+        row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are what comes out
         std::array<std::byte, 16> background;
         if (out.format() != OutputFormat::None)
             convertPixels(info_.background.data(), 1, out.format(), background.data());
@@ -225,12 +241,16 @@ private:
             scratch.compositors.front().nextRow(row);
             int x = 0;
             double farthest = 0;
-            for (const Span& run : scratch.compositors.front().runs()) {
+            for (const auto& run : scratch.compositors.front().runs()) {
                 out.fillPixels(x, y, run.x - x, background.data());
+                x = run.x + run.count;
+                if (run.color) {
+                    out.setPixels(run.x, y, run.count, run.color);
+                    continue;
+                }
                 overBackground(row, run.x, run.count, info_.background.data());
                 farthest = std::max(farthest, out.setPixels(run.x, y, run.count, row.rgba.data() + 4 * run.x,
                                                             row.depth.data() + (row.wantsDepth ? run.x : 0)));
-                x = run.x + run.count;
             }
             out.fillPixels(x, y, out.width() - x, background.data());
             roundExactly(out, y, farthest);
@@ -245,7 +265,7 @@ private:
         const double layers = static_cast<double>(fragments_.size()) + info_.passes;
         if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
             return;
-        const std::vector<DoubleDouble> exact = exactRow(y);
+        const std::vector<DoubleDouble>& exact = exactRow(y);
         const int step = out.isDithered() ? 4 : 1; // then of alpha alone
         for (int i = step - 1; i < 4 * out.width(); i += step) {
             const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
@@ -253,15 +273,14 @@ private:
         }
     }
 
-    // Row y in twice the precision, the mean of the passes.
-    std::vector<DoubleDouble> exactRow(int y)
+    // Row y in twice the precision, the mean of the passes. Holds until the thread's next call.
+    const std::vector<DoubleDouble>& exactRow(int y)
     {
         const int width = info_.region.width();
-        std::vector<DoubleDouble> mean(4 * static_cast<std::size_t>(width));
-        CompositeRow row;
+        static thread_local Exact scratch;
+        auto& [mean, row, pointers, compositor] = scratch;
+        mean.assign(4 * static_cast<std::size_t>(width), {});
         row.minTransmittance = static_cast<double>(info_.minTransmittance);
-        std::vector<const Fragment*> pointers;
-        FragmentCompositor compositor(Rule);
         for (int pass = 0; pass < info_.passes; ++pass) {
             pointers.clear();
             for (const Fragment& fragment : fragments_)
@@ -329,18 +348,54 @@ public:
 // right for all pixels of a tile. Nothing is sorted, and no depth travels unless the image has it. The tree is a list:
 // each input announces 1 child but the last, which announces none; a tile without any has one empty input of generation
 // 0. See renderOrdered().
+//
+// Of a tile of one pass that has no more than a colour, what is behind an opaque input does not count, nor does the
+// tile wait for it.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
     static constexpr ChannelMask neededChannels = colorChannel;
+
+    static bool opaqueHides(const TileInfo& info)
+    {
+        return info.passes == 1 && (info.wanted & ~colorChannel) == 0 && (Channels & farChannel) == 0;
+    }
+
+    void newFrame(const TileInfo& info)
+    {
+        detail::SortLast<BlendRule::InOrder, TileSize, Channels>::newFrame(info);
+        generations_.clear();
+        opaque_ = none;
+    }
 
     void add(Fragment&& fragment)
     {
         if (fragment.header().children > 1)
             throw InvalidArgument("inputs in order form a list: at most 1 child each, not "
                                   + std::to_string(fragment.header().children));
+        const int generation = fragment.header().generation;
+        generations_.push_back(generation);
+        if (generation > opaque_)
+            return;
+        if (opaqueHides(this->store_.info()) && fragment.isOpaque()) {
+            opaque_ = generation;
+            this->store_.removeBehind(generation);
+        }
         this->store_.add(std::move(fragment));
     }
+
+    // Whether all is there that can be seen, because of an opaque input.
+    bool isComplete() const
+    {
+        return opaque_ != none && std::count_if(generations_.begin(), generations_.end(), [this](int g) {
+                                      return g < opaque_;
+                                  }) == opaque_;
+    }
+
+private:
+    static constexpr int none = std::numeric_limits<int>::max();
+    std::vector<int> generations_; // that have come
+    int opaque_ = none;            // the first that is
 };
 
 // Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry; what is behind it is not

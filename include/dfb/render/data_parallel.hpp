@@ -11,6 +11,13 @@
 
 namespace dfb {
 
+namespace detail {
+
+struct DataParallelWork : OwnBricks {
+};
+
+} // namespace detail
+
 // Renders all bricks of `world` into the tiles that they may project to, and returns the frame, which is to be ended;
 // every brick must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once,
 // for each pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
@@ -25,9 +32,11 @@ template <class FrameBuffer, class Camera, class RenderBrick>
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    const auto& pairs = detail::foundOnce(frame, [&] { return visibleTiles(world, camera, fb.layout()); });
+    const auto& work =
+        detail::workOf<detail::DataParallelWork>(frame, [&](auto& w) { w.find(world, camera, fb.layout()); });
+    const std::vector<BrickInTile>& pairs = work.pairs;
     if (frame.wantsDeclaration())
-        frame.declare(inputsOf(world, pairs));
+        frame.declare(work.inputs);
     const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {

@@ -23,6 +23,13 @@ template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
+namespace detail {
+
+struct DeepParallelWork : OwnBricks {
+};
+
+} // namespace detail
+
 // As startDataParallel(), with the bounds of bricks enclosing what they have; they may overlap.
 // `renderBrick(brick, deep)` adds the segments of the pixels of deep.header().region to the empty DeepTile, of which
 // each pixel keeps `maxSegments` at most. FrameReport::mergeErrorBound is how much that may have changed a pixel. The
@@ -38,9 +45,11 @@ template <class FrameBuffer, class Camera, class RenderBrick>
         throw InvalidArgument("a pixel has 1 to 65535 segments");
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    const auto& pairs = detail::foundOnce(frame, [&] { return visibleTiles(world, camera, fb.layout()); });
+    const auto& work =
+        detail::workOf<detail::DeepParallelWork>(frame, [&](auto& w) { w.find(world, camera, fb.layout()); });
+    const std::vector<BrickInTile>& pairs = work.pairs;
     if (frame.wantsDeclaration())
-        frame.declare(inputsOf(world, pairs));
+        frame.declare(work.inputs);
     const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
     std::mutex mutex;
     std::vector<std::unique_ptr<DeepTile>> spare;

@@ -167,38 +167,52 @@ struct HasPlan<Owner, std::void_t<decltype(std::declval<Owner&>().plan(std::decl
     : std::true_type {
 };
 
-// What this rank has to do of a mixed-parallel frame.
 struct MixedJob {
     std::size_t pair = 0;
     int pass = 0;
 };
 
-// The most bricks that meet in a tile.
-inline int mostPerTile(const std::vector<BrickInTile>& pairs, int tileCount)
-{
-    std::vector<int> counts(static_cast<std::size_t>(tileCount), 0);
-    int most = 1;
-    for (const BrickInTile& pair : pairs)
-        most = std::max(most, ++counts[static_cast<std::size_t>(pair.tile)]);
-    return most;
-}
+// What there is to do in a mixed-parallel frame: the pairs hold as long as a declaration, the rest for one frame.
+struct MixedWork {
+    std::vector<BrickInTile> pairs;
+    std::vector<int> passes;       // of each pair
+    std::vector<MixedJob> jobs;    // of this rank
+    std::vector<int> perTile;      // pairs
+    std::vector<TileInput> inputs; // that this rank declares
 
-template <class Frame, class Owner>
-std::vector<MixedJob> mixedJobs(const Frame& frame, const SharedWorld& world, const std::vector<BrickInTile>& pairs,
-                                Owner& owner)
-{
-    std::vector<int> passes;
-    for (const BrickInTile& pair : pairs)
-        passes.push_back(frame.samples(pair.tile).count);
-    if constexpr (HasPlan<Owner>::value)
-        owner.plan(world, pairs, passes);
-    std::vector<MixedJob> jobs;
-    for (std::size_t p = 0; p < pairs.size(); ++p)
-        for (int pass = 0; pass < passes[p]; ++pass)
-            if (owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], pairs[p].tile, pass) == world.rank())
-                jobs.push_back({p, pass});
-    return jobs;
-}
+    // The most bricks that meet in a tile.
+    int mostPerTile(int tileCount)
+    {
+        perTile.assign(static_cast<std::size_t>(tileCount), 0);
+        int most = 1;
+        for (const BrickInTile& pair : pairs)
+            most = std::max(most, ++perTile[static_cast<std::size_t>(pair.tile)]);
+        return most;
+    }
+
+    template <class Frame, class Owner>
+    void findJobs(const Frame& frame, const SharedWorld& world, Owner& owner)
+    {
+        passes.clear();
+        for (const BrickInTile& pair : pairs)
+            passes.push_back(frame.samples(pair.tile).count);
+        if constexpr (HasPlan<Owner>::value)
+            owner.plan(world, pairs, passes);
+        jobs.clear();
+        for (std::size_t p = 0; p < pairs.size(); ++p)
+            for (int pass = 0; pass < passes[p]; ++pass)
+                if (owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], pairs[p].tile, pass)
+                    == world.rank())
+                    jobs.push_back({p, pass});
+    }
+};
+
+// The same in a known order.
+struct OrderedWork : MixedWork {
+    std::vector<int> place;     // of each brick, from the front
+    std::vector<int> firstPair; // of each tile, or -1
+    std::vector<int> empty;     // tiles of this rank
+};
 
 // Calls renderBrick, and takes note of the cost for an owner that plans.
 template <class Owner, class Frame, class RenderBrick, class Tile>
@@ -219,6 +233,22 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
     }
 }
 
+// Lets those know who render what is behind a pair, which is opaque.
+template <class Frame, class Owner>
+void hideBehind(const Frame& frame, const SharedWorld& world, const std::vector<BrickInTile>& pairs, std::size_t opaque,
+                int generation, Owner& owner)
+{
+    const int tile = pairs[opaque].tile;
+    std::vector<int> told;
+    for (std::size_t p = opaque + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
+        const int rank = owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], tile, 0);
+        if (std::find(told.begin(), told.end(), rank) != told.end())
+            continue;
+        frame.hide(tile, generation + 1, rank);
+        told.push_back(rank);
+    }
+}
+
 } // namespace detail
 
 // As startDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says which of them
@@ -235,17 +265,20 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.guard([&] {
-        const auto& pairs = detail::foundOnce(frame, [&] { return visibleTiles(world, camera, fb.layout()); });
-        frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
-        const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
+        auto& work = detail::workOf<detail::MixedWork>(
+            frame, [&](auto& w) { detail::findVisibleTiles(world, camera, fb.layout(), w.pairs); });
+        const std::vector<BrickInTile>& pairs = work.pairs;
+        const std::vector<detail::MixedJob>& jobs = work.jobs;
+        frame.expectLayers(work.mostPerTile(fb.layout().tileCount()));
+        work.findJobs(frame, world, owner);
         if (frame.wantsDeclaration()) {
             // The tile, whoever renders it, is declared by the first of those that hold the brick.
-            std::vector<TileInput> inputs;
+            work.inputs.clear();
             for (const BrickInTile& pair : pairs)
                 if (const SharedBrick& b = world.bricks()[static_cast<std::size_t>(pair.brick)];
                     b.ranks.front() == fb.rank())
-                    inputs.push_back({pair.tile, b.brick.id, 0});
-            frame.declare(inputs);
+                    work.inputs.push_back({pair.tile, b.brick.id, 0});
+            frame.declare(work.inputs);
         }
         loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
             const BrickInTile& pair = pairs[jobs[i].pair];
@@ -272,7 +305,8 @@ FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const
 
 // The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
 // visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
-// manifest. Only where one order is right for all rays of a frame: not with an extended lens or several eyes.
+// manifest. What an opaque tile hides is not sent, nor rendered by those who have heard of it in time. Only where one
+// order is right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
 [[nodiscard]] typename FrameBuffer::Frame startOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                                                        const std::vector<int>& order, TileBrickOwner& owner,
@@ -285,23 +319,27 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
     loop.guard([&] {
-        std::vector<int> place(world.bricks().size(), -1);
+        auto& work = detail::workOf<detail::OrderedWork>(
+            frame, [&](auto& w) { detail::findVisibleTiles(world, camera, fb.layout(), w.pairs); });
+        std::vector<BrickInTile>& pairs = work.pairs;
+        const std::vector<detail::MixedJob>& jobs = work.jobs;
+        std::vector<int>&place = work.place, &firstPair = work.firstPair, &empty = work.empty;
+        place.assign(world.bricks().size(), -1);
         for (std::size_t i = 0; i < order.size(); ++i)
             place.at(static_cast<std::size_t>(order[i])) = static_cast<int>(i);
         if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
             throw InvalidArgument("the order does not have each brick once");
-        std::vector<BrickInTile> pairs = visibleTiles(world, camera, fb.layout());
         std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
             return a.tile != b.tile
                        ? a.tile < b.tile
                        : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
         });
-        const std::vector<detail::MixedJob> jobs = detail::mixedJobs(frame, world, pairs, owner);
-        frame.expectLayers(detail::mostPerTile(pairs, fb.layout().tileCount()));
-        std::vector<int> firstPair(static_cast<std::size_t>(fb.layout().tileCount()), -1);
+        work.findJobs(frame, world, owner);
+        frame.expectLayers(work.mostPerTile(fb.layout().tileCount()));
+        firstPair.assign(static_cast<std::size_t>(fb.layout().tileCount()), -1);
         for (std::size_t p = pairs.size(); p-- > 0;)
             firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
-        std::vector<int> empty; // tiles of this rank
+        empty.clear();
         for (const int tile : fb.ownedTiles())
             if (firstPair[static_cast<std::size_t>(tile)] < 0)
                 empty.push_back(tile);
@@ -314,12 +352,17 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
         loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
             const BrickInTile& pair = pairs[jobs[i].pair];
             const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+            const int generation = static_cast<int>(jobs[i].pair) - firstPair[static_cast<std::size_t>(pair.tile)];
+            if (frame.isHidden(pair.tile, generation))
+                return;
             frame.start(tile, pair.tile, jobs[i].pass);
-            tile.generation = static_cast<int>(jobs[i].pair) - firstPair[static_cast<std::size_t>(pair.tile)];
+            tile.generation = generation;
             tile.children = jobs[i].pair + 1 < pairs.size() && pairs[jobs[i].pair + 1].tile == pair.tile;
             tile.source = brick.id;
             detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
             frame.setTile(tile);
+            if (tile.children > 0 && frame.hidesRest(tile))
+                detail::hideBehind(frame, world, pairs, jobs[i].pair, generation, owner);
         });
     });
     return frame;

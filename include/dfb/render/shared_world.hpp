@@ -75,14 +75,26 @@ private:
     std::vector<SharedBrick> bricks_;
 };
 
+namespace detail {
+
+template <class Camera>
+void findVisibleTiles(const SharedWorld& world, const Camera& camera, const TileLayout& layout,
+                      std::vector<BrickInTile>& result)
+{
+    findVisibleTiles(
+        world.bricks().size(), [&](std::size_t b) -> const Box3& { return world.bricks()[b].brick.bounds; }, camera,
+        layout, result);
+}
+
+} // namespace detail
+
 // All pairs of a brick, by its place in SharedWorld::bricks(), and a tile that it may project to; tile by tile.
 template <class Camera>
 std::vector<BrickInTile> visibleTiles(const SharedWorld& world, const Camera& camera, const TileLayout& layout)
 {
-    std::vector<Brick> bricks;
-    for (const SharedBrick& shared : world.bricks())
-        bricks.push_back(shared.brick);
-    return visibleTiles(World(bricks), camera, layout);
+    std::vector<BrickInTile> result;
+    detail::findVisibleTiles(world, camera, layout, result);
+    return result;
 }
 
 // The bricks, by their place in SharedWorld::bricks(), such that no ray from `eye` meets one before another that stands

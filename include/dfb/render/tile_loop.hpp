@@ -8,7 +8,6 @@
 #include <cstdint>
 #include <exception>
 #include <memory>
-#include <mutex>
 #include <utility>
 #include <vector>
 
@@ -47,17 +46,20 @@ struct TileOf<FrameBuffer, InPlace<Find>> {
     using Type = typename FrameBuffer::TileView;
 };
 
-// What find() gives: called once for each declaration of inputs, not in the frames that go by the last one.
-template <class Frame, class Find>
-const auto& foundOnce(const Frame& frame, const Find& find)
+// What a loop has to do: a `Work`, a type of that loop alone, that it has again in the next frame, with its memory.
+// Calls find(work) for what holds as long as a declaration of inputs: not in the frames that go by the last one.
+template <class Work, class Frame, class Find>
+Work& workOf(const Frame& frame, const Find& find)
 {
-    struct Found { // a type for each place that this is called at: loops do not take each other's
-        decltype(find()) value;
-    };
-    auto* found = std::any_cast<std::shared_ptr<Found>>(&frame.declaredFrom());
-    if (!found)
-        found = &frame.declaredFrom().template emplace<std::shared_ptr<Found>>(new Found{find()});
-    return (*found)->value;
+    auto* work = std::any_cast<std::shared_ptr<Work>>(&frame.loopMemory());
+    if (!work)
+        work = &frame.loopMemory().template emplace<std::shared_ptr<Work>>(std::make_shared<Work>());
+    Work* const* found = std::any_cast<Work*>(&frame.declaredFrom());
+    if (!found || *found != work->get()) {
+        find(**work);
+        frame.declaredFrom() = work->get();
+    }
+    return **work;
 }
 
 // A job for each pass of each of some items, numbered item by item.
@@ -65,13 +67,22 @@ class PassJobs {
 public:
     // `passesOf(item)`: how many passes an item has.
     template <class PassesOf>
-    PassJobs(std::size_t itemCount, const PassesOf& passesOf) : firstJob_(itemCount + 1, 0)
+    PassJobs(std::size_t itemCount, const PassesOf& passesOf) : passes_(itemCount > 0 ? passesOf(0) : 1)
     {
+        bool alike = true;
+        for (std::size_t i = 0; i < itemCount; ++i) {
+            const int passes = passesOf(i);
+            alike = alike && passes == passes_;
+            count_ += passes;
+        }
+        if (alike)
+            return;
+        firstJob_.resize(itemCount + 1, 0);
         for (std::size_t i = 0; i < itemCount; ++i)
             firstJob_[i + 1] = firstJob_[i] + passesOf(i);
     }
 
-    std::int64_t count() const noexcept { return firstJob_.back(); }
+    std::int64_t count() const noexcept { return count_; }
 
     struct Job {
         std::size_t item = 0;
@@ -79,13 +90,17 @@ public:
     };
     Job at(std::int64_t job) const
     {
+        if (firstJob_.empty())
+            return {static_cast<std::size_t>(job / passes_), static_cast<int>(job % passes_)};
         const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
         const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
         return {item, static_cast<int>(job - firstJob_[item])};
     }
 
 private:
-    std::vector<std::int64_t> firstJob_;
+    int passes_; // of the first item
+    std::int64_t count_ = 0;
+    std::vector<std::int64_t> firstJob_; // of each item, unless all have equally many passes
 };
 
 // An exception of a job makes the frame fail on all ranks; then no further job is begun. Lives as long as the frame is
@@ -105,44 +120,33 @@ public:
             fb_.executor().parallelFor(count, [&](std::size_t i) {
                 if (frame_.failed())
                     return;
-                // Not one per thread: a renderer that waits inside a job may be given another job on the same thread.
-                std::unique_ptr<Tile> tile = take();
-                guard([&] { job(i, *tile); }); // the frame may do without that one
-                const std::lock_guard<std::mutex> lock(mutex_);
-                spare_.push_back(std::move(tile));
+                // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be given
+                // another job on the same thread.
+                static thread_local std::unique_ptr<Tile> spare;
+                std::unique_ptr<Tile> tile = std::move(spare);
+                if (!tile)
+                    tile.reset(new Tile); // start() clears it
+                tile->tile = -1;
+                guard([&] { job(i, *tile); }, &tile->tile); // the frame may do without that one
+                spare = std::move(tile);
             });
         });
     }
 
-    // Calls body(); what it throws makes the frame fail.
+    // Calls body(); what it throws makes the frame fail. `tile`: which one it was about, once that is known.
     template <class Body>
-    void guard(const Body& body)
+    void guard(const Body& body, const int* tile = nullptr)
     {
         try {
             body();
         } catch (...) {
-            frame_.abort(std::current_exception());
+            frame_.abort(std::current_exception(), tile ? *tile : -1);
         }
     }
 
 private:
-    std::unique_ptr<Tile> take()
-    {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (!spare_.empty()) {
-                std::unique_ptr<Tile> tile = std::move(spare_.back());
-                spare_.pop_back();
-                return tile;
-            }
-        }
-        return std::unique_ptr<Tile>(new Tile); // start() clears it
-    }
-
     FrameBuffer& fb_;
     typename FrameBuffer::Frame& frame_;
-    std::mutex mutex_;
-    std::vector<std::unique_ptr<Tile>> spare_; // under mutex_
 };
 
 } // namespace detail

@@ -184,6 +184,32 @@ void forEachTile(const std::vector<Projection>& projections, const TileLayout& l
         forEachTile(projection, layout, found);
 }
 
+// The same as visibleTiles(), into memory that is there already. `boundsOf(b)`: of brick b.
+template <class BoundsOf, class Camera>
+void findVisibleTiles(std::size_t brickCount, const BoundsOf& boundsOf, const Camera& camera, const TileLayout& layout,
+                      std::vector<BrickInTile>& result)
+{
+    result.clear();
+    for (std::size_t b = 0; b < brickCount; ++b)
+        forEachTile(camera.project(boundsOf(b), layout.width(), layout.height()), layout, [&](int tile) {
+            result.push_back({static_cast<int>(b), tile});
+        });
+    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
+    std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
+    result.erase(
+        std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
+        result.end());
+}
+
+template <class Camera>
+void findVisibleTiles(const World& world, const Camera& camera, const TileLayout& layout,
+                      std::vector<BrickInTile>& result)
+{
+    findVisibleTiles(
+        world.bricks().size(), [&](std::size_t b) -> const Box3& { return world.bricks()[b].bounds; }, camera, layout,
+        result);
+}
+
 } // namespace detail
 
 // All pairs, tile by tile, so that the inputs of a tile are rendered one after the other.
@@ -191,26 +217,41 @@ template <class Camera>
 std::vector<BrickInTile> visibleTiles(const World& world, const Camera& camera, const TileLayout& layout)
 {
     std::vector<BrickInTile> result;
-    for (std::size_t b = 0; b < world.bricks().size(); ++b)
-        detail::forEachTile(camera.project(world.bricks()[b].bounds, layout.width(), layout.height()), layout,
-                            [&](int tile) {
-                                result.push_back({static_cast<int>(b), tile});
-                            });
-    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
-    std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
-    result.erase(
-        std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
-        result.end());
+    detail::findVisibleTiles(world, camera, layout, result);
     return result;
 }
+
+namespace detail {
+
+// The same as inputsOf(), into memory that is there already.
+inline void findInputs(const World& world, const std::vector<BrickInTile>& pairs, std::vector<TileInput>& result)
+{
+    result.clear();
+    result.reserve(pairs.size());
+    for (const BrickInTile& pair : pairs)
+        result.push_back({pair.tile, world.bricks()[static_cast<std::size_t>(pair.brick)].id, 0});
+}
+
+// What there is to do for a rank that renders its own bricks, and what it declares.
+struct OwnBricks {
+    std::vector<BrickInTile> pairs;
+    std::vector<TileInput> inputs;
+
+    template <class Camera>
+    void find(const World& world, const Camera& camera, const TileLayout& layout)
+    {
+        findVisibleTiles(world, camera, layout, pairs);
+        findInputs(world, pairs, inputs);
+    }
+};
+
+} // namespace detail
 
 // What a rank declares that renders these pairs: the source is the brick's id.
 inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs)
 {
     std::vector<TileInput> inputs;
-    inputs.reserve(pairs.size());
-    for (const BrickInTile& pair : pairs)
-        inputs.push_back({pair.tile, world.bricks()[static_cast<std::size_t>(pair.brick)].id, 0});
+    detail::findInputs(world, pairs, inputs);
     return inputs;
 }
 

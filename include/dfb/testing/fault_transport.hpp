@@ -17,6 +17,7 @@
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -180,6 +181,29 @@ public:
         if (orderly)
             release(true);
         base_.stop(orderly);
+    }
+
+    // What Base need not have; neither has this then. What goes through shared memory without a message goes unharmed.
+    template <class B = Base>
+    auto abort(const std::string& text) -> decltype(std::declval<B&>().abort(text))
+    {
+        base_.abort(text);
+    }
+    template <class B = Base>
+    auto lendsTo(int other) const -> decltype(std::declval<const B&>().lendsTo(other))
+    {
+        return base_.lendsTo(other);
+    }
+    template <class B = Base>
+    auto placeOf(const std::byte* block) const -> decltype(std::declval<const B&>().placeOf(block))
+    {
+        return base_.placeOf(block);
+    }
+    template <class B = Base>
+    auto blockAt(int other, std::int32_t place, std::size_t byteCount) const
+        -> decltype(std::declval<const B&>().blockAt(other, place, byteCount))
+    {
+        return base_.blockAt(other, place, byteCount);
     }
 
 private:

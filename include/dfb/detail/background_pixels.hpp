@@ -1,0 +1,86 @@
+// BackgroundPixels: which pixels of a tile already are, where the image lies, as the background is stored. They need
+// not be written again.
+#pragma once
+
+#include <dfb/cpu.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <vector>
+
+namespace dfb::detail {
+
+// One per tile; used by one thread at a time.
+class BackgroundPixels {
+public:
+    // To be called for each frame in which the tile is written. `epoch`: as long as it stays the same, what was written
+    // is still there, and the background is stored alike; 0: nothing is known of what will be there.
+    void newFrame(int width, int height, std::int64_t epoch)
+    {
+        if (epoch != 0 && epoch == epoch_)
+            return;
+        epoch_ = epoch;
+        wordsPerRow_ = static_cast<std::size_t>(width + 63) / 64;
+        bits_.assign(epoch == 0 ? 0 : wordsPerRow_ * static_cast<std::size_t>(height), 0);
+    }
+
+    // Pixels [x, x + count) of row y become something else.
+    void remove(int x, int y, int count)
+    {
+        if (bits_.empty())
+            return;
+        forEachWord(x, y, count, [](std::uint64_t& known, std::uint64_t range, int) { known &= ~range; });
+    }
+
+    // They become the background: calls write(x, count) for each run of those that are not yet.
+    template <class Write>
+    void add(int x, int y, int count, const Write& write)
+    {
+        if (bits_.empty()) {
+            if (count > 0)
+                write(x, count);
+            return;
+        }
+        int begin = 0, end = 0; // a run that may go on in the next word
+        forEachWord(x, y, count, [&](std::uint64_t& known, std::uint64_t range, int first) {
+            std::uint64_t bits = range & ~known;
+            known |= range;
+            for (int at = first; bits != 0;) {
+                const int skipped = zerosBelow(bits);
+                bits >>= skipped;
+                at += skipped;
+                const int run = ~bits == 0 ? 64 : zerosBelow(~bits);
+                bits = run == 64 ? 0 : bits >> run;
+                if (at != end) {
+                    if (end > begin)
+                        write(begin, end - begin);
+                    begin = at;
+                }
+                at += run;
+                end = at;
+            }
+        });
+        if (end > begin)
+            write(begin, end - begin);
+    }
+
+private:
+    // Calls f(word, bits of the range in it, x of its first bit).
+    template <class F>
+    void forEachWord(int x, int y, int count, const F& f)
+    {
+        const int end = x + count;
+        std::uint64_t* row = bits_.data() + wordsPerRow_ * static_cast<std::size_t>(y);
+        for (int first = x / 64 * 64; first < end; first += 64) {
+            const int low = std::max(x, first) - first, high = std::min(end, first + 64) - first;
+            f(row[first / 64], ~std::uint64_t{0} << low & ~std::uint64_t{0} >> (64 - high), first);
+        }
+    }
+
+    std::int64_t epoch_ = 0;
+    std::size_t wordsPerRow_ = 0;
+    std::vector<std::uint64_t> bits_; // row by row, or empty: nothing is known
+};
+
+} // namespace dfb::detail

@@ -1,0 +1,5 @@
+// The cases of moving.hpp with ranks in one process.
+#define ALGORITHMS_WITHOUT_TESTS
+#include "moving.hpp"
+
+template algorithms::Result algorithms::inProcess<algorithms::MovingBricks>(int);

@@ -1,0 +1,4 @@
+// The cases of tests/algorithms/moving.hpp.
+#include "everywhere.hpp"
+
+#include "../algorithms/moving.hpp"
