@@ -75,7 +75,7 @@ struct TileOutput {
     bool operator==(const TileOutput& o) const
     {
         return color == o.color && depth.size() == o.depth.size()
-               && std::memcmp(depth.data(), o.depth.data(), depth.size() * sizeof(float)) == 0;
+               && (depth.empty() || std::memcmp(depth.data(), o.depth.data(), depth.size() * sizeof(float)) == 0);
     }
     // Of OutputFormat::RGBA32F.
     float value(std::size_t i) const
