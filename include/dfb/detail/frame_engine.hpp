@@ -219,6 +219,7 @@ public:
             arrive(std::move(message), -1);
             gate_.leave();
         }
+        poll();
     }
 
     // See Frame.
@@ -305,7 +306,14 @@ public:
         failWith(reason, where);
     }
 
-    bool poll() { return messaging_->messenger().poll(); }
+    bool poll()
+    {
+        bool did = messaging_->messenger().poll();
+        Executor& executor = messaging_->executor();
+        while (!executor.hasWorkers() && executor.help())
+            did = true;
+        return did;
+    }
 
     FrameReport end()
     {
@@ -936,7 +944,7 @@ private:
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
-        gate_.close();
+        gate_.close([this] { return messaging_->executor().help(); });
         messaging_->reductions().forget(AllDeclared, gate_.frame());
         messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
