@@ -39,9 +39,6 @@ public:
         dfb::FrameBufferConfig config;
         config.width = width;
         config.height = height;
-        if (getenv("CAL")) {
-        config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread a rank, as with IceT
-        config.progress = dfb::Progress::Caller; } else
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         bench::MarchedBricks bricks(comm_, config, o_.views);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};

@@ -65,12 +65,14 @@ void check(Arguments... threads)
             CHECK(calls == 10);
         }
         // From within a nested loop too.
-        CHECK_THROWS_AS(executor.parallelFor(3, [&](std::size_t) {
-            executor.parallelFor(3, [](std::size_t i) {
-                if (i == 1)
-                    throw std::runtime_error("inner");
-            });
-        }), std::runtime_error);
+        CHECK_THROWS_AS(executor.parallelFor(3,
+                                             [&](std::size_t) {
+                                                 executor.parallelFor(3, [](std::size_t i) {
+                                                     if (i == 1)
+                                                         throw std::runtime_error("inner");
+                                                 });
+                                             }),
+                        std::runtime_error);
     }
     SECTION("what was submitted has run when the executor is gone, also what tasks submit")
     {
@@ -117,10 +119,7 @@ TEST_CASE("ThreadExecutor", "[executor]")
         DYNAMIC_SECTION("threads: " << threads) { check<dfb::ThreadExecutor>(threads); }
 }
 
-TEST_CASE("CallerExecutor", "[executor]")
-{
-    check<dfb::CallerExecutor>();
-}
+TEST_CASE("CallerExecutor", "[executor]") { check<dfb::CallerExecutor>(); }
 
 TEST_CASE("CallerExecutor has no workers", "[executor]")
 {
