@@ -38,14 +38,19 @@ struct Options {
     }
 };
 
-void addAllDfb(std::vector<System>& systems, const std::shared_ptr<bench::Messenger>& messenger, const Inputs& inputs)
+void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
+    const auto messenger = bench::makeMessenger(inputs.comm, false);
     using bench::addDfb, dfb::WireFormat, dfb::BasicOrderedBlend, dfb::BasicAlphaBlend;
     const auto addOrdered = [&](const std::string& wire, const bench::DfbSettings& settings) {
         addDfb<BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, " + wire + ", tiles of 128", settings);
     };
     addDfb<BasicOrderedBlend<64>>(systems, messenger, inputs, "in order, float32, tiles of 64", {});
     addOrdered("float32", {});
+    bench::DfbSettings threads;
+    threads.hasThreads = true;
+    addDfb<BasicOrderedBlend<128>>(systems, bench::makeMessenger(inputs.comm, true), inputs,
+                                   "in order, float32, tiles of 128, threads of its own", threads);
     addDfb<BasicAlphaBlend<64>>(systems, messenger, inputs, "float32, tiles of 64", {});
     addDfb<BasicAlphaBlend<128>>(systems, messenger, inputs, "float32, tiles of 128", {});
     addOrdered("unorm16", {WireFormat::Unorm16});
@@ -189,7 +194,7 @@ public:
         bench::meet(comm_);
         std::vector<System> systems;
         if (o_.wants("dfb"))
-            addAllDfb(systems, std::make_shared<bench::Messenger>(comm_), inputs);
+            addAllDfb(systems, inputs);
         if (o_.wants("plain"))
             addAllPlain(systems, inputs);
 #ifdef DFB_BENCH_HAS_ICET

@@ -21,8 +21,9 @@ struct Options {
     std::string only; // the systems whose name and configuration have one of these, with | between
 };
 
-void addAllDfb(std::vector<System>& systems, const std::shared_ptr<bench::Messenger>& messenger, const Inputs& inputs)
+void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
+    const auto messenger = bench::makeMessenger(inputs.comm, false);
     using bench::addDfb, bench::DfbSettings, dfb::WireFormat;
     const auto add = [&](const std::string& config, const DfbSettings& settings) {
         addDfb<dfb::AlphaBlend>(systems, messenger, inputs, config, settings);
@@ -71,7 +72,7 @@ public:
             exact = scene.exact();
         bench::meet(comm_);
         std::vector<System> systems;
-        addAllDfb(systems, std::make_shared<bench::Messenger>(comm_), inputs);
+        addAllDfb(systems, inputs);
         bench::addDirectSend(systems, inputs);
 #ifdef DFB_BENCH_HAS_ICET
         bench::addIceT(systems, inputs);

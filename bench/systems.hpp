@@ -122,7 +122,16 @@ struct DfbSettings {
     float minTransmittance = 0;
     bool isDefault = false;
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
+    bool hasThreads = false; // a worker; else the executor has none
 };
+
+// Without `hasThreads` what each rank does is done by one thread, as with the other systems.
+inline std::shared_ptr<Messenger> makeMessenger(MPI_Comm comm, bool hasThreads)
+{
+    dfb::MessengerOptions options;
+    options.progress = hasThreads ? dfb::Progress::Thread : dfb::Progress::Caller;
+    return std::make_shared<Messenger>(comm, options);
+}
 
 // `inputs` must outlive the systems, here and below.
 template <class TileOp>
@@ -156,9 +165,13 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& mess
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
-        s.start = [c, messenger, toBytes, from = &inputs.image, order = inputs.order] {
+        s.start = [c, messenger, toBytes, hasThreads = settings.hasThreads, from = &inputs.image,
+                   order = inputs.order] {
             dfb::FrameBufferConfig ownConfig = c;
-            ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
+            if (hasThreads)
+                ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
+            else
+                ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
             const auto r = std::make_shared<Renderer>(messenger, ownConfig, *from);
             Compositor compositor;
             compositor.frame = [r, from, order] {

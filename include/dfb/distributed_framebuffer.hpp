@@ -202,9 +202,10 @@ public:
     // On the display rank: false if the last frame ended without that tile, see FrameParams::allowPartial.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
-    // Moves messages; true if any moved. With Progress::Caller, call it now and then while rendering, so that
-    // compositing goes on meanwhile; otherwise there is no need to. Does nothing on a thread that may not be in MPI.
-    // Waits for nothing.
+    // With Progress::Caller, moves messages, unless on a thread that may not be in MPI; with an executor that has no
+    // workers, runs the tasks that wait. True if there was anything. Call it now and then while rendering what takes
+    // long (setTile() does it, too), so that compositing goes on meanwhile, and no other rank waits in vain for what
+    // this one has to say. Otherwise there is no need to. Waits for nothing.
     bool poll() { return engine().poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws

@@ -1,5 +1,5 @@
 // Executor: runs the tasks of a framebuffer and the loops of a renderer. ThreadExecutor: on std::threads of
-// its own. (TbbExecutor, in tbb_executor.hpp: in a oneTBB arena of its own.)
+// its own. CallerExecutor: on the threads that call. (TbbExecutor, in tbb_executor.hpp: in a oneTBB arena of its own.)
 #pragma once
 
 #include <dfb/detail/fifo.hpp>
@@ -32,6 +32,9 @@ public:
     // Number of workers, at least 1.
     virtual int concurrency() const noexcept = 0;
 
+    // False if tasks are run by those threads alone that are in help() or parallelFor().
+    virtual bool hasWorkers() const noexcept { return true; }
+
     // From any thread.
     void submit(Task task)
     {
@@ -45,6 +48,11 @@ public:
     // Runs one task that waits, on the calling thread, so that it does something useful while it waits. False if there
     // is none.
     bool help() { return runOne(); }
+    bool hasTasks() // that wait; from any thread
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return !tasks_.empty();
+    }
 
     // Calls body(i) for i in [0, count), in no particular order, from several workers at once. The calling thread
     // waits; called from inside a task the loop runs right there. Rethrows the first exception of a body, after
@@ -199,6 +207,30 @@ private:
     std::size_t signals_ = 0;
     bool stop_ = false;
     std::vector<std::thread> threads_;
+};
+
+// No threads of its own: loops run on the thread that calls parallelFor(), tasks there between two iterations, in
+// setTile(), poll(), or on a thread that waits for a frame. For ranks that have one core each. With Progress::Caller,
+// too, all that a rank does is done by the threads that call it; while none does, other ranks may wait.
+class CallerExecutor final : public Executor {
+public:
+    CallerExecutor() = default;
+    ~CallerExecutor() override
+    {
+        while (help()) {
+        }
+    }
+
+    int concurrency() const noexcept override { return 1; }
+    bool hasWorkers() const noexcept override { return false; }
+
+private:
+    void wake() override {}
+    void run(std::size_t count, const std::function<void(std::size_t)>& body) override
+    {
+        for (std::size_t i = 0; i < count; ++i)
+            body(i);
+    }
 };
 
 } // namespace dfb

@@ -63,6 +63,8 @@ public:
             for (std::size_t k = 0; k < layers_.size(); ++k)
                 layers_[k] = {active_[k].color, active_[k].depth, nullptr};
             addRun(row, span.x, span.count);
+        } else if (active_.size() == 1 && !wantsAux) {
+            compositeSpans(row, active_.front());
         } else {
             compositeRuns(row, wantsAux);
         }
@@ -80,9 +82,9 @@ private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
 
-    static void clearGap(CompositeRow& row, int begin, int end)
+    static void clearGap(CompositeRow& row, int begin, int end, bool isBetweenRuns = false)
     {
-        if (row.wantsGaps)
+        if (row.wantsGaps || (isBetweenRuns && end - begin < narrowGap))
             row.clear(begin, end - begin);
     }
 
@@ -105,6 +107,21 @@ private:
         }
         active_.resize(rows);
         return isOneRun;
+    }
+
+    // Of the only fragment that has something in this row.
+    void compositeSpans(CompositeRow& row, const FragmentRow& r)
+    {
+        Layer layer{r.color, r.depth, nullptr};
+        int end = 0;
+        for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+            clearGap(row, end, span->x, end > 0);
+            layers_.assign(1, layer);
+            addRun(row, span->x, span->count);
+            layer = layer.from(span->count);
+            end = span->x + span->count;
+        }
+        clearGap(row, end, static_cast<int>(row.transmittance.size()));
     }
 
     void compositeRuns(CompositeRow& row, bool wantsAux)
@@ -135,12 +152,10 @@ private:
                     }
                 }
             }
-            if (layers_.empty()) {
-                if (row.wantsGaps || x1 - x0 < narrowGap)
-                    row.clear(x0, x1 - x0);
-                continue;
-            }
-            addRun(row, x0, x1 - x0);
+            if (layers_.empty())
+                clearGap(row, x0, x1, true);
+            else
+                addRun(row, x0, x1 - x0);
         }
     }
 

@@ -56,7 +56,8 @@ struct FrameBufferConfig {
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
     std::size_t messagePoolBytes = std::size_t{64} << 20;
-    std::shared_ptr<Executor> executor{}; // null: a ThreadExecutor with one thread per core
+    // Null: a ThreadExecutor with one thread per core. A CallerExecutor makes no threads.
+    std::shared_ptr<Executor> executor{};
     // Of the messenger; a framebuffer that is given one goes by that one's.
     Progress progress = Progress::Thread;
     bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it

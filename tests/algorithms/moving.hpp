@@ -31,9 +31,10 @@ struct MovingBricks {
     }
 
     template <class Transport>
-    static void run(const typename Transport::Communicator& communicator, dfb::OutputFormat format, Result& result)
+    static void run(const typename Transport::Communicator& communicator, dfb::OutputFormat format, int threads,
+                    Result& result)
     {
-        dfb::FrameBufferConfig config = configOf(sceneOf(0), 2);
+        dfb::FrameBufferConfig config = configOf(sceneOf(0), threads);
         config.format = format;
         config.depth = format == dfb::OutputFormat::RGBA32F;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, Transport> fb(communicator, config);
@@ -66,8 +67,13 @@ struct MovingBricks {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        run<Transport>(communicator, dfb::OutputFormat::RGBA32F, result);
-        run<Transport>(communicator, dfb::OutputFormat::RGBA8, result);
+        run<Transport>(communicator, dfb::OutputFormat::RGBA32F, 2, result);
+        run<Transport>(communicator, dfb::OutputFormat::RGBA8, 2, result);
+        const std::uint64_t before = result.hash;
+        result.hash = 0;
+        run<Transport>(communicator, dfb::OutputFormat::RGBA32F, 0, result);
+        run<Transport>(communicator, dfb::OutputFormat::RGBA8, 0, result);
+        result.expect(result.hash == before, "images differ without workers");
         return result;
     }
 };

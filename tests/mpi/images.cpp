@@ -105,6 +105,10 @@ TEST_CASE("The image does not depend on configuration", "[images]")
     check("another display rank", [&](auto& c) { c.displayRank = size - 1; });
     check("linear owners", [](auto& c) { c.ownerMap = dfb::linearOwner; });
     check("progress by the caller", [](auto& c) { c.progress = dfb::Progress::Caller; });
+    check("no threads of its own", [](auto& c) {
+        c.progress = dfb::Progress::Caller;
+        c.executor = std::make_shared<dfb::CallerExecutor>();
+    });
     check("one worker", [](auto& c) { c.executor = std::make_shared<dfb::ThreadExecutor>(1); });
 #if defined(DFB_HAS_TBB)
     check("oneTBB", [](auto& c) { c.executor = std::make_shared<dfb::TbbExecutor>(2); });

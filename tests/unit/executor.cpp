@@ -11,6 +11,7 @@
 #include <condition_variable>
 #include <memory>
 #include <mutex>
+#include <set>
 #include <stdexcept>
 #include <string>
 #include <thread>
@@ -18,13 +19,12 @@
 
 namespace {
 
-template <class Executor>
-void check(int threads)
+template <class Executor, class... Arguments>
+void check(Arguments... threads)
 {
-    INFO(threads << " threads");
     SECTION("a loop calls each index once")
     {
-        Executor executor(threads);
+        Executor executor(threads...);
         CHECK(executor.concurrency() >= 1);
         for (const std::size_t count : {0, 1, 2, 3, 17, 5000}) {
             std::vector<std::atomic<int>> calls(count);
@@ -36,7 +36,7 @@ void check(int threads)
     {
         std::atomic<int> inner{0}, inTask{0};
         {
-            Executor executor(threads);
+            Executor executor(threads...);
             executor.parallelFor(13, [&](std::size_t) {
                 executor.parallelFor(7, [&](std::size_t) { executor.parallelFor(3, [&](std::size_t) { ++inner; }); });
             });
@@ -48,7 +48,7 @@ void check(int threads)
     }
     SECTION("an exception of a body comes out of the loop, and the executor goes on")
     {
-        Executor executor(threads);
+        Executor executor(threads...);
         for (const std::size_t culprit : {0, 50, 99}) {
             std::string what;
             try {
@@ -65,18 +65,20 @@ void check(int threads)
             CHECK(calls == 10);
         }
         // From within a nested loop too.
-        CHECK_THROWS_AS(executor.parallelFor(3, [&](std::size_t) {
-            executor.parallelFor(3, [](std::size_t i) {
-                if (i == 1)
-                    throw std::runtime_error("inner");
-            });
-        }), std::runtime_error);
+        CHECK_THROWS_AS(executor.parallelFor(3,
+                                             [&](std::size_t) {
+                                                 executor.parallelFor(3, [](std::size_t i) {
+                                                     if (i == 1)
+                                                         throw std::runtime_error("inner");
+                                                 });
+                                             }),
+                        std::runtime_error);
     }
     SECTION("what was submitted has run when the executor is gone, also what tasks submit")
     {
         std::atomic<int> ran{0};
         {
-            Executor executor(threads);
+            Executor executor(threads...);
             std::vector<std::thread> submitters;
             for (int t = 0; t < 3; ++t)
                 submitters.emplace_back([&] {
@@ -95,7 +97,7 @@ void check(int threads)
     }
     SECTION("loops of several threads at once")
     {
-        Executor executor(threads);
+        Executor executor(threads...);
         std::atomic<int> calls{0};
         std::vector<std::thread> callers;
         for (int t = 0; t < 4; ++t)
@@ -115,6 +117,24 @@ TEST_CASE("ThreadExecutor", "[executor]")
 {
     for (const int threads : {1, 2, 3, 0})
         DYNAMIC_SECTION("threads: " << threads) { check<dfb::ThreadExecutor>(threads); }
+}
+
+TEST_CASE("CallerExecutor", "[executor]") { check<dfb::CallerExecutor>(); }
+
+TEST_CASE("CallerExecutor has no workers", "[executor]")
+{
+    dfb::CallerExecutor executor;
+    CHECK(executor.concurrency() == 1);
+    CHECK(!executor.hasWorkers());
+    bool ran = false;
+    executor.submit([&] { ran = true; });
+    CHECK(executor.hasTasks());
+    std::set<std::thread::id> threads;
+    executor.parallelFor(3, [&](std::size_t) { threads.insert(std::this_thread::get_id()); });
+    CHECK(threads == std::set<std::thread::id>{std::this_thread::get_id()});
+    CHECK(ran);
+    CHECK(!executor.hasTasks());
+    CHECK(!executor.help());
 }
 
 #if defined(DFB_HAS_TBB)
@@ -144,13 +164,18 @@ TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[exe
 
 TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
 {
-    dfb::ThreadExecutor executor(1);
-    std::atomic<int> tasks{0};
-    std::vector<int> seen(5);
-    executor.parallelFor(5, [&](std::size_t i) {
-        seen[i] = tasks;
-        executor.submit([&] { ++tasks; });
-    });
-    std::sort(seen.begin(), seen.end());
-    CHECK(seen == std::vector<int>{0, 1, 2, 3, 4});
+    const auto check = [](dfb::Executor& executor) {
+        std::atomic<int> tasks{0};
+        std::vector<int> seen(5);
+        executor.parallelFor(5, [&](std::size_t i) {
+            seen[i] = tasks;
+            executor.submit([&] { ++tasks; });
+        });
+        std::sort(seen.begin(), seen.end());
+        CHECK(seen == std::vector<int>{0, 1, 2, 3, 4});
+    };
+    dfb::ThreadExecutor thread(1);
+    check(thread);
+    dfb::CallerExecutor caller;
+    check(caller);
 }

@@ -8,6 +8,8 @@
 
 using dfb::detail::FrameGate;
 
+const auto noHelp = [] { return false; };
+
 TEST_CASE("Frames of several gates are numbered in turns", "[frame_gate]")
 {
     FrameGate first(1, 2), second(2, 2);
@@ -15,10 +17,10 @@ TEST_CASE("Frames of several gates are numbered in turns", "[frame_gate]")
         CHECK(first.next() == frame);
         first.open();
         CHECK(first.frame() == frame);
-        first.close();
+        first.close(noHelp);
         second.open();
         CHECK(second.frame() == frame + 1);
-        second.close();
+        second.close(noHelp);
     }
 }
 
@@ -38,9 +40,26 @@ TEST_CASE("A message is of this frame, the last, the next, or none that can be",
     CHECK(enter(5) == FrameGate::Entry::Kept);
     CHECK(enter(8) == FrameGate::Entry::Absurd);
     CHECK(enter(std::int64_t{1} << 62) == FrameGate::Entry::Absurd);
-    gate.close();
+    gate.close(noHelp);
     CHECK(gate.open().size() == 1);
-    gate.close();
+    gate.close(noHelp);
+}
+
+TEST_CASE("Closing does itself what it waits for", "[frame_gate]")
+{
+    FrameGate gate;
+    gate.open();
+    int inside = 3, asked = 0;
+    for (int i = 0; i < inside; ++i)
+        CHECK(gate.enter(1));
+    gate.close([&] {
+        if (++asked % 2 == 0) // not at once
+            return false;
+        gate.leave();
+        --inside;
+        return true;
+    });
+    CHECK(inside == 0);
 }
 
 TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[frame_gate]")
@@ -51,7 +70,7 @@ TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[f
         REQUIRE(gate.enter(frame));
         std::atomic<bool> closed{false};
         std::thread closing([&] {
-            gate.close();
+            gate.close(noHelp);
             closed = true;
         });
         while (gate.enter(frame)) { // until it has begun to close

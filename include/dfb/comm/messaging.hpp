@@ -70,7 +70,13 @@ public:
         messenger_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
         isEnding_ = true;
-        changed_.wait(lock, [this] { return tasks_ == 0; });
+        while (tasks_ > 0) {
+            lock.unlock();
+            const bool did = executor_->help(); // who else would, if it has no workers?
+            lock.lock();
+            if (!did)
+                changed_.wait_for(lock, std::chrono::milliseconds(2), [this] { return tasks_ == 0; });
+        }
     }
 
     int rank() const noexcept { return messenger_->rank(); }
@@ -174,6 +180,8 @@ public:
             task();
             taskDone();
         });
+        if (!executor_->hasWorkers())
+            notify();
     }
 
     // The same for the handler's work(number); takes no memory.
@@ -187,6 +195,8 @@ public:
             handler_.work(number);
             taskDone();
         });
+        if (!executor_->hasWorkers())
+            notify();
     }
 
     ReductionTable& reductions() noexcept { return reductions_; }
@@ -237,7 +247,8 @@ public:
         if (!messenger_->needsCaller()) {
             while (!over() && !late()) {
                 const auto next = Clock::now() + std::chrono::milliseconds(2);
-                changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next, over);
+                changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next,
+                                    [&] { return over() || (!executor_->hasWorkers() && executor_->hasTasks()); });
                 // Workers may be short: those of several ranks in one process can all be in waitForRoom(), each for
                 // the others.
                 lock.unlock();
@@ -249,7 +260,7 @@ public:
             // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
             while ((!over() || (!failed() && !messenger_->quiet())) && !late()) {
                 lock.unlock();
-                if (!messenger_->poll() && !over())
+                if (!executor_->help() && !messenger_->poll() && !over())
                     messenger_->nap(std::chrono::microseconds(50));
                 lock.lock();
             }

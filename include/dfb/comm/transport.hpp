@@ -57,9 +57,10 @@ namespace dfb {
 // Who calls poll() of a transport that needs it.
 enum class Progress {
     Thread, // a thread of the library's own; MPI must have been initialised with MPI_THREAD_MULTIPLE
-    Caller // the calls of the user: DistributedFrameBuffer::poll(), and those that wait (the constructor, Frame::end(),
-           // ...). At MPI_THREAD_FUNNELED all of them belong to the thread that initialised MPI; at
-           // MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile. Messages move only in those calls
+    Caller // the calls of the user: DistributedFrameBuffer::poll(), Frame::setTile(), and those that wait (the
+           // constructor, Frame::end(), ...). At MPI_THREAD_FUNNELED those that wait belong to the thread that
+           // initialised MPI; at MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile. Messages move only in
+           // those calls
 };
 
 // Where a transport delivers. The calls are quick, never block, may come from any thread, and must not call the

@@ -5,6 +5,7 @@
 #include <dfb/comm/message.hpp>
 
 #include <atomic>
+#include <chrono>
 #include <condition_variable>
 #include <cstdint>
 #include <mutex>
@@ -104,12 +105,20 @@ public:
             empty_.notify_all();
     }
 
-    // Lets nothing more in, and waits until all have left.
-    void close()
+    // Lets nothing more in, and waits until all have left. `help()` runs what some of them may be waiting for, and is
+    // false if there is nothing.
+    template <class Help>
+    void close(const Help& help)
     {
         std::unique_lock<std::mutex> lock(mutex_);
         open_ = false;
-        empty_.wait(lock, [this] { return inside_ == 0; });
+        while (inside_ > 0) {
+            lock.unlock();
+            const bool did = help();
+            lock.lock();
+            if (!did)
+                empty_.wait_for(lock, std::chrono::milliseconds(2), [this] { return inside_ == 0; });
+        }
     }
 
 private:
