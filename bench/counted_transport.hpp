@@ -45,14 +45,14 @@ public:
     void add(Kind kind, std::size_t byteCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        counts_[static_cast<std::size_t>(kind)].add(static_cast<std::int64_t>(byteCount));
+        counts_.at(static_cast<std::size_t>(kind)).add(static_cast<std::int64_t>(byteCount));
     }
     MessageCount of(std::initializer_list<Kind> kinds) const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         MessageCount sum;
         for (const Kind kind : kinds)
-            sum += counts_[static_cast<std::size_t>(kind)];
+            sum += counts_.at(static_cast<std::size_t>(kind));
         return sum;
     }
     MessageCount all() const
@@ -71,7 +71,7 @@ public:
 
 private:
     mutable std::mutex mutex_;
-    std::array<MessageCount, static_cast<std::size_t>(Kind::Failure) + 1> counts_{};
+    std::array<MessageCount, static_cast<std::size_t>(Kind::Hidden) + 1> counts_{};
 };
 
 // What ranks share that are counted: their traffic, and a place to meet without messages.
