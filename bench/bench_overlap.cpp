@@ -12,6 +12,7 @@
 #include <fstream>
 #include <memory>
 #include <string>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -39,7 +40,8 @@ public:
         dfb::FrameBufferConfig config;
         config.width = width;
         config.height = height;
-        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
+        config.progress = dfb::Progress::Caller;
         bench::MarchedBricks bricks(comm_, config, o_.views);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
 #ifdef DFB_BENCH_HAS_ICET
@@ -72,11 +74,15 @@ public:
             for (std::size_t i = 0; ours && theirs && i < values; ++i)
                 largest = std::max(largest, std::abs(static_cast<double>(ours[i]) - static_cast<double>(theirs[i])));
         }
-        report(systems, width, height, largest);
+        std::vector<std::array<double, 2>> traffic; // bytes and messages, of the last frame
+        for (const MarchedSystem& s : systems)
+            traffic.push_back(s.traffic ? s.traffic() : std::array<double, 2>{});
+        report(systems, traffic, width, height, largest);
     }
 
 private:
-    void report(const std::vector<MarchedSystem>& systems, int width, int height, double largest) const
+    void report(const std::vector<MarchedSystem>& systems, const std::vector<std::array<double, 2>>& traffic, int width,
+                int height, double largest) const
     {
         if (rank_ != 0)
             return;
@@ -88,17 +94,23 @@ private:
         };
         const MarchedSystem& alone = systems.front();
         struct Row {
-            Figure frame, beyond, overhead;
+            Figure frame, beyond, overhead, cpu, cpuBeyond;
         };
         std::vector<Row> rows;
         std::vector<bench::Result> results;
-        bench::Table table({"", "frame [ms]", "beyond rendering alone [ms]", "after the slowest had rendered [ms]"});
-        for (const MarchedSystem& s : systems) {
+        bench::Table table({"", "frame [ms]", "beyond rendering alone [ms]", "after the slowest had rendered [ms]",
+                            "CPU beyond rendering [ms]", "MB", "messages"});
+        for (std::size_t i = 0; i < systems.size(); ++i) {
+            const MarchedSystem& s = systems[i];
             rows.push_back({figure(s, [&](std::size_t v) { return s.times[v].image; }),
                             figure(s, [&](std::size_t v) { return s.times[v].image - alone.times[v].image; }),
-                            figure(s, [&](std::size_t v) { return s.times[v].overhead(); })});
-            table.add({s.name, bench::text(rows.back().frame), bench::text(rows.back().beyond),
-                       bench::text(rows.back().overhead)});
+                            figure(s, [&](std::size_t v) { return s.times[v].overhead(); }),
+                            figure(s, [&](std::size_t v) { return s.times[v].cpu; }),
+                            figure(s, [&](std::size_t v) { return s.times[v].cpu - alone.times[v].cpu; })});
+            const Row& row = rows.back();
+            const auto& [bytes, messages] = traffic[i];
+            table.add({s.name, bench::text(row.frame), bench::text(row.beyond), bench::text(row.overhead),
+                       bench::text(row.cpuBeyond), bench::text(1e-6 * bytes), bench::text(messages)});
             bench::Result r;
             r.bench = "bench_overlap";
             r.system = s.name.substr(0, s.name.find(':'));
@@ -107,12 +119,16 @@ private:
             r.width = width;
             r.height = height;
             r.commit = o_.commit;
-            const std::pair<const char*, const Figure*> parts[] = {{", frame", &rows.back().frame},
-                                                                   {", beyond rendering", &rows.back().beyond},
-                                                                   {", overhead", &rows.back().overhead}};
-            for (const auto& [part, ms] : parts) {
+            r.bytes = bytes;
+            r.messages = messages;
+            const std::tuple<const char*, const Figure*, const Figure*> parts[] = {
+                {", frame", &row.frame, &row.cpu},
+                {", beyond rendering", &row.beyond, &row.cpuBeyond},
+                {", overhead", &row.overhead, &row.cpu}};
+            for (const auto& [part, ms, cpu] : parts) {
                 r.config = s.name + part;
                 r.ms = *ms;
+                r.cpuMs = *cpu;
                 results.push_back(r);
             }
         }
@@ -135,10 +151,12 @@ private:
                                  + bench::text(mine.frame.median / peer.frame.median) + " | " + bench::text(mine.beyond)
                                  + " | " + bench::text(peer.beyond) + " | "
                                  + bench::text(mine.beyond.median / peer.beyond.median) + " | "
-                                 + bench::text(mine.overhead) + " | " + bench::text(peer.overhead) + " |\n";
+                                 + bench::text(mine.overhead) + " | " + bench::text(peer.overhead) + " | "
+                                 + bench::text(mine.cpuBeyond) + " | " + bench::text(peer.cpuBeyond) + " |\n";
         const char* head = "| size | ranks | rendering alone [ms] | dfb [ms] | best IceT [ms] | ratio | dfb beyond "
-                           "rendering | IceT beyond | ratio | dfb after rendering | IceT after |\n"
-                           "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
+                           "rendering | IceT beyond | ratio | dfb after rendering | IceT after | dfb CPU beyond "
+                           "rendering | IceT CPU beyond |\n"
+                           "|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
         std::printf("\n%s%s", head, line.c_str());
         if (o_.table.empty())
             return;
