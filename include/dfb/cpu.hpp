@@ -66,4 +66,19 @@ inline int zerosBelow(std::uint64_t bits) noexcept
 #endif
 }
 
+// Calls f(first, count) for each run of bits that are set, from the lowest on.
+template <class F>
+void forEachRun(std::uint64_t bits, const F& f)
+{
+    for (int at = 0; bits != 0;) {
+        const int skipped = zerosBelow(bits);
+        bits >>= skipped;
+        at += skipped;
+        const int run = ~bits == 0 ? 64 : zerosBelow(~bits);
+        f(at, run);
+        bits = run == 64 ? 0 : bits >> run;
+        at += run;
+    }
+}
+
 } // namespace dfb::detail

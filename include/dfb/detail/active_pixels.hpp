@@ -59,43 +59,39 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
     return findActivePixels(rgba, count);
 }
 
-// False if a colour is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
-template <bool Copies>
-DFB_INLINE bool checkColorsOrCopy(const float* rgba, int count, float* out)
-{
-    constexpr float most = std::numeric_limits<float>::max();
-    constexpr float low[8] = {-most, -most, -most, 0, -most, -most, -most, 0};
-    constexpr float high[8] = {most, most, most, 1, most, most, most, 1};
-    const auto isOutside = [&](float value, int c) {
-        return static_cast<int>(!(value >= low[c])) | static_cast<int>(!(value <= high[c]));
-    };
-    int bad[8] = {}, i = 0;
-    for (; i + 8 <= 4 * count; i += 8)
-        for (int c = 0; c < 8; ++c) {
-            if constexpr (Copies)
-                out[i + c] = rgba[i + c];
-            bad[c] |= isOutside(rgba[i + c], c);
-        }
-    for (; i < 4 * count; ++i) {
-        if constexpr (Copies)
-            out[i] = rgba[i];
-        bad[i % 4] |= isOutside(rgba[i], i % 4);
-    }
-    return (bad[0] | bad[1] | bad[2] | bad[3] | bad[4] | bad[5] | bad[6] | bad[7]) == 0;
-}
+// Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
 inline bool copyAndCheckColors(const float* rgba, int count, float* out)
 {
-    return checkColorsOrCopy<true>(rgba, count, out);
+    constexpr float most = std::numeric_limits<float>::max();
+    constexpr float low[4] = {-most, -most, -most, 0}, high[4] = {most, most, most, 1};
+    int bad[4] = {};
+    for (int i = 0; i < 4 * count; i += 4)
+        for (int c = 0; c < 4; ++c) {
+            const float value = rgba[i + c];
+            out[i + c] = value;
+            bad[c] |= static_cast<int>(!(value >= low[c])) | static_cast<int>(!(value <= high[c]));
+        }
+    return (bad[0] | bad[1] | bad[2] | bad[3]) == 0;
 }
+
+#if defined(DFB_HAS_AVX2_CLONES)
 DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
 {
-    return checkColorsOrCopy<true>(rgba, count, out);
+    constexpr float most = std::numeric_limits<float>::max();
+    const __m256 low = _mm256_setr_ps(-most, -most, -most, 0, -most, -most, -most, 0);
+    const __m256 high = _mm256_setr_ps(most, most, most, 1, most, most, most, 1);
+    __m256 areInside = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
+    int i = 0;
+    for (; i + 2 <= count; i += 2) {
+        const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
+        _mm256_storeu_ps(out + 4 * i, two);
+        areInside = _mm256_and_ps(
+            areInside, _mm256_and_ps(_mm256_cmp_ps(two, low, _CMP_GE_OQ), _mm256_cmp_ps(two, high, _CMP_LE_OQ)));
+    }
+    const bool isLastGood = i == count || copyAndCheckColors(rgba + 4 * i, 1, out + 4 * i);
+    return isLastGood && _mm256_movemask_ps(areInside) == 255;
 }
-inline bool checkColors(const float* rgba, int count) { return checkColorsOrCopy<false>(rgba, count, nullptr); }
-DFB_AVX2 inline bool checkColorsAvx2(const float* rgba, int count)
-{
-    return checkColorsOrCopy<false>(rgba, count, nullptr);
-}
+#endif
 
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
 inline float canonicalDepth(float depth)
@@ -118,16 +114,6 @@ DFB_AVX2 inline bool copyAndCheckDepthsAvx2(const float* depth, int count, float
 {
     return copyAndCheckDepths(depth, count, out);
 }
-
-// False if depths do not travel as they are.
-DFB_INLINE bool areCanonical(const float* depth, int count)
-{
-    int differs = 0;
-    for (int i = 0; i < count; ++i)
-        differs |= static_cast<int>(bitsOf(canonicalDepth(depth[i])) != bitsOf(depth[i]));
-    return differs == 0;
-}
-DFB_AVX2 inline bool areCanonicalAvx2(const float* depth, int count) { return areCanonical(depth, count); }
 
 // Copies `count` pixels of a channel, from place `first` of its plane on, as they travel. False if a colour is not
 // finite, an alpha not within [0, 1], or a depth NaN.
@@ -166,20 +152,26 @@ struct ActivePixels {
         const ConstPlanes planes = tile.planes();
         const auto most =
             static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
-        std::array<std::byte*, channelCount> to{reinterpret_cast<std::byte*>(colors)};
+        struct Target {
+            std::size_t channel;
+            std::byte* to;
+        };
+        std::array<Target, channelCount> targets{{{Color, reinterpret_cast<std::byte*>(colors)}}};
+        std::size_t targetCount = 1;
         for (std::size_t c = Depth; c < channelCount; ++c)
             if (hasChannel(channels, c)) {
                 planes_[c].resize(std::max(planes_[c].size(), most * static_cast<std::size_t>(channelWords[c])));
-                to[c] = reinterpret_cast<std::byte*>(planes_[c].data());
+                targets[targetCount++] = {c, reinterpret_cast<std::byte*>(planes_[c].data())};
             }
-        isClean_ = true;
+        bool isClean = true;
         find(tile, [&](std::size_t first, int count) {
-            for (std::size_t c = 0; c < channelCount; ++c)
-                if (hasChannel(channels, c)) {
-                    isClean_ &= copyAndCheck(planes, c, first, count, to[c]);
-                    to[c] += 4 * static_cast<std::size_t>(channelWords[c]) * static_cast<std::size_t>(count);
-                }
+            for (std::size_t i = 0; i < targetCount; ++i) {
+                const auto [channel, to] = targets[i];
+                isClean &= copyAndCheck(planes, channel, first, count, to);
+                targets[i].to += 4 * static_cast<std::size_t>(channelWords[channel]) * static_cast<std::size_t>(count);
+            }
         });
+        isClean_ = isClean;
     }
     const std::byte* plane(std::size_t channel) const noexcept
     {
@@ -251,19 +243,13 @@ private:
         for (int x0 = begin; x0 < end; x0 += 64) {
             const int count = std::min(64, end - x0);
             const float* from = row + 4 * static_cast<std::ptrdiff_t>(x0);
-            std::uint64_t bits = activePixelBits(from, count);
-            for (int x = x0; bits != 0;) {
-                const int skipped = zerosBelow(bits);
-                bits >>= skipped;
-                x += skipped;
-                const int run = ~bits == 0 ? 64 : zerosBelow(~bits);
-                bits = run == 64 ? 0 : bits >> run;
+            forEachRun(activePixelBits(from, count), [&](int at, int run) {
+                const int x = x0 + at;
                 if (spans.size() > before && spans.back().x + spans.back().count == x)
                     spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
                 else
                     spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
-                x += run;
-            }
+            });
         }
     }
 

@@ -44,22 +44,16 @@ public:
         }
         int begin = 0, end = 0; // a run that may go on in the next word
         forEachWord(x, y, count, [&](std::uint64_t& known, std::uint64_t range, int first) {
-            std::uint64_t bits = range & ~known;
+            const std::uint64_t missing = range & ~known;
             known |= range;
-            for (int at = first; bits != 0;) {
-                const int skipped = zerosBelow(bits);
-                bits >>= skipped;
-                at += skipped;
-                const int run = ~bits == 0 ? 64 : zerosBelow(~bits);
-                bits = run == 64 ? 0 : bits >> run;
-                if (at != end) {
+            forEachRun(missing, [&](int at, int run) {
+                if (first + at != end) {
                     if (end > begin)
                         write(begin, end - begin);
-                    begin = at;
+                    begin = first + at;
                 }
-                at += run;
-                end = at;
-            }
+                end = first + at + run;
+            });
         });
         if (end > begin)
             write(begin, end - begin);
