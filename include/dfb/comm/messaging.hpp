@@ -172,31 +172,19 @@ public:
     template <class Task>
     void submit(Task task)
     {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            ++tasks_;
-        }
-        executor_->submit([this, task = std::move(task)] {
+        submitToExecutor([this, task = std::move(task)] {
             task();
             taskDone();
         });
-        if (!executor_->hasWorkers())
-            notify();
     }
 
     // The same for the handler's work(number); takes no memory.
     void submitWork(int number)
     {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            ++tasks_;
-        }
-        executor_->submit([this, number] {
+        submitToExecutor([this, number] {
             handler_.work(number);
             taskDone();
         });
-        if (!executor_->hasWorkers())
-            notify();
     }
 
     ReductionTable& reductions() noexcept { return reductions_; }
@@ -343,6 +331,18 @@ private:
             if (Clock::now() - now > taken)
                 return;
         }
+    }
+
+    template <class Task>
+    void submitToExecutor(Task task)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            ++tasks_;
+        }
+        executor_->submit(std::move(task));
+        if (!executor_->hasWorkers()) // whoever waits is to run it
+            notify();
     }
 
     void taskDone()

@@ -5,8 +5,8 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
+#include <dfb/comm/message.hpp>
 #include <dfb/detail/small_bytes.hpp>
-#include <dfb/error.hpp>
 
 #include <algorithm>
 #include <cstddef>
@@ -83,7 +83,7 @@ public:
         const bool isNeighbour = up ? std::find(children_.begin(), children_.end(), source) != children_.end()
                                     : rank_ != 0 && source == parent();
         if (!isNeighbour)
-            fail("a part of a reduction from a rank that has none", up ? -1 : parent(), source);
+            detail::failMalformed("a part of a reduction from a rank that has none", up ? -1 : parent(), source);
         const auto floor = forgotten_.find(key.scope);
         if (floor != forgotten_.end() && key.number <= floor->second)
             return;
@@ -91,12 +91,12 @@ public:
             State& state = stateOf(key);
             if (std::any_of(state.parts.begin(), state.parts.end(),
                             [&](const auto& part) { return part.first == source; }))
-                fail("a second part of a reduction", -1, source);
+                detail::failMalformed("a second part of a reduction", -1, source);
             state.parts.emplace_back(source, std::move(bytes));
             advance(lock, state);
         } else if (State* state = find(key)) {
             if (!hasAll(*state))
-                fail("a reduction's result before all of its parts", -1, source);
+                detail::failMalformed("a reduction's result before all of its parts", -1, source);
             finish(lock, *state, bytes);
         }
     }
@@ -131,16 +131,6 @@ public:
 
 private:
     int parent() const noexcept { return rank_ & (rank_ - 1); }
-
-    [[noreturn]] static void fail(const char* message, std::int64_t expected, std::int64_t got)
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::MalformedMessage;
-        info.expected = expected;
-        info.got = got;
-        info.message = message;
-        throw Error(std::move(info));
-    }
 
     // Those that are over are used again.
     struct State {
