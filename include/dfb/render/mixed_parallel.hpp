@@ -16,6 +16,7 @@
 #include <dfb/render/tile_loop.hpp>
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
@@ -209,9 +210,42 @@ struct MixedWork {
 
 // The same in a known order.
 struct OrderedWork : MixedWork {
-    std::vector<int> place;     // of each brick, from the front
-    std::vector<int> firstPair; // of each tile, or -1
-    std::vector<int> empty;     // tiles of this rank
+    std::vector<int> place;             // of each brick, from the front
+    std::vector<int> firstPair;         // of each tile, or -1
+    std::vector<int> empty;             // tiles of this rank
+    std::vector<MixedJob> ordered;      // only renderFrontsFirst() uses it
+    std::atomic<bool> anyHidden{false}; // in the last frame: of this rank's inputs, or by one
+
+    int generationOf(const MixedJob& job) const
+    {
+        return static_cast<int>(job.pair) - firstPair[static_cast<std::size_t>(pairs[job.pair].tile)];
+    }
+
+    // First the tiles of which this rank has the front, then the others from the end of the image back: when it comes
+    // to what an opaque input of another rank hides, that one should have been rendered. Not for images that hide
+    // nothing: their tiles would be complete later.
+    void renderFrontsFirst()
+    {
+        const auto tileOf = [&](std::size_t job) { return pairs[jobs[job].pair].tile; };
+        const auto append = [&](std::size_t begin, std::size_t end) {
+            ordered.insert(ordered.end(), jobs.begin() + static_cast<std::ptrdiff_t>(begin),
+                           jobs.begin() + static_cast<std::ptrdiff_t>(end));
+        };
+        ordered.clear();
+        for (std::size_t begin = 0, end = 0; begin < jobs.size(); begin = end) {
+            while (end < jobs.size() && tileOf(end) == tileOf(begin))
+                ++end;
+            if (generationOf(jobs[begin]) == 0)
+                append(begin, end);
+        }
+        for (std::size_t end = jobs.size(), begin = end; end > 0; end = begin) {
+            while (begin > 0 && tileOf(begin - 1) == tileOf(end - 1))
+                --begin;
+            if (generationOf(jobs[begin]) > 0)
+                append(begin, end);
+        }
+        jobs.swap(ordered);
+    }
 };
 
 // Calls renderBrick, and takes note of the cost for an owner that plans.
@@ -305,8 +339,9 @@ FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const
 
 // The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
 // visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
-// manifest. What an opaque tile hides is not sent, nor rendered by those who have heard of it in time. Only where one
-// order is right for all rays of a frame: not with an extended lens or several eyes.
+// manifest. What an opaque tile hides is not sent, nor rendered by those who have heard of it in time: ranks that had
+// to do with that in the last frame begin with the tiles of which they have the front. Only where one order is right
+// for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
 [[nodiscard]] typename FrameBuffer::Frame startOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                                                        const std::vector<int>& order, TileBrickOwner& owner,
@@ -349,20 +384,26 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
                 frame.setTile(tile);
             }
         });
+        if (work.anyHidden.exchange(false))
+            work.renderFrontsFirst();
         loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
             const BrickInTile& pair = pairs[jobs[i].pair];
             const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
-            const int generation = static_cast<int>(jobs[i].pair) - firstPair[static_cast<std::size_t>(pair.tile)];
-            if (frame.isHidden(pair.tile, generation))
+            const int generation = work.generationOf(jobs[i]);
+            if (frame.isHidden(pair.tile, generation)) {
+                work.anyHidden = true;
                 return;
+            }
             frame.start(tile, pair.tile, jobs[i].pass);
             tile.generation = generation;
             tile.children = jobs[i].pair + 1 < pairs.size() && pairs[jobs[i].pair + 1].tile == pair.tile;
             tile.source = brick.id;
             detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
             frame.setTile(tile);
-            if (tile.children > 0 && frame.hidesRest(tile))
+            if (tile.children > 0 && frame.hidesRest(tile)) {
+                work.anyHidden = true;
                 detail::hideBehind(frame, world, pairs, jobs[i].pair, generation, owner);
+            }
         });
     });
     return frame;
