@@ -20,6 +20,7 @@
 #include <mutex>
 #include <optional>
 #include <string>
+#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -89,6 +90,7 @@ public:
             mine = {false, wrong};
         const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         if (!all.fine) {
+            messaging_->stop();
             messaging_.reset();
             throw InvalidArgument(all.text);
         }
@@ -100,7 +102,7 @@ public:
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
     // Collective. After the framebuffers whose pixel operation sends here.
-    ~DisplayWall() = default;
+    ~DisplayWall() { messaging_->stop(); }
 
     const WallLayout& layout() const noexcept { return layout_; }
 
@@ -116,7 +118,9 @@ public:
 
     // Collective, after the frame of that number has ended well on all ranks: returns when all displays have it, which
     // is the moment to show it on all of them. If some display has not got all of it within `timeoutMs` (0: no limit),
-    // throws Error (TimedOut), the same on all ranks. Throws TransportError.
+    // throws Error (TimedOut), or MalformedMessage if a part of it, or of a later frame, was not to be believed; the
+    // same on all ranks. What the displays show stays. Whatever the limit, waits for all ranks to call it, as
+    // allReduce() does. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
         messaging_->messenger().expectMessages(true);
@@ -141,12 +145,13 @@ public:
                 std::swap(shown_.at(display), picture.image);
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
         last_ = frame;
-        if (!all.fine) {
+        if (isMalformed(missing) && frame >= errorFrame_)
             error_.clear();
+        if (!all.fine) {
             ErrorInfo info;
-            info.kind = ErrorKind::TimedOut;
+            info.kind = isMalformed(all.text) ? ErrorKind::MalformedMessage : ErrorKind::TimedOut;
             info.frame = frame;
-            info.message = all.text;
+            info.message = all.text.substr(isMalformed(all.text) ? malformed.size() : 0);
             throw Error(std::move(info));
         }
     }
@@ -163,6 +168,7 @@ public:
     // Called by ToWall, from any thread.
     void put(const PixelTile& tile)
     {
+        noteFrame(tile.frame);
         const std::size_t pixelBytes = bytesPerPixel(format_);
         const auto tileWidth = static_cast<std::size_t>(tile.region.width());
         for (int d = 0; d < layout_.displayCount(); ++d) {
@@ -197,9 +203,18 @@ private:
     };
     static constexpr std::size_t prefix = sizeof(detail::MessageHeader) + sizeof(PartHeader);
 
+    // So many frames the others may be ahead of this rank: of those in flight, and of some that have failed. What says
+    // it is of a later one is not believed, as each takes the memory of its pictures.
+    static constexpr std::int64_t framesAhead = 16;
+
+    // In front of an Agreement's text that is not about time.
+    static constexpr std::string_view malformed = "malformed: ";
+    static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
+
     struct Picture {
         Image image;
         std::int64_t pixelsLeft = 0;
+        std::vector<std::uint64_t> covered{}; // a bit for each pixel, each row from a word on
     };
     using Pictures = std::map<int, Picture>; // by display
 
@@ -244,18 +259,32 @@ private:
                 messaging_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
                 break;
             case detail::MessageKind::FinishedTiles: store(header.number, message); break;
-            default: break;
+            default:
+                detail::failMalformed("a message of a kind that no wall gets", -1,
+                                      static_cast<std::int64_t>(header.kind));
             }
         } catch (const Error& e) {
-            undecodable(source, e.info());
+            if (header.kind == detail::MessageKind::FinishedTiles)
+                refuse(source, e.info(), header.number);
+            else // it may have been one that finish() waits for
+                messaging_->giveUp(source, e.info());
         }
     }
 
     void undecodable(int source, const ErrorInfo& error) override
     {
+        messaging_->keepDamage(source, error); // it may have been a part of what finish() waits for
+        refuse(source, error, 0);
+    }
+
+    // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: what the message says.
+    void refuse(int source, const ErrorInfo& error, std::int64_t frame)
+    {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             error_ = error.message + ", in a message from rank " + std::to_string(source) + " to the wall";
+            errorFrame_ = std::max({errorFrame_, newest_, coming_.empty() ? 0 : coming_.rbegin()->first,
+                                    frame <= lastPossible() ? frame : 0});
         }
         messaging_->notify();
     }
@@ -285,7 +314,10 @@ private:
             const std::lock_guard<std::mutex> lock(mutex_);
             if (frame <= last_)
                 return;
+            if (frame > lastPossible())
+                detail::failMalformed("a part of a display's frame that no rank can have begun", lastPossible(), frame);
             pictures = picturesOf(frame);
+            cover(pictures->at(where.display), part);
         }
         Picture& picture = pictures->at(where.display);
         std::byte* pixels = picture.image.bytes();
@@ -300,12 +332,38 @@ private:
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             picture.pixelsLeft -= static_cast<std::int64_t>(part.width()) * part.height();
-            if (picture.pixelsLeft < 0)
-                detail::failMalformed("more of a display than it has");
             complete = picture.pixelsLeft == 0;
         }
         if (complete)
             messaging_->notify();
+    }
+
+    // Takes note that these pixels have come, and must not come again; under mutex_.
+    void cover(Picture& picture, const Region& part) const
+    {
+        std::uint64_t twice = 0;
+        for (int y = part.y0; y < part.y1; ++y)
+            for (int x = part.x0; x < part.x1; x = (x / 64 + 1) * 64) {
+                const int count = std::min(64 - x % 64, part.x1 - x);
+                const std::uint64_t pixels = ~std::uint64_t{0} >> (64 - count) << x % 64;
+                std::uint64_t& word =
+                    picture.covered[static_cast<std::size_t>(y) * wordsPerRow() + static_cast<std::size_t>(x) / 64];
+                twice |= word & pixels;
+                word |= pixels;
+            }
+        if (twice != 0)
+            detail::failMalformed("a part of a display overlaps another");
+    }
+    std::size_t wordsPerRow() const { return (static_cast<std::size_t>(layout_.displayWidth) + 63) / 64; }
+
+    // Under mutex_.
+    std::int64_t lastPossible() const { return std::max(last_, newest_) + framesAhead; }
+
+    // This rank has begun it.
+    void noteFrame(std::int64_t frame)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        newest_ = std::max(newest_, frame);
     }
 
     // Of all displays of this rank; under mutex_.
@@ -316,7 +374,9 @@ private:
             pictures = std::make_shared<Pictures>();
             for (const auto& [d, shown] : shown_)
                 pictures->emplace(d, Picture{Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0),
-                                             static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight});
+                                             static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight,
+                                             std::vector<std::uint64_t>(static_cast<std::size_t>(layout_.displayHeight)
+                                                                        * wordsPerRow())});
         }
         return pictures;
     }
@@ -341,7 +401,7 @@ private:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (!error_.empty())
-            return error_;
+            return std::string(malformed) + error_;
         std::string text;
         for (const auto& [display, image] : shown_) {
             const std::int64_t left = picturesOf(frame)->at(display).pixelsLeft;
@@ -360,7 +420,9 @@ private:
     std::mutex mutex_;
     std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels
     std::int64_t last_ = 0;                                    // finished; under mutex_
+    std::int64_t newest_ = 0;                                  // of which this rank has put() a tile; under mutex_
     std::string error_;                                        // under mutex_
+    std::int64_t errorFrame_ = 0;                              // the last that error_ may be about; under mutex_
 
     std::unique_ptr<detail::Messaging<Transport>> messaging_; // last: its tasks use the others
 };

@@ -210,7 +210,9 @@ public:
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
     // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` can not be. Frames begin
-    // and end in the same order on all ranks; the oldest must end before one too many begins.
+    // and end in the same order on all ranks, and with several in flight also each begin() before or after the same
+    // end(): setTile() may wait for room that a rank makes only when it has begun that frame, too. The oldest must end
+    // before one too many begins.
     Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
@@ -223,12 +225,14 @@ public:
     enum class Reduce : std::uint8_t { Sum, Min, Max };
 
     // Collective, outside frames: combines `values` element by element over all ranks; the result is the same
-    // everywhere. For a user's own figures, or to agree on whether all ranks could load their data. Throws
-    // InvalidArgument on every rank if their numbers of values differ.
+    // everywhere; a sum that is too large wraps around. For a user's own figures, or to agree on whether all ranks
+    // could load their data. Throws InvalidArgument on every rank if their numbers of values differ.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
         return engine().allReduce(values, [how](std::int64_t x, std::int64_t y) {
-            return how == Reduce::Sum ? x + y : how == Reduce::Min ? std::min(x, y) : std::max(x, y);
+            if (how == Reduce::Sum)
+                return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
+            return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
         });
     }
 

@@ -75,7 +75,8 @@ public:
                     error = std::current_exception();
                 stop.store(true, std::memory_order_relaxed);
             }
-            while (runOne()) {
+            // Not within a task: tasks with loops would run in each other, as deep as there are many.
+            while (depth() == 0 && runOne()) {
             }
         };
         run(count, std::ref(guarded)); // which, unlike a copy, takes no memory
@@ -99,11 +100,20 @@ protected:
                 return false;
             task = tasks_.pop();
         }
+        ++depth();
         task();
+        --depth();
         return true;
     }
 
 private:
+    // Of tasks that the calling thread is in.
+    static int& depth() noexcept
+    {
+        static thread_local int depth = 0;
+        return depth;
+    }
+
     std::mutex mutex_;
     detail::Fifo<Task> tasks_;
 };

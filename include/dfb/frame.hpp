@@ -34,8 +34,8 @@ enum class CompressionMode : std::uint8_t {
          // messages become smaller by it, as each rank finds out by itself
 };
 
-// What a framebuffer is made with. Everything but executor, progress, peerTimeoutMs and onPeerLost must be the same on
-// all ranks, which is checked when it is made.
+// What a framebuffer is made with. Everything but executor, progress, sharedMemory, peerTimeoutMs and onPeerLost must
+// be the same on all ranks, as must the types of its operations, which is checked when it is made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank

@@ -147,7 +147,7 @@ void reductions(fuzz::Input in)
         }
         case 2: {
             const bool isKnown = !m.over && (m.entered || !m.parts.empty());
-            const bool canBe = rank != 0 && source == parent && (!isKnown || hasAll());
+            const bool canBe = rank != 0 && source == parent && isKnown && hasAll();
             const bool no = refused([&] { table.receive(source, key, false, Bytes(1)); });
             fuzz::require(no == !canBe, "a result comes from the parent, after all parts");
             if (!no && isKnown)

@@ -206,8 +206,8 @@ void play(std::uint8_t flags, fuzz::Input& in)
     const auto peer = std::make_shared<Peer>();
     auto config = configFor(flags);
     config.executor = peer->tasks;
-    const auto agreement = d::Agreement::of(config, 1, side, TileOp::channels, Pipeline::travelling(config), tileCount,
-                                            [](int tile) { return ownerOf(tile); });
+    const auto agreement = d::Agreement::of<TileOp, dfb::NoPixelOp>(config, 1, side, Pipeline::travelling(config),
+                                                                    tileCount, [](int tile) { return ownerOf(tile); });
     if (flags & NoConfiguration)
         for (std::string message = nextMessage(in, 0); !message.empty(); message = nextMessage(in, 0))
             peer->send(message);

@@ -8,6 +8,7 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <string>
@@ -185,6 +186,19 @@ TEST_CASE("Framebuffers on one messenger are made and gone in any order", "[edge
     });
     CHECK(wrong == 0);
     CHECK(images > 15);
+}
+
+TEST_CASE("A sum over all ranks that is too large wraps around", "[edges]")
+{
+    const std::int64_t most = std::numeric_limits<std::int64_t>::max(), least = -most - 1;
+    std::atomic<int> wrong{0};
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, configOf(scene::makeScene(1)));
+        const bool isFirst = fb.rank() == 0;
+        const auto sums = fb.allReduce({isFirst ? most : 1, isFirst ? -1 : least}, decltype(fb)::Reduce::Sum);
+        wrong += sums != std::vector<std::int64_t>{least, most};
+    });
+    CHECK(wrong == 0);
 }
 
 #if defined(DFB_HAS_TBB)

@@ -1,11 +1,13 @@
 // What goes wrong: every call that can not be right, every failure of a frame, and ranks that leave. The same error on
 // every rank, no hang, and the next frame is right.
+#include "board.hpp"
 #include "catch.hpp"
 #include "forward.hpp"
 #include "scene.hpp"
 
 #include <algorithm>
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <functional>
 #include <future>
@@ -16,6 +18,7 @@
 #include <numeric>
 #include <stdexcept>
 #include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -457,6 +460,82 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
             }
 }
 
+TEST_CASE("Ranks that were given other passes or samples find out, also where nobody waits for a time-out", "[errors]")
+{
+    // The odd one has no data and owns tiles: it waits for what is not rendered elsewhere, and the others for its
+    // tiles.
+    struct Case {
+        bool samples;
+        int odd;
+    };
+    const Scene s = scene::makeScene(3);
+    const auto run = [&](const Case& c) {
+        return badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+            const bool isOdd = fb.rank() == c.odd;
+            dfb::FrameParams params = scene::paramsOf(s);
+            const dfb::TileSamples samples{0, isOdd ? 2 : 1};
+            if (c.samples)
+                params.samples = std::make_shared<std::vector<dfb::TileSamples>>(
+                    static_cast<std::size_t>(fb.layout().tileCount()), samples);
+            else
+                params.passes = samples.count;
+            const dfb::World world(isOdd ? std::vector<dfb::Brick>() : scene::bricksOf(s, fb.rank(), fb.size()));
+            dfb::renderDataParallel(
+                fb, world, scene::FlatCamera(),
+                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, params);
+        });
+    };
+    board::eachAtOnce(std::vector<Case>{{false, 0}, {false, 1}, {false, 2}, {true, 0}, {true, 1}, {true, 2}}, run,
+                      [](const Case& c, const BadFrame& bad) {
+                          INFO((c.samples ? "samples" : "passes") << ", rank " << c.odd << joined(bad.texts));
+                          CHECK(allSame(bad.texts));
+                          CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
+                          CHECK(bad.wrongAfter == 0);
+                      });
+}
+
+namespace {
+
+struct Same {
+    static constexpr bool pointwise = true;
+    void process(dfb::PixelTile&) const {}
+};
+
+// What came of it where rank 0 is made with one type, rank 1 with another.
+template <class One, class Other>
+std::vector<std::string> madeOf(const Scene& s)
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        texts[static_cast<std::size_t>(communicator.rank())] = outcomeOf([&] {
+            if (communicator.rank() == 0)
+                One(communicator, configOf(s));
+            else
+                Other(communicator, configOf(s));
+        });
+    });
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("Ranks with different operations are refused on every rank", "[errors]")
+{
+    using Blended = FrameBuffer<Blend>;
+    const Scene s = scene::makeScene(3);
+    const auto tileOps = madeOf<Blended, FrameBuffer<dfb::BasicDepthComposite<16>>>(s);
+    const auto pixelOps = madeOf<FrameBuffer<Blend, Same>, Blended>(s);
+    INFO(joined(tileOps) << joined(pixelOps));
+    CHECK(allSame(tileOps));
+    CHECK(has(tileOps[0], "InvalidArgument"));
+    CHECK(has(tileOps[0], "[tile operation dfb::BasicAlphaBlend<16"));
+    CHECK(has(tileOps[0], "and [tile operation dfb::BasicDepthComposite<16"));
+    CHECK_FALSE(has(tileOps[0], "pixel operation"));
+    CHECK(allSame(pixelOps));
+    CHECK(has(pixelOps[0], "and [pixel operation dfb::NoPixelOp]"));
+    CHECK(madeOf<Blended, Blended>(s) == std::vector<std::string>(2, "fine"));
+}
+
 namespace {
 
 struct FaultyNewFrame {
@@ -760,6 +839,89 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
     CHECK(late[0] >= 1);
 }
 
+namespace {
+
+// Of two inputs where one was announced the other is there first; the announced one comes when its owner has voted.
+template <class TileOp>
+std::vector<std::string> withInputTooMany(bool allowPartial)
+{
+    const auto board = std::make_shared<Switchboard>();
+    std::promise<void> ownerVoted;
+    std::atomic<bool> said{false};
+    board->inspect = [&](int from, int, const dfb::detail::MessageHeader& header, dfb::Buffer& message) {
+        if (from == 1 && header.kind == dfb::detail::MessageKind::ReduceUp && header.number == 1
+            && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) != 0 && !said.exchange(true))
+            ownerVoted.set_value();
+        const bool announced =
+            header.kind == dfb::detail::MessageKind::Fragment
+            && dfb::detail::loadAs<dfb::detail::FragmentHeader>(message.data() + sizeof header).source == 7;
+        return announced ? Switchboard::Verdict::Hold : Switchboard::Verdict::Pass;
+    };
+    const Scene s = scene::makeScene(0, 1, 16, 16);
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        using Fb = InspectedFrameBuffer<TileOp>;
+        auto config = configOf(s);
+        config.depth = false;
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        Fb fb({communicator, board}, config);
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            dfb::FrameParams params;
+            params.timeoutMs = 20000;
+            params.allowPartial = allowPartial;
+            auto frame = fb.begin(params);
+            auto tile = std::make_unique<typename Fb::Tile>();
+            if (fb.rank() == 1) {
+                send(frame, *tile, 0, 0, 1, 0, 1);
+            } else {
+                send(frame, *tile, 0, 1, 7, 0, 0);
+                send(frame, *tile, 0, 1, 99, 0, 0);
+                ownerVoted.get_future().wait_for(std::chrono::seconds(20));
+                board->release();
+            }
+            frame.end();
+        });
+    });
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("An input that takes the place of an announced one is an error, whatever the operation", "[errors]")
+{
+    for (const bool allowPartial : {false, true})
+        for (const auto& texts :
+             {withInputTooMany<Blend>(allowPartial), withInputTooMany<dfb::BasicDepthComposite<16>>(allowPartial),
+              withInputTooMany<dfb::BasicOrderedBlend<16>>(allowPartial)}) {
+            INFO(joined(texts));
+            CHECK(allSame(texts));
+            CHECK(has(texts[0], "FrameError: dfb: ranks disagree: expected 0, got 1: more inputs were sent"));
+        }
+}
+
+TEST_CASE("Cancelling a frame that is over changes nothing", "[errors]")
+{
+    const Scene s = scene::makeScene(3);
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(s));
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            dfb::FrameParams params;
+            params.declared = true;
+            auto first = fb.begin(params);
+            first.declare({});
+            first.end();
+            first.cancel();
+            auto second = fb.begin(params);
+            second.declare({});
+            first.cancel();
+            second.end();
+        });
+    });
+    INFO(joined(texts));
+    CHECK(texts == std::vector<std::string>(2, "fine"));
+}
+
 TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]")
 {
     const Scene s = scene::makeScene(6);
@@ -1015,4 +1177,115 @@ TEST_CASE("runRanks refuses a number of ranks that is none", "[errors]")
     int calls = 0;
     dfb::runRanks(1, [&](dfb::InprocCommunicator c) { calls += c.rank() == 0 && c.size() == 1; });
     CHECK(calls == 1);
+}
+
+namespace {
+
+// Sends what the tiles of this rank wait for.
+template <class Fb, class Frame>
+void sendOwned(Fb& fb, Frame& frame)
+{
+    auto tile = std::make_unique<typename Fb::Tile>();
+    for (const int index : fb.ownedTiles())
+        send(frame, *tile, index, 0, 0, 0, 0);
+}
+
+// How a partial frame of two ranks ended, and the one after it. On rank 0 a tile is given up first, then `more(frame)`
+// happens; `params(rank)` says with what it begins.
+template <class Params, class More>
+std::vector<std::string> partialFrame(const Params& params, const More& more)
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(0)));
+        std::string failure;
+        const std::string text = outcomeOf([&] {
+            auto frame = fb.begin(params(fb.rank()));
+            sendOwned(fb, frame);
+            if (fb.rank() == 0) {
+                frame.abort(std::make_exception_ptr(std::runtime_error("no such brick")), 0);
+                more(frame);
+            } else {
+                while (!frame.failed())
+                    std::this_thread::yield();
+            }
+            const auto report = frame.end();
+            failure = report.failure ? ", " + report.failure->describe() : "";
+        });
+        const std::string after = outcomeOf([&] {
+            auto frame = fb.begin();
+            sendOwned(fb, frame);
+            frame.end();
+        });
+        texts[static_cast<std::size_t>(fb.rank())] = text + failure + ", then " + after;
+    });
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("What ends a partial frame is told to all ranks, also after an error that it could bear", "[errors]")
+{
+    const auto params = [](int) {
+        dfb::FrameParams p;
+        p.allowPartial = true;
+        p.timeoutMs = 20000;
+        return p;
+    };
+    const auto texts = partialFrame(params, [](auto& frame) { frame.cancel(); });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "no such brick"));
+    CHECK(has(texts[0], "then fine"));
+}
+
+TEST_CASE("Ranks that began a partial frame differently disagree, whatever else went wrong", "[errors]")
+{
+    const auto params = [](int rank) {
+        dfb::FrameParams p;
+        p.allowPartial = true;
+        p.timeoutMs = 20000;
+        p.background[2] = static_cast<float>(rank);
+        return p;
+    };
+    const auto texts = partialFrame(params, [](auto&) {});
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "FrameError: dfb: ranks disagree"));
+    CHECK(has(texts[0], "then fine"));
+}
+
+TEST_CASE("An operation that takes longer than a frame may fails the frame, not the framebuffer", "[errors]")
+{
+    static std::atomic<int> slowMs{0};
+    struct Slow {
+        void process(dfb::PixelTile&) const { std::this_thread::sleep_for(std::chrono::milliseconds(slowMs)); }
+    };
+    constexpr int limitMs = 1000;
+    std::vector<std::string> texts(2), after(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        using Fb = FrameBuffer<Blend, Slow>;
+        auto config = configOf(scene::makeScene(0, 1, 32, 16)); // a tile each
+        Fb fb(communicator, config);
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        slowMs = 5 * limitMs / 2;
+        dfb::FrameParams params;
+        params.timeoutMs = limitMs;
+        texts[rank] = outcomeOf([&] {
+            auto frame = fb.begin(params);
+            sendOwned(fb, frame);
+            frame.end();
+        });
+        slowMs = 0;
+        after[rank] = outcomeOf([&] {
+            auto frame = fb.begin();
+            sendOwned(fb, frame);
+            frame.end();
+        });
+    });
+    INFO(joined(texts) << joined(after));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "FrameError: dfb: timed out"));
+    CHECK(has(texts[0], "are still being finished"));
+    CHECK(after == std::vector<std::string>(2, "fine"));
 }

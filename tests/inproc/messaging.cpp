@@ -3,6 +3,7 @@
 #include "board.hpp"
 #include "catch.hpp"
 #include "flood.hpp"
+#include "forward.hpp"
 #include "scene.hpp"
 
 #include <algorithm>
@@ -400,7 +401,7 @@ struct Damaged {
     std::size_t wrong = 0;
 };
 
-Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeoutMs)
+Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeoutMs, int peerTimeoutMs = 0)
 {
     Damaged result;
     result.before.resize(2);
@@ -424,6 +425,7 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
         config.checksums = true;
+        config.peerTimeoutMs = peerTimeoutMs;
         FrameBuffer<Blend> fb(communicator, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         const auto frame = [&](int limit) {
@@ -503,6 +505,179 @@ TEST_CASE("With checksums a changed byte anywhere is an error, never a wrong ima
         for (const std::string& text : d.after)
             CHECK((dead ? text.empty() || has(text, "TransportError") : text == "fine"));
     });
+}
+
+TEST_CASE("A damaged vote or verdict does not hang a frame that has no time-out", "[messaging]")
+{
+    enum : std::uint32_t { FrameVerdict = 2 };
+    board::eachAtOnce(
+        std::vector<MessageKind>{MessageKind::ReduceUp, MessageKind::ReduceDown},
+        [](MessageKind kind) { return damagedFrame(kind, FrameVerdict, -1, 0, 300); },
+        [](MessageKind kind, const Damaged& d) {
+            INFO((kind == MessageKind::ReduceUp ? "vote" : "verdict") << joined(d.texts));
+            CHECK(d.done);
+            CHECK(d.wrong == 0);
+            // Who has the verdict has a frame that ended well; it learns of the end of the others in the next one.
+            CHECK(has(d.texts[1], "TransportError"));
+            CHECK((kind == MessageKind::ReduceDown || has(d.texts[0], "no verdict after 300 ms")
+                   || has(d.texts[1], "no verdict after 300 ms")));
+            CHECK((d.texts[0] == "fine" ? has(d.after[0], "TransportError") : has(d.texts[0], "TransportError")));
+        });
+}
+
+TEST_CASE("With frames in flight a damaged message costs frames, not the framebuffer", "[messaging]")
+{
+    const Scene s = sceneFor(Loop::Declared);
+    const auto board = std::make_shared<Board>();
+    std::atomic<bool> done{false};
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (header.kind == MessageKind::Fragment && !done.exchange(true))
+            message.data()[message.size() - 1] ^= std::byte{1};
+        return Board::What::Pass;
+    };
+    std::vector<std::string> texts(2);
+    std::vector<std::vector<std::string>> after(2);
+    std::size_t wrong = 1;
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(s);
+        config.checksums = true;
+        config.framesInFlight = 2; // the second has never begun one when the first fails
+        FrameBuffer<Blend> fb(communicator, config);
+        const auto rank = static_cast<std::size_t>(fb.rank());
+        texts[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+        after[rank].push_back(outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); }));
+        after[rank].push_back(outcomeOf([&] {
+            const auto report = scene::renderLoop(fb, s, Loop::Declared);
+            if (fb.isDisplayRank())
+                wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+        }));
+    });
+    for (std::size_t rank = 0; rank < 2; ++rank) {
+        INFO(texts[rank] << joined(after[rank]));
+        CHECK(has(texts[rank], "FrameError: dfb: malformed message"));
+        // Nobody knows that it was not for this one.
+        CHECK(has(after[rank][0], "FrameError: dfb: malformed message"));
+        CHECK(after[rank][1] == "fine");
+    }
+    CHECK(wrong == 0);
+}
+
+TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in an error on every rank", "[messaging]")
+{
+    const Scene s = sceneFor(Loop::Declared);
+    const auto board = std::make_shared<Board>();
+    std::atomic<bool> armed{false}, done{false};
+    std::promise<void> came;
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (armed && header.kind == MessageKind::ReduceUp && !done.exchange(true))
+            message.data()[message.size() - 1] ^= std::byte{1};
+        return Board::What::Pass;
+    };
+    board->passed = [&](int, int, const MessageHeader& header) {
+        if (header.kind == MessageKind::ReduceUp && armed.exchange(false))
+            came.set_value();
+    };
+    std::vector<std::string> texts(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(s);
+        config.checksums = true;
+        config.peerTimeoutMs = 300;
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
+        FrameBuffer<Blend> fb(communicator, config);
+        scene::renderLoop(fb, s, Loop::Declared);
+        if (fb.rank() == 1) {
+            armed = true;
+        } else {
+            came.get_future().wait_for(std::chrono::seconds(20));
+            while (fb.poll()) {
+            }
+        }
+        texts[static_cast<std::size_t>(fb.rank())] =
+            outcomeOf([&] { fb.allReduce({7}, FrameBuffer<Blend>::Reduce::Sum); });
+    });
+    INFO(joined(texts));
+    for (const std::string& text : texts) {
+        CHECK(has(text, "TransportError: dfb: malformed message"));
+        CHECK(has(text, "in a message from rank 1"));
+    }
+}
+
+TEST_CASE("A reduction that no rank can be at is malformed, and nobody waits for it", "[messaging]")
+{
+    // Of the constructor's reduction, which is number 0: its part becomes that of another.
+    for (const std::int64_t number : {-1, 1, 1000000}) {
+        const auto board = std::make_shared<Board>();
+        std::atomic<bool> done{false};
+        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (header.kind == MessageKind::ReduceUp && !done.exchange(true))
+                std::memcpy(message.data() + offsetof(MessageHeader, number), &number, sizeof number);
+            return Board::What::Pass;
+        };
+        std::vector<std::string> texts(2);
+        runOn(board, 2, [&](const auto& communicator) {
+            texts[static_cast<std::size_t>(communicator.inner.rank())] =
+                outcomeOf([&] { FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared))); });
+        });
+        INFO(number << joined(texts));
+        for (const std::string& text : texts)
+            CHECK(has(text, "TransportError: dfb: malformed message"));
+    }
+}
+
+TEST_CASE("A reduction's result is malformed where nothing was given to it", "[messaging]")
+{
+    dfb::ReductionTable leaf(1, 2, [](int, const dfb::ReductionKey&, bool, const dfb::detail::SmallBytes&) {});
+    CHECK_THROWS_AS(leaf.receive(0, {2, 1}, false, dfb::detail::SmallBytes(1)), dfb::Error);
+}
+
+namespace {
+
+// Rank 1 sends an input right behind its part of the constructor's reduction.
+class Hasty : public Forward<dfb::InprocTransport> {
+public:
+    using Communicator = dfb::InprocCommunicator;
+    [[maybe_unused]] static constexpr const char* name = "hasty";
+    using Forward::Forward;
+
+    void send(int to, dfb::Buffer&& message)
+    {
+        auto header = dfb::detail::loadAs<MessageHeader>(message.data());
+        inner_.send(to, std::move(message));
+        if (rank() != 1 || header.kind != MessageKind::ReduceUp)
+            return;
+        header.kind = MessageKind::Fragment;
+        header.number = 1;
+        ++header.sequence;
+        inner_.send(to, dfb::detail::makeMessage(*pool_, header, nullptr, 0));
+        sentBoth().set_value();
+    }
+    static std::promise<void>& sentBoth()
+    {
+        static std::promise<void> promise;
+        return promise;
+    }
+
+private:
+    std::shared_ptr<dfb::MemoryPool> pool_ = dfb::MemoryPool::create(false);
+};
+
+} // namespace
+
+TEST_CASE("What has come for a framebuffer that is refused is still in order when it ends", "[messaging]")
+{
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        auto config = configOf(sceneFor(Loop::Declared));
+        config.width += communicator.rank();
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // what it has not run waits for the end
+        if (communicator.rank() == 0)
+            Hasty::sentBoth().get_future().wait_for(std::chrono::seconds(20));
+        texts[static_cast<std::size_t>(communicator.rank())] =
+            outcomeOf([&] { dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, Hasty> fb(communicator, config); });
+    });
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(has(text, "InvalidArgument: dfb: invalid argument: ranks 0 and 1 were configured differently"));
 }
 
 TEST_CASE("A damaged message that comes before its frame has begun fails that frame on every rank", "[messaging]")
@@ -814,4 +989,61 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
         CHECK(moved);
         CHECK(wrong == std::vector<std::size_t>(2));
     }
+}
+
+TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[messaging]")
+{
+    // 64 tiles of 64 KiB, kept until the end, and a pool of four; the frame is cancelled when they are finished.
+    constexpr int tiles = 64;
+    static std::atomic<int> finished{0};
+    static std::promise<void> areFinished;
+    struct Count {
+        void process(dfb::PixelTile&) const
+        {
+            if (++finished == tiles)
+                areFinished.set_value();
+        }
+    };
+    using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, Count, BoardTransport>;
+    dfb::FrameParams params;
+    params.allowPartial = true;
+    params.timeoutMs = 20000;
+    std::vector<dfb::FrameReport> reports(2);
+    runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
+        auto config = configOf(scene::makeScene(0, 1, 64 * (tiles + 1), 64));
+        config.format = dfb::OutputFormat::RGBA32F;
+        config.messagePoolBytes = 0;
+        config.gather = dfb::GatherMode::AtEnd;
+        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        Fb fb(communicator, config);
+        auto frame = fb.begin(params);
+        auto tile = std::make_unique<Fb::Tile>();
+        for (int index = 0; index < tiles && fb.rank() == 1; ++index) {
+            frame.start(*tile, index);
+            for (std::size_t i = 0; i < 64 * 64; ++i) { // not what a few bytes could say
+                tile->color[4 * i] = static_cast<float>(i % 777) / 1000;
+                tile->color[4 * i + 1] = tile->color[4 * i + 3] = 0.5f;
+                tile->depth[i] = static_cast<float>(i);
+            }
+            frame.setTile(*tile);
+        }
+        if (fb.rank() == 0) {
+            areFinished.get_future().wait_for(std::chrono::seconds(20));
+            frame.cancel();
+        }
+        reports[static_cast<std::size_t>(fb.rank())] = frame.end();
+        if (fb.isDisplayRank())
+            for (int index = 0; index < tiles; ++index)
+                if (fb.isComplete(index)
+                    && fb.image().rgba32f()[4 * 64 * static_cast<std::size_t>(index) + 1]
+                           < 0.5f) // the background shines through
+                    finished = -1;
+    });
+    CHECK(finished == tiles);
+    REQUIRE(reports[0].failure);
+    CHECK(reports[0].failure->kind == dfb::ErrorKind::Cancelled);
+    // One was never sent; another may not have been handed on when the frame was cancelled.
+    CHECK(reports[0].tilesIncomplete >= 1);
+    CHECK(reports[0].tilesIncomplete <= 2);
+    CHECK(reports[0].compositingOverheadMs < params.timeoutMs / 2);
 }

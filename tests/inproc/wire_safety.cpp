@@ -9,7 +9,9 @@
 #include <cstdint>
 #include <cstring>
 #include <functional>
+#include <limits>
 #include <memory>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -146,7 +148,8 @@ struct Changed {
     std::size_t wrong = 0;
 };
 
-Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::function<void(dfb::Buffer&)>& change)
+Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::function<void(dfb::Buffer&)>& change,
+                std::optional<MessageKind> overtaken = std::nullopt)
 {
     Changed result;
     result.texts.resize(3);
@@ -159,7 +162,11 @@ Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::fu
             && (!isReduction || dfb::detail::loadAs<std::uint32_t>(message.data() + body) == scope)
             && !done.exchange(true))
             change(message);
-        return Board::What::Pass;
+        return from == sender && overtaken == header.kind && !done ? Board::What::Hold : Board::What::Pass;
+    };
+    watched->passed = [&](int from, int, const MessageHeader& header) {
+        if (from == sender && header.kind == kind && done)
+            watched->release();
     };
     const Scene s = scene::makeScene(6);
     runOn(
@@ -191,12 +198,17 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
         MessageKind kind;
         int sender;
         std::function<void(dfb::Buffer&)> change;
-        std::string part; // of the error
+        std::string part;                       // of the error
+        std::optional<MessageKind> overtaken{}; // those of this kind come after it
     };
     const dfb::TileLayout layout(97, 61, 16);
     std::int32_t ofDisplay = 0; // a tile that rank 1 does not own
     while (dfb::latticeOwner(ofDisplay, layout, 3) == 1)
         ++ofDisplay;
+    std::int64_t owned = 0; // by rank 1
+    for (int tile = 0; tile < layout.tileCount(); ++tile)
+        owned += dfb::latticeOwner(tile, layout, 3) == 1;
+    const auto oneLess = [](dfb::Buffer& m) { put(m, body, dfb::detail::loadAs<std::int64_t>(m.data() + body) - 1); };
     const std::vector<Lie> lies{
         {"an input of a frame far ahead", MessageKind::Fragment, 2,
          [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, number), std::int64_t{1000}); }, "no rank can have begun"},
@@ -227,9 +239,14 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
          [](dfb::Buffer& m) { put(m, body, std::uint64_t{16}); }, "a batch of tiles has the wrong size"},
         {"more finished tiles than there are", MessageKind::TilesDone, 1,
          [](dfb::Buffer& m) { put(m, body, std::int64_t{1000}); }, "a count of tiles that can not be"},
+        {"more finished tiles than the rank owns", MessageKind::TilesDone, 1,
+         [=](dfb::Buffer& m) { put(m, body, owned + 1); }, "a count of tiles that can not be"},
+        {"fewer finished tiles than come", MessageKind::TilesDone, 1, oneLess, "more finished tiles than were counted"},
+        {"fewer finished tiles than come after it", MessageKind::TilesDone, 1, oneLess,
+         "more finished tiles than were counted", MessageKind::FinishedTiles},
     };
     for (const Lie& lie : lies) {
-        const Changed c = changed(lie.kind, 0, lie.sender, lie.change);
+        const Changed c = changed(lie.kind, 0, lie.sender, lie.change, lie.overtaken);
         INFO(lie.name << joined(c.texts) << "\n after it" << joined(c.after));
         CHECK(c.done);
         CHECK(allSame(c.texts));
@@ -301,5 +318,55 @@ TEST_CASE("Bytes that are gathered wrongly are an error on every rank", "[wire_s
         INFO(joined(texts));
         CHECK(allSame(texts));
         CHECK(has(texts[0], "malformed message"));
+    }
+}
+
+TEST_CASE("Bricks that no rank can have are an error on every rank", "[wire_safety]")
+{
+    struct Lie {
+        const char* name;
+        std::function<void(dfb::Buffer&)> change;
+        std::string part; // of the error
+    };
+    constexpr std::size_t record = 4 + 6 * 4, first = body + 4 + 4 + 8, second = first + record;
+    const float infinity = std::numeric_limits<float>::infinity();
+    const std::vector<Lie> lies{
+        {"a bound that is NaN", [=](dfb::Buffer& m) { put(m, first + 4, std::numeric_limits<float>::quiet_NaN()); },
+         "the bounds of brick 10 of rank 1 are not a box"},
+        {"an infinite one", [=](dfb::Buffer& m) { put(m, second + 16, infinity); }, "brick 11 of rank 1 are not a box"},
+        {"a box from its end to its beginning", [=](dfb::Buffer& m) { put(m, first + 4, 9.0f); }, "are not a box"},
+        {"a brick twice", [=](dfb::Buffer& m) { std::memcpy(m.data() + second, m.data() + first, record); },
+         "brick 10 comes twice from rank 1"},
+        {"half a brick",
+         [=](dfb::Buffer& m) {
+             put(m, first - 8, std::uint64_t{record + 5});
+             m.shrink(second + 5);
+         },
+         "the bricks of rank 1 have 33 bytes"},
+    };
+    for (const Lie& lie : lies) {
+        std::atomic<bool> armed{false};
+        const auto watched = std::make_shared<Board>();
+        watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (from == 1 && header.kind == MessageKind::ReduceUp && armed.exchange(false))
+                lie.change(message);
+            return Board::What::Pass;
+        };
+        std::vector<std::string> texts(2);
+        runOn(watched, 2, [&](const BoardTransport::Communicator& communicator) {
+            FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(1)));
+            dfb::World world;
+            if (fb.rank() == 1) {
+                armed = true;
+                world.add({10, {{0, 0, 0}, {1, 1, 1}}});
+                world.add({11, {{1, 0, 0}, {2, 1, 1}}});
+            }
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { dfb::SharedWorld(fb, world); });
+        });
+        INFO(lie.name << joined(texts));
+        CHECK_FALSE(armed);
+        CHECK(allSame(texts));
+        CHECK(has(texts[0], "InvalidArgument"));
+        CHECK(has(texts[0], lie.part));
     }
 }

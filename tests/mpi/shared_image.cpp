@@ -9,7 +9,9 @@
 
 #include <atomic>
 #include <chrono>
+#include <cstddef>
 #include <cstdint>
+#include <cstring>
 #include <memory>
 #include <string>
 #include <thread>
@@ -90,40 +92,66 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         return;
     const int rank = rankIn(MPI_COMM_WORLD);
     const Scene s = sceneFor(5, 2);
-    dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s));
-    dfb::FrameReport report;
-    CHECK(goodFrame(fb, s, report));
-    CHECK(goodFrame(fb, s, report));
-    const std::int64_t messagesBefore = report.messagesSent;
-    const std::byte* imageBefore = fb.image().bytes();
-
-    for (int tile = 0; tile < fb.layout().tileCount() && rank == 1; ++tile)
-        if (fb.tileOwner(tile) == 1 && tile % 2 == 1)
-            slowTile = tile;
-    isThere = mayGoOn = false;
-    MPI_Request go = MPI_REQUEST_NULL;
-    int word = 0;
-    if (rank == 1)
-        MPI_Irecv(&word, 1, MPI_INT, 0, 0, MPI_COMM_WORLD, &go);
-    std::thread waiter([&] {
-        for (int done = 0; rank == 1 && !done; std::this_thread::sleep_for(std::chrono::milliseconds(1)))
-            MPI_Test(&go, &done, MPI_STATUS_IGNORE);
-        mayGoOn = true;
-    });
-    Scene impatient = s;
-    impatient.timeoutMs = 2000; // by then rank 1 has long been at that tile
-    const std::string text = scene::outcomeOf([&] { goodFrame(fb, impatient, report); });
-    CHECK(scene::has(text, "timed out"));
-    if (rank == 0) {
-        CHECK(fb.image().bytes() != imageBefore);
-        MPI_Send(&word, 1, MPI_INT, 1, 0, MPI_COMM_WORLD);
-    }
-    waiter.join();
-    CHECK((rank != 1 || isThere));
-    slowTile = -1;
-    for (int i = 0; i < 3; ++i)
+    for (const bool allowPartial : {false, true}) {
+        dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s));
+        dfb::FrameReport report;
         CHECK(goodFrame(fb, s, report));
-    CHECK(report.messagesSent > messagesBefore); // tiles are sent again
+        CHECK(goodFrame(fb, s, report));
+        const std::int64_t messagesBefore = report.messagesSent;
+        const std::byte* imageBefore = fb.image().bytes();
+        const Picture before(fb.image(), report);
+
+        for (int tile = 0; tile < fb.layout().tileCount() && rank == 1; ++tile)
+            if (fb.tileOwner(tile) == 1 && tile % 2 == 1)
+                slowTile = tile;
+        isThere = mayGoOn = false;
+        MPI_Request go = MPI_REQUEST_NULL;
+        int word = 0;
+        if (rank == 1)
+            MPI_Irecv(&word, 1, MPI_INT, 0, 0, MPI_COMM_WORLD, &go);
+        std::thread waiter([&] {
+            for (int done = 0; rank == 1 && !done; std::this_thread::sleep_for(std::chrono::milliseconds(1)))
+                MPI_Test(&go, &done, MPI_STATUS_IGNORE);
+            mayGoOn = true;
+        });
+        Scene impatient = s;
+        impatient.timeoutMs = 2000; // by then rank 1 has long been at that tile
+        impatient.allowPartial = allowPartial;
+        const std::string text =
+            scene::outcomeOf([&] { report = scene::renderLoop(fb, impatient, scene::Loop::Declared); });
+        if (allowPartial)
+            CHECK((report.failure && report.failure->kind == dfb::ErrorKind::TimedOut && report.tilesIncomplete > 0));
+        else
+            CHECK(scene::has(text, "timed out"));
+        if (rank == 0) {
+            CHECK(fb.image().bytes() != imageBefore);
+            // Who still writes costs its tiles, and no others.
+            const Picture after(fb.image(), report);
+            const auto width = static_cast<std::size_t>(s.width),
+                       pixelBytes = after.bytes.size() / fb.image().pixelCount();
+            int lost = 0, wrong = 0;
+            for (int tile = 0; tile < fb.layout().tileCount() && allowPartial; ++tile) {
+                const dfb::Region region = fb.layout().region(tile);
+                lost += !fb.isComplete(tile) && fb.tileOwner(tile) != 1;
+                for (int y = region.y0; y < region.y1 && fb.isComplete(tile); ++y) {
+                    const std::size_t at =
+                        (static_cast<std::size_t>(y) * width + static_cast<std::size_t>(region.x0)) * pixelBytes;
+                    wrong += std::memcmp(after.bytes.data() + at, before.bytes.data() + at,
+                                         static_cast<std::size_t>(region.width()) * pixelBytes)
+                             != 0;
+                }
+            }
+            CHECK(lost == 0);
+            CHECK(wrong == 0);
+            MPI_Send(&word, 1, MPI_INT, 1, 0, MPI_COMM_WORLD);
+        }
+        waiter.join();
+        CHECK((rank != 1 || isThere));
+        slowTile = -1;
+        for (int i = 0; i < 3; ++i)
+            CHECK(goodFrame(fb, s, report));
+        CHECK(report.messagesSent > messagesBefore); // tiles are sent again
+    }
 }
 
 // More than the ranks of a node share (NodeMemory::capacity): finished tiles are lent, or go through MPI.

@@ -46,6 +46,26 @@ void check(Arguments... threads)
         }
         CHECK(inTask == 55);
     }
+    SECTION("tasks with loops do not run in each other, however many wait")
+    {
+        std::atomic<int> deepest{0};
+        {
+            Executor executor(threads...);
+            for (int i = 0; i < 1000; ++i)
+                executor.submit([&] {
+                    static thread_local int depth = 0;
+                    ++depth;
+                    executor.parallelFor(2, [&](std::size_t) {
+                        for (int seen = deepest; depth > seen && !deepest.compare_exchange_weak(seen, depth);) {
+                        }
+                    });
+                    --depth;
+                });
+            while (executor.help()) {
+            }
+        }
+        CHECK(deepest == 1);
+    }
     SECTION("an exception of a body comes out of the loop, and the executor goes on")
     {
         Executor executor(threads...);

@@ -481,7 +481,7 @@ TEST_CASE("After an epoch that lost messages or was dropped the next one works l
             const bool lose = random() % 2; // else what is on its way comes when its epoch is over
             for (int rank = 0; rank < c.ranks; ++rank)
                 if (random() % 2)
-                    network.flow(rank).drop();
+                    network.flow(rank).drop([](const dfb::Buffer&) { return false; });
             network.run(random() % 20);
             if (lose)
                 network.loseAll();
@@ -620,7 +620,7 @@ TEST_CASE("A request that a later one has overtaken changes nothing", "[flow]")
     FlowControl flow(5, 400,
                      {[](int, Buffer&&) {}, [](int, const FlowControl::Request&) {},
                       [&](int, const FlowControl::Credit& credit) { granted.push_back(credit.granted); }});
-    flow.requested(1, {250, 250}); // all of it
+    flow.requested(1, {150, 250}); // all of it
     flow.requested(2, {90, 90});
     CHECK(granted == std::vector<std::uint64_t>{250});
     flow.requested(2, {60, 60}); // of before
@@ -644,8 +644,9 @@ TEST_CASE("Credits that overtake each other, come twice or say nonsense", "[flow
     link.flow->credited(1, {400, 200}); // again
     CHECK(link.transmitted.size() == 8);
     CHECK(link.flow->underWay() == 300);
-    link.flow->credited(1, {400, 1000}); // more than was ever sent
-    CHECK(link.flow->underWay() == 100);
+    CHECK_THROWS_AS(link.flow->credited(1, {600, 401}), dfb::Error); // more than was ever sent
+    CHECK(link.transmitted.size() == 8);
+    CHECK(link.flow->underWay() == 300);
     link.flow->credited(1, {500, 400});
     CHECK(link.transmitted.size() == 10);
     CHECK(link.flow->underWay() == 100);
@@ -664,6 +665,8 @@ TEST_CASE("More than a pool is neither granted nor asked for", "[flow]")
     const std::uint64_t most = ~std::uint64_t{0};
     CHECK_THROWS_AS(link.flow->requested(1, {most, most}), dfb::Error);
     CHECK_THROWS_AS(link.flow->requested(1, {300, 299}), dfb::Error);
+    // For a message that can not be:
+    CHECK_THROWS_AS(link.flow->requested(1, {301, 301}), dfb::Error);
     link.flow->requested(1, {300, 350}); // and nobody waits behind them
     REQUIRE(link.credits.size() == 1);
     CHECK(link.credits[0].granted == 350);
@@ -675,7 +678,7 @@ TEST_CASE("drop() forgets what waits and keeps nothing more; a new epoch does ag
     for (int i = 0; i < 10; ++i)
         link.send(50);
     CHECK(link.flow->underWay() == 500);
-    link.flow->drop();
+    link.flow->drop([](const dfb::Buffer&) { return false; });
     CHECK(link.flow->underWay() == 200); // what is on its way
     link.send(50);
     CHECK(link.transmitted.size() == 4);

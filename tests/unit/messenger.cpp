@@ -182,6 +182,9 @@ TEST_CASE("A number far from the others is refused and changes nothing", "[messe
     CHECK(window.arrive(2) == Result::New);
     CHECK(window.arrive(2) == Result::Duplicate);
     CHECK(window.missing() == (1u << 20) - 1);
+    CHECK(window.arrive((1u << 20) + 5) == Result::Absurd); // so many are missing in all
+    CHECK(window.arrive((1u << 20) + 4) == Result::New);
+    CHECK(window.missing() == 1u << 20);
 }
 
 TEST_CASE("Numbers run per destination, from 0, from any thread; checksums are there if they are wanted", "[messenger]")

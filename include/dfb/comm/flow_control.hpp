@@ -63,19 +63,33 @@ public:
         asking_.clear();
         underWay_ = 0;
         peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
-        dropping_ = false;
+        matters_ = nullptr;
     }
 
-    // From now on nothing of this epoch matters: forgets what waits, and does not keep what comes.
-    void drop()
+    // From now on nothing of this epoch matters but what `matters(message)`: forgets the rest of what waits, and does
+    // not keep it when it comes.
+    void drop(std::function<bool(const Buffer&)> matters)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        dropping_ = true;
-        for (auto& [destination, out] : outgoing_) {
-            underWay_ -= out.queuedBytes;
-            out.queue.clear();
-            out.queuedBytes = 0;
-        }
+        matters_ = std::move(matters);
+        for (auto& [destination, out] : outgoing_)
+            for (std::size_t left = out.queue.size(); left > 0; --left) {
+                Buffer message = out.queue.pop();
+                if (matters_(message)) {
+                    out.queue.push(std::move(message));
+                    continue;
+                }
+                underWay_ -= message.size();
+                out.queuedBytes -= message.size();
+            }
+    }
+
+    // Whether nothing waits for credit.
+    bool allSent() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return std::all_of(outgoing_.begin(), outgoing_.end(),
+                           [](const auto& out) { return out.second.queue.empty(); });
     }
 
     // ---- the sender's side
@@ -86,7 +100,7 @@ public:
         Request request;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (dropping_)
+            if (matters_ && !matters_(message))
                 return;
             Outgoing& out = outgoingTo(destination);
             underWay_ += message.size();
@@ -125,7 +139,7 @@ public:
         return text;
     }
 
-    // Throws Error (MalformedMessage) for more than its pool.
+    // Throws Error (MalformedMessage) for more than its pool, and for what was not sent.
     void credited(int from, const Credit& credit)
     {
         if (credit.granted > credit.consumed && credit.granted - credit.consumed > pool_)
@@ -133,9 +147,12 @@ public:
                           static_cast<std::int64_t>(credit.granted - credit.consumed));
         std::unique_lock<std::mutex> lock(mutex_);
         Outgoing& out = outgoingTo(from);
+        if (credit.consumed > out.sent)
+            failMalformed("credit for more than was sent", static_cast<std::int64_t>(out.sent),
+                          static_cast<std::int64_t>(credit.consumed));
         out.granted = std::max(out.granted, credit.granted);
         if (credit.consumed > out.consumed) {
-            const std::uint64_t more = std::min(credit.consumed, out.sent) - out.consumed;
+            const std::uint64_t more = credit.consumed - out.consumed;
             out.consumed += more;
             underWay_ -= more;
         }
@@ -189,7 +206,8 @@ public:
         serve(lock);
     }
 
-    // Throws Error (MalformedMessage) for what could never be met: others would wait behind it.
+    // Throws Error (MalformedMessage) for what could never be met: others would wait behind it. An honest sender has
+    // sent no more than it was granted, and asks for one message at least.
     void requested(int source, const Request& request)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -197,6 +215,9 @@ public:
         if (request.all < request.first || (request.all > in.granted && request.all - in.granted > pool_))
             failMalformed("a request for more than a pool", static_cast<std::int64_t>(pool_),
                           static_cast<std::int64_t>(request.all - in.granted));
+        if (request.first > in.granted && request.first - in.granted > pool_ / 4)
+            failMalformed("a request for more than the largest message", static_cast<std::int64_t>(pool_ / 4),
+                          static_cast<std::int64_t>(request.first - in.granted));
         if (request.first <= in.granted || (in.asks && request.first <= in.request.first))
             return; // it has its answer, or a later one has overtaken it
         in.request = request;
@@ -337,7 +358,7 @@ private:
     Fifo<int> asking_;
     Fifo<std::pair<int, Credit>> grants_; // to be told
     std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;
-    bool dropping_ = false;
+    std::function<bool(const Buffer&)> matters_; // null: all does
     Callbacks callbacks_;
 };
 

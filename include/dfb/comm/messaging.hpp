@@ -30,8 +30,11 @@ public:
     // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
     // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
+    // A message of whatever kind, perhaps not even for this object: what it can not fail for, it leaves to
+    // keepDamage().
     virtual void undecodable(int source, const ErrorInfo& error) = 0;
     virtual void work(int) {} // what submitWork() was given
+    virtual void polled() {}  // messages have moved while this rank waits and nobody else would move them
 
 protected:
     ~MessageHandler() = default;
@@ -65,7 +68,10 @@ public:
     // From here on the handler is called. Collective, in the same order for all objects of a messenger.
     void start() { messenger_->attach(*this, address_); }
 
-    ~Messaging()
+    ~Messaging() { stop(); }
+
+    // Afterwards the handler is not called any more.
+    void stop()
     {
         messenger_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
@@ -204,6 +210,19 @@ public:
         reductions_.receive(source, keyOf(header, message), header.kind == MessageKind::ReduceUp, bytesOf(message));
     }
 
+    // Nobody knows what a message was that could not be read. Where it may have been for what this rank has not begun
+    // yet, that fails: the next frame, which takes this, or the next reduce().
+    void keepDamage(int source, const ErrorInfo& error)
+    {
+        const std::lock_guard<std::mutex> lock(damageMutex_);
+        damage_.emplace(source, error);
+    }
+    std::optional<std::pair<int, ErrorInfo>> takeDamage()
+    {
+        const std::lock_guard<std::mutex> lock(damageMutex_);
+        return std::exchange(damage_, std::nullopt);
+    }
+
     // For a message of rank `source` that nothing goes on without.
     void giveUp(int source, ErrorInfo error)
     {
@@ -250,6 +269,7 @@ public:
                 lock.unlock();
                 if (!executor_->help() && !messenger_->poll() && !over())
                     messenger_->nap(std::chrono::microseconds(50));
+                handler_.polled();
                 lock.lock();
             }
         }
@@ -260,7 +280,9 @@ public:
         return isReady;
     }
 
-    // Collective: combines `own` over all ranks and waits for the result.
+    // Collective: combines `own` over all ranks and waits for the result. Throws TransportError, also when a message
+    // could not be read that may have been a part of this: when there is no result after a second, or `peerTimeoutMs`
+    // if it came before this rank was here.
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
         struct Result {
@@ -268,11 +290,11 @@ public:
             Bytes bytes;
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
+        const std::int64_t number = reductionCount_++;
         messenger_->expectMessages(true);
-        reducing_ = true;
         try {
             try {
-                reductions_.enter({ownScope, reductionCount_++}, std::move(own), std::move(combine),
+                reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
                                   [this, result](const Bytes& bytes) {
                                       result->bytes = bytes;
                                       result->there = true;
@@ -283,13 +305,11 @@ public:
                 error.rank = rank();
                 messenger_->giveUp(error);
             }
-            wait([&] { return result->there.load(); });
+            waitForResult([&] { return result->there.load(); }, number == 0);
         } catch (...) {
-            reducing_ = false;
             messenger_->expectMessages(false);
             throw;
         }
-        reducing_ = false;
         messenger_->expectMessages(false);
         return result->bytes;
     }
@@ -310,6 +330,35 @@ public:
     }
 
 private:
+    // A message that could not be read may have been a part of this, for which others may not be here yet, or of what
+    // comes after, if they are through. The first one is what its owner's constructor does.
+    template <class Ready>
+    void waitForResult(const Ready& ready, bool isFirst)
+    {
+        constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
+        const std::chrono::milliseconds late(messenger_->options().peerTimeoutMs);
+        auto damage = takeDamage();
+        const bool wasBefore = damage.has_value();
+        std::optional<Clock::time_point> deadline;
+        if (damage)
+            deadline = Clock::now() + (isFirst ? soon : late);
+        while (!ready()) {
+            if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {
+                giveUp(damage->first, damage->second);
+            } else if (!damage && (damage = takeDamage())) {
+                deadline = Clock::now() + soon;
+            }
+        }
+        if (damage && !wasBefore)
+            keepDamage(damage->first, damage->second);
+    }
+
+    bool isDamaged()
+    {
+        const std::lock_guard<std::mutex> lock(damageMutex_);
+        return damage_.has_value();
+    }
+
     // For a moment a waiting thread does by itself what those do that would otherwise have to be woken, each of which
     // may wait for a core then. Gives up when nothing has come for some time, or when others need the core.
     template <class Over>
@@ -411,30 +460,33 @@ private:
                 if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
                 if (keyOf(a.header, a.message).scope == ownScope) {
+                    requireCanBe(a.header);
                     receiveReduction(a.source, a.header, a.message);
                     return;
                 }
             }
         } catch (const Error& e) {
-            undecodable(a.source, e.info());
+            giveUp(a.source, e.info()); // nothing goes on without it
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
-    void malformed(int source, const ErrorInfo& error) override
+    // Of reductions of reduce(): this rank is at the last one that it has begun, and who is at the next one has got the
+    // result of that through this rank.
+    void requireCanBe(const MessageHeader& header)
     {
-        submit([this, source, error] { undecodable(source, error); });
+        const std::int64_t begun = reductionCount_, number = header.number;
+        const bool isLast = number >= 0 && number == begun - 1;
+        const bool isNext =
+            number == begun && header.kind == MessageKind::ReduceUp && !reductions_.isUnderWay({ownScope, begun - 1});
+        if (!isLast && !isNext)
+            failMalformed("a reduction that no rank can be at", begun, number);
     }
 
-    // A frame can fail; a reduction outside frames can not go on without the message that this may have been.
-    void undecodable(int source, const ErrorInfo& error)
+    void malformed(int source, const ErrorInfo& error) override
     {
-        if (epoch_ > 0 && !reducing_) {
-            handler_.undecodable(source, error);
-            return;
-        }
-        giveUp(source, error);
+        submit([this, source, error] { handler_.undecodable(source, error); });
     }
 
     void messengerFailed() override { notify(); }
@@ -447,8 +499,9 @@ private:
     FlowControl flow_;
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
-    std::int64_t reductionCount_ = 0; // of reduce()
-    std::atomic<bool> reducing_{false};
+    std::atomic<std::int64_t> reductionCount_{0}; // of reduce()
+    std::mutex damageMutex_;
+    std::optional<std::pair<int, ErrorInfo>> damage_; // under damageMutex_
 
     std::mutex mutex_;
     std::condition_variable changed_;

@@ -69,7 +69,7 @@ public:
     {
         const auto ahead = static_cast<std::int32_t>(sequence - next_);
         if (ahead >= 0) {
-            if (ahead > maxHoles)
+            if (ahead > maxHoles - static_cast<std::int32_t>(holes_.size()))
                 return Result::Absurd;
             for (; next_ != sequence; ++next_)
                 holes_.push_back(next_);
@@ -112,28 +112,23 @@ public:
         transport_.start(*this);
         if (!hasOwnThread())
             return;
-        progress_.start();
-        for (const int other : heartbeat_.neighbours())
-            sendSign(other, detail::MessageKind::Present);
+        try {
+            progress_.start();
+            for (const int other : heartbeat_.neighbours())
+                sendSign(other, detail::MessageKind::Present);
+        } catch (const std::exception& e) { // no thread, no memory: the others have made theirs
+            leave(e.what());
+            end();
+            throw;
+        }
     }
 
     // While an exception passes it waits for nobody, as the other ranks may not be on their way here, and tells them.
     ~Messenger()
     {
-        if (std::uncaught_exceptions() > exceptions_) {
-            ErrorInfo error;
-            error.kind = ErrorKind::Transport;
-            error.rank = rank();
-            error.message = "an exception has ended its messenger";
-            giveUp(error);
-        }
-        progress_.stop();
-        if (failed_) // what tells the others of it should still leave, but not at any cost
-            for (int tries = 0; tries < 100 && transport_.mayPoll() && !transport_.quiet(); ++tries) {
-                transport_.poll();
-                std::this_thread::sleep_for(std::chrono::milliseconds(1));
-            }
-        transport_.stop(!failed_);
+        if (std::uncaught_exceptions() > exceptions_)
+            leave("an exception has ended its messenger");
+        end();
     }
 
     int rank() const noexcept { return transport_.rank(); }
@@ -301,6 +296,26 @@ private:
         detail::MessageHeader header;
         Buffer message;
     };
+
+    void leave(const char* why)
+    {
+        ErrorInfo error;
+        error.kind = ErrorKind::Transport;
+        error.rank = rank();
+        error.message = why;
+        giveUp(error);
+    }
+
+    void end()
+    {
+        progress_.stop();
+        if (failed_) // what tells the others of it should still leave, but not at any cost
+            for (int tries = 0; tries < 100 && transport_.mayPoll() && !transport_.quiet(); ++tries) {
+                transport_.poll();
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+            }
+        transport_.stop(!failed_);
+    }
 
     static std::uint32_t checksumOf(const Buffer& message)
     {

@@ -98,7 +98,15 @@ public:
             if (!hasAll(*state))
                 detail::failMalformed("a reduction's result before all of its parts", -1, source);
             finish(lock, *state, bytes);
+        } else {
+            detail::failMalformed("a reduction's result where it was not entered", -1, source);
         }
+    }
+
+    bool isUnderWay(const ReductionKey& key)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return find(key) != nullptr;
     }
 
     // The neighbours in the tree that this rank waits for: children whose parts have not come, or else its parent.

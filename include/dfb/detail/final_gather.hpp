@@ -61,8 +61,11 @@ public:
           senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
           record_(settings_.format, settings_.channels)
     {
-        if (isDisplay_ && enabled())
+        if (isDisplay_ && enabled()) {
             tilesOf_ = std::vector<TilesOf>(senders_.size());
+            for (int tile = 0; tile < layout_.tileCount(); ++tile)
+                ++tilesOf_[static_cast<std::size_t>(ownerOf_(tile))].owned;
+        }
         if (isDisplay_ && settings_.format != OutputFormat::None) {
             image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
@@ -171,15 +174,18 @@ public:
     {
         if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
             return;
-        // Somebody is still at it, or has died there: the memory is left to it.
+        // Somebody is still at it, or has died there: the memory is left to it, and the other tiles are in a copy.
+        Image copy(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+        const Planes from = image_.planesAt(0), to = copy.planesAt(0);
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (to.at[c])
+                std::memcpy(to.at[c], from.at[c], copy.pixelCount() * record_.pixelBytes(c));
         for (Buffer& plane : image_.release())
             pool_->lend(plane);
         pool_->lend(gateMemory_);
         imageGate_ = nullptr;
-        image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+        image_ = std::move(copy);
         ++imageEpoch_;
-        for (auto& s : state_)
-            s = TileState::Undefined;
     }
 
     // The most that a message to the display rank can have.
@@ -339,7 +345,10 @@ public:
             });
             in += bytes;
             left -= bytes;
-            ++tilesOf_[static_cast<std::size_t>(source)].received;
+            TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
+            const std::int64_t received = ++its.received, announced = its.announced;
+            if (announced >= 0 && received > announced)
+                failMalformed("more finished tiles than were counted", announced, received);
             ++tilesReceived_;
         }
     }
@@ -362,10 +371,13 @@ public:
             ++tilesOf_[static_cast<std::size_t>(source)].received;
             ++tilesReceived_;
         }
+        TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
         std::int64_t expected = -1;
-        if (count < 0 || count > layout_.tileCount()
-            || !tilesOf_[static_cast<std::size_t>(source)].announced.compare_exchange_strong(expected, count))
+        if (count < 0 || count > its.owned || !its.announced.compare_exchange_strong(expected, count))
             failMalformed("a count of tiles that can not be", -1, count);
+        // Either this or receiveTiles() sees it. Thus, when all have counted, no rank's tiles stand for another's.
+        if (const std::int64_t received = its.received; received > count)
+            failMalformed("more finished tiles than were counted", count, received);
         tilesAnnounced_ += count;
         ++ranksDone_; // after the count: who sees all ranks done sees all counts
     }
@@ -460,6 +472,7 @@ private:
     };
     struct TilesOf {
         std::atomic<std::int64_t> received{0}, announced{-1};
+        std::int64_t owned = 0; // the most that there can be
         TilesOf() = default;
         TilesOf(const TilesOf&) {} // for the vector, which never copies a used one
     };

@@ -77,8 +77,8 @@ public:
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of(config_, rank(), Tile::size, Tile::channels, Pipeline::travelling(config_),
-                                 layout().tileCount(), [this](int tile) { return tileOwner(tile); });
+            mine = Agreement::of<TileOp, PixelOp>(config_, rank(), Tile::size, Pipeline::travelling(config_),
+                                                  layout().tileCount(), [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
         } catch (const std::exception& e) {
@@ -87,6 +87,7 @@ public:
         }
         const auto all = Agreement::from(messaging_->reduce(mine.bytes(), Agreement::combine));
         if (!all.fine) {
+            messaging_->stop(); // what has come already is for this object, as long as it is whole
             outcome_.reset();
             messaging_.reset(); // before the exception passes: all ranks throw it, so this end is in order
             throw InvalidArgument(all.text);
@@ -96,7 +97,7 @@ public:
 
     FrameEngine(const FrameEngine&) = delete;
     FrameEngine& operator=(const FrameEngine&) = delete;
-    ~FrameEngine() = default;
+    ~FrameEngine() { messaging_->stop(); }
 
     int rank() const noexcept { return messaging_->rank(); }
     int size() const noexcept { return messaging_->size(); }
@@ -180,7 +181,7 @@ public:
         for (FrameGate::Message& message : early)
             incoming(message.source, message.header, std::move(message.bytes));
         early.clear(); // some may still be there, if the frame has failed
-        failForStray();
+        failForDamage();
         for (const int tile : kept)
             if (gate_.enter(info.frame)) {
                 submitFinish(tile);
@@ -415,10 +416,13 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
-    enum Scope : std::uint32_t { AllDeclared = Messaging<Transport>::ownScope + 1, FrameVerdict };
+    enum Scope : std::uint32_t { AllDeclared = Messaging<Transport>::ownScope + 1, FrameVerdict, SameParams };
 
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
+
+    // So long end() waits before ranks compare what they began the frame with.
+    static constexpr std::chrono::milliseconds untilCompared{2000};
 
     bool compresses() const
     {
@@ -487,17 +491,6 @@ private:
         messaging_->send(to, kind, gate_.frame(), Bytes(first, first + sizeof body));
     }
 
-    void failForStray()
-    {
-        std::optional<ErrorInfo> stray;
-        {
-            const std::lock_guard<std::mutex> lock(strayMutex_);
-            stray.swap(stray_);
-        }
-        if (stray)
-            failWith(std::make_exception_ptr(Error(std::move(*stray))));
-    }
-
     void sendToDisplay(Buffer&& message)
     {
         if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
@@ -534,19 +527,18 @@ private:
     // next one can not do without it.
     void undecodable(int source, const ErrorInfo& error) override
     {
-        const std::exception_ptr reason = std::make_exception_ptr(Error(error));
-        {
-            const std::lock_guard<std::mutex> lock(strayMutex_); // begin() opens the gate and then looks at stray_
-            if (!gate_.enterAny()) {
-                stray_ = errorInfoOf(reason, messageFrom(source));
-                return;
-            }
-        }
-        if (!failWith(reason, messageFrom(source))) {
-            const std::lock_guard<std::mutex> lock(strayMutex_);
-            stray_ = errorInfoOf(reason, messageFrom(source));
-        }
+        messaging_->keepDamage(source, error); // first: begin() opens the gate and then looks
+        if (!gate_.enterAny())
+            return;
+        failForDamage();
         gate_.leave(); // not before: the next begin() waits for it
+    }
+
+    void failForDamage()
+    {
+        const auto damage = messaging_->takeDamage();
+        if (damage && !failWith(std::make_exception_ptr(Error(damage->second)), messageFrom(damage->first)))
+            messaging_->keepDamage(damage->first, damage->second);
     }
 
     static ErrorInfo messageFrom(int source)
@@ -664,13 +656,18 @@ private:
                 const Verdict verdict = Verdict::from(messaging_->bytesOf(message));
                 if (!verdict.fits(layout().tileCount()))
                     failMalformed("a verdict on tiles that there are not", layout().tileCount() - 1);
-                differs = isUp && !verdict.error && verdict.paramsHash != fingerprintOf(params_);
+                differs = isUp && verdict.paramsHash != fingerprintOf(params_);
             } else if (scope == AllDeclared) {
                 if (!messaging_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
                 differs = isUp && !wantsDeclaration_;
+            } else if (scope == SameParams) {
+                const Bytes bytes = messaging_->bytesOf(message);
+                ByteReader in(bytes);
+                differs = in.get<std::uint64_t>() != fingerprintOf(params_);
+                in.end();
             } else {
-                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
+                failMalformed("a reduction of a kind that there is not", SameParams, scope);
             }
             if (differs)
                 failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
@@ -821,9 +818,10 @@ private:
     // The frame has failed: what has not left matters no more, unless what is finished is wanted.
     void dropRest()
     {
-        if (!params_.allowPartial)
-            messaging_->flow().drop();
-        else if (!ownTilesDone_)
+        messaging_->flow().drop([this](const Buffer& message) {
+            return params_.allowPartial && isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
+        });
+        if (params_.allowPartial && !ownTilesDone_)
             pipeline_->gather().flush();
     }
 
@@ -852,6 +850,10 @@ private:
                 info->message += ", no word from rank " + std::to_string(other);
         } else if (!ownTilesDone_) {
             info = pipeline_->table().missing(params_.declared);
+            if (!info) {
+                info.emplace();
+                info->message = "tiles that have all their inputs are still being finished";
+            }
         } else if (!pipeline_->gather().complete()) {
             info.emplace();
             info->message = pipeline_->gather().missing();
@@ -878,6 +880,7 @@ private:
             [this] {
                 return endCalled_ && ownTilesDone_ && pipeline_->table().isSaid() && pipeline_->gather().complete();
             },
+            [this] { return mayVote(); },
             [this] {
                 Verdict v;
                 const std::int64_t repeated = messaging_->messenger().duplicates();
@@ -892,7 +895,8 @@ private:
                           reports.orderUndefinedPixels,
                           pipeline_->alphaOutsidePixels(),
                           gains_->links(),
-                          HasIsComplete<TileOp>::value ? 0 : inputsSent_ - pipeline_->table().arrivedCount()};
+                          inputsSent_ - pipeline_->table().arrivedCount(),
+                          pipeline_->table().endedEarlyCount()};
                 v.wireErrorBound = reports.wireErrorBound;
                 v.tileErrors = FrameFigures::of(reports.errors);
                 figures_.addTo(v);
@@ -904,6 +908,20 @@ private:
                             std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
                 return v;
             });
+    }
+
+    // Where only end() moves messages, all that others have sent must have been taken before any rank may leave: who
+    // polls no more takes nothing, and its sender would wait in end() for it to go.
+    bool mayVote() const
+    {
+        Messenger<Transport>& messenger = messaging_->messenger();
+        return !messenger.needsCaller() || (messaging_->flow().allSent() && messenger.quiet());
+    }
+
+    void polled() override
+    {
+        if (frameOpen_)
+            tryVote();
     }
 
     void checkWire() const
@@ -947,22 +965,24 @@ private:
         Verdict verdict;
         try {
             tryVote();
-            verdict = params_.timeoutMs > 0 ? waitInTime() : *outcome_->wait();
-            if (!verdict.error && verdict.sums[9] != 0)
-                verdict.error = Verdict::strayInputs(verdict.sums[9]);
+            verdict = params_.timeoutMs > 0 ? waitInTime() : waitWithoutLimit();
+            if (!verdict.error)
+                verdict.error = verdict.strayInputs();
             if (verdict.error && params_.allowPartial) // finished tiles may still be on their way
-                messaging_->wait([this] { return pipeline_->gather().complete(); },
+                messaging_->wait([this] { return pipeline_->gather().complete() && messaging_->flow().allSent(); },
                                  Clock::now() + std::chrono::milliseconds(params_.timeoutMs));
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
         gate_.close([this] { return messaging_->executor().help(); });
         messaging_->reductions().forget(AllDeclared, gate_.frame());
+        messaging_->reductions().forget(SameParams, gate_.frame());
         messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
         lastFailed_ = transportError || verdict.error;
         pipeline_->gather().closeImage();
-        if (lastFailed_ && params_.allowPartial && !transportError)
+        const bool isPartial = !transportError && verdict.error && verdict.error->kind != ErrorKind::Disagreement;
+        if (isPartial && params_.allowPartial)
             pipeline_->setIncomplete(verdict.incomplete);
         else if (lastFailed_)
             pipeline_->gather().invalidate();
@@ -976,17 +996,58 @@ private:
     {
         const auto limit = std::chrono::milliseconds(params_.timeoutMs);
         const auto start = Clock::now();
+        if (limit > untilCompared) {
+            if (const Verdict* verdict = outcome_->wait(start + untilCompared))
+                return *verdict;
+            compareParams();
+        }
         if (const Verdict* verdict = outcome_->wait(start + limit))
             return *verdict;
         if (const auto what = missing(); what && !outcome_->failed())
             failWith(std::make_exception_ptr(Error(*what)));
         if (const Verdict* verdict = outcome_->wait(start + 2 * limit))
             return *verdict;
+        giveUpVerdict(2 * limit);
+    }
+
+    // The verdict, however long others render. Only where a damaged message was noticed, which may have been part of
+    // the verdict, is it waited for no longer than for a rank of which nothing is heard.
+    Verdict waitWithoutLimit()
+    {
+        const auto limit = std::chrono::milliseconds(config_.peerTimeoutMs);
+        if (const Verdict* verdict = outcome_->wait(Clock::now() + untilCompared))
+            return *verdict;
+        compareParams();
+        std::optional<Clock::time_point> deadline;
+        for (;;) {
+            const auto next = Clock::now() + std::min<std::chrono::milliseconds>(limit, untilCompared);
+            if (const Verdict* verdict = outcome_->wait(limit.count() > 0 ? std::optional(next) : std::nullopt))
+                return *verdict;
+            if (!deadline && outcome_->isDamaged())
+                deadline = Clock::now() + limit;
+            if (deadline && Clock::now() >= *deadline)
+                giveUpVerdict(limit);
+        }
+    }
+
+    // Ranks that were given different parameters may wait for each other for ever. Therefore those that have waited
+    // for some time send up the tree what they were given; see receiveReduction().
+    void compareParams()
+    {
+        ByteWriter mine;
+        mine.put(fingerprintOf(params_));
+        messaging_->reductions().enter(
+            {SameParams, gate_.frame()}, mine.bytes(), [](const Bytes& a, const Bytes&) { return a; },
+            [](const Bytes&) {});
+    }
+
+    [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
+    {
         ErrorInfo info;
         info.kind = ErrorKind::Transport;
         info.rank = rank();
         info.frame = gate_.frame();
-        info.message = "no verdict after " + std::to_string(2 * params_.timeoutMs) + " ms";
+        info.message = "no verdict after " + std::to_string(after.count()) + " ms";
         for (const std::string& more : {outcome_->waitsFor(), messaging_->messenger().lost()})
             info.message += (more.empty() ? "" : ": ") + more;
         messaging_->messenger().giveUp(info);
@@ -1011,8 +1072,6 @@ private:
     FrameFigures figures_;
     CompressionTrial compressionTrial_;
     std::optional<CompressionGains> gains_; // per rank that this one sends to
-    std::mutex strayMutex_;
-    std::optional<ErrorInfo> stray_; // what was wrong with a message between frames; under strayMutex_
     std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank

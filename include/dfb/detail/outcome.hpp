@@ -30,11 +30,14 @@ public:
     {
         error_.reset();
         verdict_.reset();
-        hasVerdict_ = failed_ = voted_ = false;
+        hasVerdict_ = failed_ = damaged_ = voted_ = told_ = false;
     }
 
     // The frame has failed on some rank, or the transport has. From any thread, as the rest.
     bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || messaging_.failed(); }
+
+    // A message was damaged, here or where the frame failed first: it may be one that the verdict needs.
+    bool isDamaged() const noexcept { return damaged_; }
 
     // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if
     // this rank has voted: then it is up to the others, and if they all have, it is too late.
@@ -44,11 +47,12 @@ public:
         info.rank = messaging_.rank();
         info.frame = gate_.frame();
         bool first = false, late = false;
+        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             late = voted_;
-            first = !error_;
-            if (first)
+            first = !std::exchange(told_, true);
+            if (!error_) // else one that the frame could bear
                 error_ = info;
         }
         failed_ = true;
@@ -78,22 +82,25 @@ public:
     // Another rank says that it has failed, and why. vote() must follow.
     void failElsewhere(const ErrorInfo& info)
     {
+        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             if (!error_)
                 error_ = info; // in case that rank has voted already
+            told_ = true;
         }
         failed_ = true;
     }
 
-    // Enters the verdict, once: when `done()`, or when the frame has failed. `figures()` gives this rank's Verdict.
-    template <class IsDone, class Figures>
-    void vote(const IsDone& done, const Figures& figures)
+    // Enters the verdict, once: when `done()`, or when the frame has failed, and this rank `may()`. `figures()` gives
+    // its Verdict.
+    template <class IsDone, class May, class Figures>
+    void vote(const IsDone& done, const May& may, const Figures& figures)
     {
         Verdict mine;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (voted_ || messaging_.failed() || !(failed_ || done()))
+            if (voted_ || messaging_.failed() || !(failed_ || done()) || !may())
                 return;
             voted_ = true;
             mine = figures();
@@ -126,11 +133,13 @@ private:
     Messaging<Transport>& messaging_;
     const FrameGate& gate_;
     std::uint32_t scope_;
-    std::atomic<bool> failed_{false}, hasVerdict_{false};
+    std::atomic<bool> failed_{false}, damaged_{false}, hasVerdict_{false};
     std::optional<Verdict> verdict_; // set once, before hasVerdict_
     std::mutex mutex_;
-    bool voted_ = false;             // under mutex_
-    std::optional<ErrorInfo> error_; // under mutex_
+    // Under mutex_:
+    bool voted_ = false;
+    bool told_ = false; // all ranks, by this one or another, that the frame has failed
+    std::optional<ErrorInfo> error_;
 };
 
 } // namespace dfb::detail

@@ -93,7 +93,7 @@ public:
         expected_ = nullptr;
         info_ = info;
         plan_ = plan;
-        arrived_ = 0;
+        arrived_ = endedEarly_ = 0;
     }
     // Belongs to it. Throws what copying throws.
     void setData(const FrameData& data) { data_ = data; }
@@ -105,6 +105,8 @@ public:
     // How many inputs have come to tiles of this rank that nothing was wrong with. Where all tiles are complete, there
     // were as many as all ranks have sent; else one too many has come before one that was meant.
     std::int64_t arrivedCount() const noexcept { return arrived_; }
+    // How many tiles needed no more although more was to come.
+    std::int64_t endedEarlyCount() const noexcept { return endedEarly_; }
 
     // What a tile gets in this frame.
     TileSamples samples(int tile) const
@@ -137,7 +139,9 @@ public:
             bool enough = false;
             if constexpr (HasIsComplete<TileOp>::value)
                 enough = slot.op.isComplete();
-            arrival.ready = becomesReady(slot, enough || (tree.complete() && allComplete(slot)));
+            const bool complete = tree.complete() && allComplete(slot);
+            arrival.ready = becomesReady(slot, enough || complete);
+            endedEarly_ += enough && !complete;
             ++arrived_;
         } catch (...) {
             if (const auto& slot = slotOf(h.tile)) {
@@ -399,7 +403,7 @@ private:
     std::array<std::mutex, 64> mutexes_;
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;
-    std::atomic<std::int64_t> arrived_{0};
+    std::atomic<std::int64_t> arrived_{0}, endedEarly_{0};
     std::atomic<int> unsaid_{0}; // spoilt tiles of which it is not known yet why
     SamplePlan plan_;            // null: all tiles as info_ says
     FrameData data_{};

@@ -11,12 +11,16 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <cstdlib>
 #include <cstring>
+#include <cxxabi.h>
 #include <exception>
 #include <iterator>
+#include <memory>
 #include <optional>
 #include <string>
 #include <type_traits>
+#include <typeinfo>
 #include <utility>
 #include <vector>
 
@@ -84,8 +88,9 @@ struct Verdict {
     std::optional<ErrorInfo> error;
     std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
     // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
-    // pixels with alpha outside [0, 1], compressed links, inputs that were sent without those that have come.
-    std::array<std::int64_t, 10> sums{};
+    // pixels with alpha outside [0, 1], compressed links, inputs that were sent without those that have come, tiles
+    // that needed no more although more was to come.
+    std::array<std::int64_t, 11> sums{};
     // Peak memory in bytes, rendering in ns, peak of the inbox in bytes, ns from begin() until all is done here.
     std::array<std::int64_t, 4> maxima{};
     double wireErrorBound = 0;            // a maximum
@@ -146,7 +151,8 @@ struct Verdict {
     {
         const auto count = static_cast<std::uint64_t>(tileCount);
         return (tileErrors.empty() || tileErrors.back().key < count)
-               && (mergeErrors.empty() || mergeErrors.back().key < count);
+               && (mergeErrors.empty() || mergeErrors.back().key < count) && incomplete.size() <= count
+               && std::all_of(incomplete.begin(), incomplete.end(), [=](auto tile) { return tile < tileCount; });
     }
 
     // What is the same on all ranks.
@@ -209,9 +215,13 @@ struct Verdict {
         return info;
     }
 
-    // An input that its owner did not wait for, and that came too late, may have had its place taken by another.
-    static ErrorInfo strayInputs(std::int64_t count)
+    // An input that its owner did not wait for, and that came too late, may have had its place taken by another. What
+    // comes to a tile that needs no more may be too late as well: then nothing can be said.
+    std::optional<ErrorInfo> strayInputs() const
     {
+        const std::int64_t count = sums[10] == 0 ? sums[9] : 0;
+        if (count == 0)
+            return std::nullopt;
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
         info.expected = 0;
@@ -225,6 +235,8 @@ struct Verdict {
     {
         if (e.kind == ErrorKind::Cancelled)
             return 0;
+        if (e.kind == ErrorKind::Disagreement)
+            return 5;
         return e.kind != ErrorKind::TimedOut ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
@@ -246,8 +258,8 @@ struct Verdict {
         const Verdict b = from(second);
         if (b.error)
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
-        if (!a.error && a.paramsHash != b.paramsHash)
-            a.error = disagreement();
+        if (a.paramsHash != b.paramsHash)
+            a.error = disagreement(); // whatever else came of it
         for (std::size_t i = 0; i < a.sums.size(); ++i)
             a.sums[i] = static_cast<std::int64_t>(static_cast<std::uint64_t>(a.sums[i])
                                                   + static_cast<std::uint64_t>(b.sums[i]));
@@ -268,11 +280,11 @@ struct Agreement {
     std::string text; // items parted by commas, or what is wrong
     int rank = 0;     // whose; the lowest of those that are alike
 
-    // `tileSize`, `channels`: of the tile operation; `sent`: those of them that travel; `ownerOf(tile)`: the owner
-    // map's answers.
-    template <class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, int rank, int tileSize, ChannelMask channels, ChannelMask sent,
-                        int tileCount, const OwnerOf& ownerOf)
+    // `tileSize`: of the tile operation; `sent`: those of its channels that travel; `ownerOf(tile)`: the owner map's
+    // answers.
+    template <class TileOp, class PixelOp, class OwnerOf>
+    static Agreement of(const FrameBufferConfig& c, int rank, int tileSize, ChannelMask sent, int tileCount,
+                        const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
@@ -286,7 +298,7 @@ struct Agreement {
         };
         return {true,
                 "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width) + 'x'
-                    + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(channels)
+                    + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(TileOp::channels)
                     + ", sent channels " + text(sent) + ", format " + text(static_cast<int>(c.format)) + ", depth "
                     + text(c.depth) + ", aux " + text(c.aux) + ", display rank " + text(c.displayRank)
                     + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
@@ -296,7 +308,8 @@ struct Agreement {
                     + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar)
                     + ", least transmittance " + text(c.minTransmittance) + ", checksums " + text(c.checksums)
                     + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
-                    + text(c.dither),
+                    + text(c.dither) + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation
+                    + typeid(PixelOp).name(),
                 rank};
     }
 
@@ -337,6 +350,23 @@ struct Agreement {
     }
 
 private:
+    static constexpr const char* tileOperation = "tile operation ";
+    static constexpr const char* pixelOperation = "pixel operation ";
+
+    // Types are compared by the names that all compilers have for them, and shown as they are written.
+    static std::string readable(const std::string& item)
+    {
+        for (const std::string start : {tileOperation, pixelOperation}) {
+            if (item.compare(0, start.size(), start) != 0)
+                continue;
+            const std::unique_ptr<char, decltype(&std::free)> name(
+                abi::__cxa_demangle(item.c_str() + start.size(), nullptr, nullptr, nullptr), &std::free);
+            if (name)
+                return start + name.get();
+        }
+        return item;
+    }
+
     // The items that are not the same in both; all, if they have not the same items.
     static std::string difference(const std::string& a, const std::string& b)
     {
@@ -344,7 +374,7 @@ private:
         std::string differing;
         for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
             if (as[i] != bs[i])
-                differing += (differing.empty() ? "[" : ", [") + as[i] + "] and [" + bs[i] + "]";
+                differing += (differing.empty() ? "[" : ", [") + readable(as[i]) + "] and [" + readable(bs[i]) + "]";
         return differing.empty() ? "[" + a + "] and [" + b + "]" : differing;
     }
     static std::vector<std::string> itemsOf(const std::string& text)

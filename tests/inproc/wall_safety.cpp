@@ -1,0 +1,191 @@
+// Display walls and messages that are lost, come twice or say what can not be: an error that says so, on every rank,
+// and none waits for ever; never a display that is wrong without a word.
+#include "board.hpp"
+#include "catch.hpp"
+#include "scene.hpp"
+
+#include <atomic>
+#include <cstdint>
+#include <cstring>
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace {
+
+using board::Board;
+using board::BoardTransport;
+using board::joined;
+using dfb::detail::MessageHeader;
+using dfb::detail::MessageKind;
+using scene::has;
+using scene::outcomeOf;
+
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall<BoardTransport>, BoardTransport>;
+using What = Board::What;
+constexpr std::size_t body = sizeof(MessageHeader), region = body + 4; // of a part of a display
+constexpr std::uint32_t wallAddress = 0;                               // it is made first
+
+template <class T>
+void put(dfb::Buffer& message, std::size_t at, const T& value)
+{
+    REQUIRE(message.size() >= at + sizeof value);
+    std::memcpy(message.data() + at, &value, sizeof value);
+}
+
+struct Outcome {
+    bool done = false;
+    std::vector<std::string> texts, after;                  // of both ranks, of the first frame and of the next
+    std::vector<dfb::ErrorKind> kinds{2, dfb::ErrorKind{}}; // of the first
+    std::size_t wrong = 0;                                  // pixels on the displays after frames that were fine
+};
+
+// Two frames on a wall of two displays, one of each of 2 ranks. `change` gets the first message of this kind from rank
+// 1 to the wall of rank 0, and says what becomes of it. `timeoutMs`: of finish().
+Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Buffer&)>& change)
+{
+    Outcome result;
+    result.texts.resize(2);
+    result.after.resize(2);
+    const auto watched = std::make_shared<Board>();
+    std::atomic<bool> armed{false}, done{false};
+    watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (from != 1 || header.receiver != wallAddress || header.kind != kind || !armed || done.exchange(true))
+            return What::Pass;
+        return change(message);
+    };
+    std::atomic<std::size_t> wrong{0};
+    board::runOn(
+        watched, 2,
+        [&](const BoardTransport::Communicator& communicator) {
+            const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
+            dfb::WallLayout layout;
+            layout.columns = 2;
+            layout.displayWidth = 72, layout.displayHeight = 64;
+            layout.ranks = {0, 1};
+            const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
+            dfb::DisplayWall<BoardTransport> wall(messenger, layout, dfb::OutputFormat::RGBA32F, executor);
+            auto config = wall.frameBufferConfig();
+            config.executor = executor;
+            FrameBuffer fb(messenger, config, {&wall});
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            armed = true; // rank 1 has sent what the constructors send to the wall
+            const auto frame = [&](float shade) {
+                dfb::FrameParams params;
+                params.background = {shade, shade, shade, 1};
+                const auto report = dfb::renderDataParallel(
+                    fb, dfb::World(), scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
+                try {
+                    wall.finish(report.frame, timeoutMs);
+                } catch (const dfb::Error& e) {
+                    if (shade == 0.5f)
+                        result.kinds[rank] = e.info().kind;
+                    throw;
+                }
+                const dfb::Image& image = wall.image(fb.rank());
+                for (std::size_t i = 0; i < image.pixelCount(); ++i)
+                    wrong += image.rgba32f()[4 * i] != shade;
+            };
+            result.texts[rank] = outcomeOf([&] { frame(0.5f); });
+            result.after[rank] = outcomeOf([&] { frame(0.25f); });
+        },
+        std::nullopt, std::chrono::seconds(20));
+    result.done = done;
+    result.wrong = wrong;
+    return result;
+}
+
+const std::vector<std::string> fine{"fine", "fine"};
+
+} // namespace
+
+TEST_CASE("A part of a display that can not be fails its frame on every rank, and the next is right", "[wall]")
+{
+    struct Lie {
+        const char* name;
+        std::function<void(dfb::Buffer&)> change;
+        std::string part; // of the error
+    };
+    const auto moved = [](int x, int y) {
+        return [=](dfb::Buffer& m) {
+            auto r = dfb::detail::loadAs<dfb::Region>(m.data() + region);
+            // To where another part is, of the same size.
+            r.x0 += r.x0 < 32 ? x : -x, r.x1 = r.x0 + 16;
+            r.y0 += r.y0 < 32 ? y : -y, r.y1 = r.y0 + 16;
+            put(m, region, r);
+        };
+    };
+    const std::vector<Lie> lies{
+        {"over its neighbour", moved(16, 0), "overlaps another"},
+        {"over the one below", moved(0, 16), "overlaps another"},
+        {"over a corner", moved(1, 1), "overlaps another"},
+        {"of a frame far ahead", [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, number), std::int64_t{1000}); },
+         "no rank can have begun"},
+        {"of a display of another rank", [](dfb::Buffer& m) { put(m, body, 1); }, "does not drive"},
+        {"too short", [](dfb::Buffer& m) { m.shrink(m.size() - 1); }, "wrong size"},
+    };
+    for (const Lie& lie : lies) {
+        const Outcome o = frames(MessageKind::FinishedTiles, 0, [&](dfb::Buffer& m) {
+            lie.change(m);
+            return What::Pass;
+        });
+        INFO(lie.name << joined(o.texts) << "\n after it" << joined(o.after));
+        CHECK(o.done);
+        CHECK(o.texts[0] == o.texts[1]);
+        CHECK(has(o.texts[0], lie.part));
+        CHECK(has(o.texts[0], "in a message from rank "));
+        CHECK(o.kinds == std::vector<dfb::ErrorKind>(2, dfb::ErrorKind::MalformedMessage));
+        CHECK(o.after == fine);
+        CHECK(o.wrong == 0);
+    }
+}
+
+TEST_CASE("A wall does not wait for what can not come: a message of a kind that it does not get", "[wall]")
+{
+    struct Lie {
+        const char* name;
+        MessageKind kind;
+        std::function<void(dfb::Buffer&)> change;
+    };
+    const std::vector<Lie> lies{
+        {"a part that claims to be an input", MessageKind::FinishedTiles,
+         [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, kind), MessageKind::Fragment); }},
+        {"a reduction of another scope", MessageKind::ReduceUp, [](dfb::Buffer& m) { put(m, body, std::uint32_t{7}); }},
+        {"a reduction that claims to be a request", MessageKind::ReduceUp,
+         [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, kind), MessageKind::CreditRequest); }},
+    };
+    for (const Lie& lie : lies) {
+        const Outcome o = frames(lie.kind, 0, [&](dfb::Buffer& m) {
+            lie.change(m);
+            return What::Pass;
+        });
+        INFO(lie.name << joined(o.texts) << "\n after it" << joined(o.after));
+        CHECK(o.done);
+        for (const auto* texts : {&o.texts, &o.after})
+            for (const std::string& text : *texts) {
+                CHECK(has(text, "TransportError"));
+                CHECK_FALSE(has(text, "time limit"));
+            }
+        CHECK(has(o.texts[0], "in a message from rank 1"));
+    }
+}
+
+TEST_CASE("A part of a display that is lost is named with its display, one that comes twice is dropped", "[wall]")
+{
+    const Outcome lost = frames(MessageKind::FinishedTiles, 1000, [](dfb::Buffer&) { return What::Lose; });
+    INFO(joined(lost.texts) << "\n after it" << joined(lost.after));
+    CHECK(lost.done);
+    CHECK(lost.texts[0] == lost.texts[1]);
+    CHECK(has(lost.texts[0], "display 0 of rank 0 misses "));
+    CHECK(lost.kinds == std::vector<dfb::ErrorKind>(2, dfb::ErrorKind::TimedOut));
+    CHECK(lost.after == fine);
+    CHECK(lost.wrong == 0);
+
+    const Outcome twice = frames(MessageKind::FinishedTiles, 0, [](dfb::Buffer&) { return What::Twice; });
+    INFO(joined(twice.texts) << "\n after it" << joined(twice.after));
+    CHECK(twice.done);
+    CHECK(twice.texts == fine);
+    CHECK(twice.after == fine);
+    CHECK(twice.wrong == 0);
+}

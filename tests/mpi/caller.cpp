@@ -1,0 +1,87 @@
+// Progress by the caller: a rank that has left end() may go into calls of MPI that do not move messages of dfb, and
+// nobody may need it there.
+#include "catch.hpp"
+#include "ranks.hpp"
+
+#include <dfb/comm/mpi_transport.hpp>
+#include <dfb/dfb.hpp>
+
+#include <chrono>
+#include <cstddef>
+#include <memory>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace {
+
+using Op = dfb::BasicOrderedBlend<64>;
+using Fb = dfb::DistributedFrameBuffer<Op>;
+
+// The program's own barrier. False if it takes more than 20 seconds; then messages are moved until it is over.
+bool passesBarrier(Fb& fb)
+{
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Ibarrier(MPI_COMM_WORLD, &request);
+    const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+    bool inTime = true;
+    for (int done = 0; MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done;) {
+        if (std::chrono::steady_clock::now() > limit)
+            inTime = false;
+        if (!inTime)
+            fb.poll();
+        std::this_thread::sleep_for(std::chrono::microseconds(200));
+    }
+    return inTime;
+}
+
+} // namespace
+
+TEST_CASE("Who has left end() is not needed to take what a frame did not need", "[mpi]")
+{
+    const int rank = rankIn(MPI_COMM_WORLD), last = sizeOf(MPI_COMM_WORLD) - 1;
+    constexpr int tiles = 400; // of 80 KiB, far more than MPI has under way at once
+    dfb::FrameBufferConfig config;
+    config.width = config.height = 64 * 20;
+    config.format = dfb::OutputFormat::None;
+    config.progress = dfb::Progress::Caller;
+    config.executor = std::make_shared<dfb::CallerExecutor>();
+    config.sharedMemory = false;
+    config.messagePoolBytes = std::size_t{1} << 30;
+    const int owner = last > 1 ? 1 : 0;
+    config.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
+    Fb fb(MPI_COMM_WORLD, config);
+    std::vector<float> pixels(4 * 64 * 64);
+    for (std::size_t i = 0; i < pixels.size(); ++i)
+        pixels[i] = i % 4 == 3 ? 1.0f : static_cast<float>(i % 1009) / 1009;
+    for (const bool cancelled : {false, true}) {
+        std::string failure;
+        auto frame = fb.begin();
+        const auto send = [&](int generation, int children) {
+            for (int index = 0; index < tiles; ++index) {
+                Fb::TileView view;
+                frame.start(view, index);
+                view.generation = generation;
+                view.children = children;
+                view.stride = 64;
+                view.color = pixels.data();
+                view.depth = pixels.data();
+                frame.setTile(view);
+            }
+        };
+        // The owner has something opaque in front of all that the last rank sends; or the frame is cancelled first.
+        if (rank == owner && !cancelled)
+            send(0, last == owner ? 0 : 1);
+        if (rank == last && last != owner)
+            send(1, 0);
+        if (cancelled && rank == 0)
+            frame.cancel();
+        try {
+            frame.end();
+        } catch (const dfb::FrameError& e) {
+            failure = e.what();
+        }
+        CHECK(failure.empty() == !cancelled);
+        CHECK(passesBarrier(fb));
+    }
+}
