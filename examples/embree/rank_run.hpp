@@ -378,6 +378,8 @@ private:
         const auto* first = reinterpret_cast<const std::byte*>(rendered_.data());
         std::vector<std::vector<std::int64_t>> all;
         for (const auto& bytes : fb_->allGather({first, first + rendered_.size() * sizeof(std::int64_t)})) {
+            if (bytes.size() != rendered_.size() * sizeof(std::int64_t))
+                throw std::runtime_error("ranks have counted different numbers of frames");
             all.emplace_back(rendered_.size());
             std::memcpy(all.back().data(), bytes.data(), bytes.size());
         }

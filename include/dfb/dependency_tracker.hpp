@@ -10,7 +10,9 @@
 #include <dfb/tile.hpp>
 
 #include <algorithm>
+#include <cstddef>
 #include <cstdint>
+#include <map>
 #include <optional>
 #include <string>
 #include <utility>
@@ -25,7 +27,9 @@ public:
     // Forgets everything and expects `rootCount` inputs of generation 0 (the paper's background tile is one).
     void reset(int rootCount = 1)
     {
-        generations_.clear();
+        generations_.assign(2, {}); // nearly every tree has as many
+        if (!far_.empty())
+            far_.clear();
         inputs_.clear();
         declared_.clear();
         hasDeclaration_ = false;
@@ -140,9 +144,21 @@ private:
 
     Generation& generation(int index)
     {
-        if (static_cast<std::size_t>(index) >= generations_.size())
-            generations_.resize(static_cast<std::size_t>(index) + 1);
-        return generations_[static_cast<std::size_t>(index)];
+        const auto place = static_cast<std::size_t>(index);
+        if (place >= generations_.size() && !reach(place))
+            return far_[index];
+        return generations_[place];
+    }
+    // False if it is too far.
+    bool reach(std::size_t place)
+    {
+        if (place > generations_.size() + mostAhead)
+            return false;
+        generations_.resize((place / 8 + 1) * 8); // whichever of them comes first, the same memory
+        for (; !far_.empty() && static_cast<std::size_t>(far_.begin()->first) < generations_.size();
+             far_.erase(far_.begin()))
+            generations_[static_cast<std::size_t>(far_.begin()->first)] = far_.begin()->second;
+        return true;
     }
 
     // Steps over every generation that is complete; its children are what the next one expects.
@@ -161,6 +177,8 @@ private:
                 for (std::size_t g = static_cast<std::size_t>(current_); g < generations_.size(); ++g)
                     if (generations_[g].arrived > 0)
                         failAt(static_cast<int>(g), ErrorKind::UnannouncedInput, 0, generations_[g].arrived);
+                if (!far_.empty())
+                    failAt(far_.begin()->first, ErrorKind::UnannouncedInput, 0, far_.begin()->second.arrived);
             }
         }
     }
@@ -192,7 +210,11 @@ private:
         throw Error(std::move(info));
     }
 
-    std::vector<Generation> generations_;
+    // So many more than there are an input may add, lest one with a wrong number takes the memory of all.
+    static constexpr std::size_t mostAhead = 64;
+
+    std::vector<Generation> generations_;                           // the first ones
+    std::map<int, Generation> far_;                                 // those behind that have come
     std::vector<Input> inputs_;                                     // sorted
     std::vector<std::pair<std::uint32_t, std::uint16_t>> declared_; // sorted
     bool hasDeclaration_ = false;

@@ -71,15 +71,17 @@ inline std::uint32_t nearestInteger(float value) noexcept
     return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
 }
 
-// How a scaled channel of a colour travels.
+// How a scaled channel of a colour travels. What is above `most` is none of a pixel in range.
 struct HalfCode {
     using Word = std::uint16_t;
+    static constexpr Word most = 0x7800; // 2^15, to which alpha 1 is scaled, and beyond which no colour is
     static Word of(float value) noexcept { return positiveToHalf(value); }
     static float valueOf(Word code) noexcept { return positiveFromHalf(code); }
 };
 template <class Unsigned>
 struct UnormCode {
     using Word = Unsigned;
+    static constexpr Word most = std::numeric_limits<Word>::max();
     static Word of(float value) noexcept { return static_cast<Word>(nearestInteger(value)); }
     static float valueOf(Word code) noexcept { return static_cast<float>(code); }
 };
@@ -142,11 +144,13 @@ DFB_INLINE void encodePixels(const float* rgba, int count, const WireScales& by,
     }
 }
 
+// False if there is a code that no pixel in range has.
 template <class Code>
-DFB_INLINE void decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
 {
     const float scales[4] = {by.color, by.color, by.color, by.alpha};
     typename Code::Word words[wireBlock];
+    std::uint16_t above = 0; // in its highest bit
     for (int first = 0; first < 4 * count; first += wireBlock) {
         const int size = std::min(wireBlock, 4 * count - first);
         std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
@@ -154,7 +158,11 @@ DFB_INLINE void decodePixels(const std::byte* in, int count, const WireScales& b
         for (int i = 0; i < size; i += 4)
             for (int c = 0; c < 4; ++c)
                 rgba[first + i + c] = Code::valueOf(words[i + c]) * scales[c];
+        if constexpr (std::is_same_v<Code, HalfCode>)
+            for (int i = 0; i < size; ++i) // by itself, so that both are vectorized
+                above = static_cast<std::uint16_t>(above | words[i] | (words[i] + (0x7fff - Code::most)));
     }
+    return above < 0x8000;
 }
 
 template <class Code>
@@ -242,25 +250,33 @@ DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const W
 }
 
 template <class Code>
-DFB_AVX2_F16C inline void decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
 {
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
+    bool inRange = true;
 #if defined(DFB_HAS_AVX2_CLONES)
     const __m256 scales = wireVector(by);
-    for (; i + 2 <= count; i += 2) {
-        const auto* from = reinterpret_cast<const __m128i*>(in + 4 * wordBytes * static_cast<std::size_t>(i));
-        __m256 values;
-        if constexpr (std::is_same_v<Code, HalfCode>)
-            values = _mm256_cvtph_ps(_mm_loadu_si128(from));
-        else if constexpr (wordBytes == 2)
-            values = _mm256_cvtepi32_ps(_mm256_cvtepu16_epi32(_mm_loadu_si128(from)));
-        else
-            values = _mm256_cvtepi32_ps(_mm256_cvtepu8_epi32(_mm_loadl_epi64(from)));
-        _mm256_storeu_ps(rgba + 4 * i, _mm256_mul_ps(values, scales));
+    if constexpr (std::is_same_v<Code, HalfCode>) {
+        __m128i largest[2] = {};
+        for (; i + 4 <= count; i += 4) // two at a time would be slower for the comparison
+            for (int part = 0; part < 2; ++part) {
+                const __m128i codes = _mm_loadu_si128(reinterpret_cast<const __m128i*>(in + 8 * i) + part);
+                largest[part] = _mm_max_epu16(largest[part], codes);
+                _mm256_storeu_ps(rgba + 4 * i + 8 * part, _mm256_mul_ps(_mm256_cvtph_ps(codes), scales));
+            }
+        const __m128i all = _mm_max_epu16(largest[0], largest[1]), most = _mm_set1_epi16(HalfCode::most);
+        inRange = _mm_movemask_epi8(_mm_cmpeq_epi16(_mm_max_epu16(all, most), most)) == 0xffff;
+    } else {
+        for (; i + 2 <= count; i += 2) {
+            const auto* from = reinterpret_cast<const __m128i*>(in + 4 * wordBytes * static_cast<std::size_t>(i));
+            const __m256i codes = wordBytes == 2 ? _mm256_cvtepu16_epi32(_mm_loadu_si128(from))
+                                                 : _mm256_cvtepu8_epi32(_mm_loadl_epi64(from));
+            _mm256_storeu_ps(rgba + 4 * i, _mm256_mul_ps(_mm256_cvtepi32_ps(codes), scales));
+        }
     }
 #endif
-    decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i);
+    return decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i) && inRange;
 }
 
 template <class Code>

@@ -106,20 +106,23 @@ public:
         case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
         }
     }
-    void decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
+    // False if there is a code that encodeColor() does not make.
+    bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
     {
         const auto decode = [&](auto code, float colorScale, float alphaScale) {
             using Code = decltype(code);
             const auto pixels = static_cast<int>(count);
             const WireScales by{colorScale, alphaScale};
-            cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba) : decodePixels<Code>(in, pixels, by, rgba);
+            return cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba)
+                                : decodePixels<Code>(in, pixels, by, rgba);
         };
         switch (format) {
-        case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); return;
-        case WireFormat::Float16: decode(HalfCode(), 1 / scale_, 0x1p-15f); return;
-        case WireFormat::Unorm16: decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f); return;
-        case WireFormat::Unorm8: decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f); return;
+        case WireFormat::Float32: std::memcpy(rgba, in, 4 * sizeof(float) * count); break;
+        case WireFormat::Float16: return decode(HalfCode(), 1 / scale_, 0x1p-15f);
+        case WireFormat::Unorm16: return decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f);
+        case WireFormat::Unorm8: return decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f);
         }
+        return true;
     }
 
     // Not NaN. The order of two depths stays, or they become equal.

@@ -140,4 +140,23 @@ TEST_CASE("A wrong address or place is not believed", "[memory]")
     CHECK(s.seen->borrow(place, ~std::uint64_t{0}).empty());
     CHECK(s.seen->borrow(place, 4096).size() == 4096);
 }
+
+TEST_CASE("A block is lent once, as a whole", "[memory]")
+{
+    SharedPool s;
+    Buffer buffer = s.pool->acquire(4096);
+    std::memset(buffer.data(), 1, buffer.size()); // as if each place in it were one of a block that is lent
+    const std::int32_t place = s.memory->placeOf(buffer.data());
+    const std::byte* block = s.pool->lend(buffer);
+    REQUIRE(block);
+    for (int i = 1; i < 10; ++i)
+        CHECK(s.seen->borrow(place + i, 64).empty());
+    Buffer borrowed = s.seen->borrow(place, 4096);
+    CHECK(borrowed.size() == 4096);
+    CHECK(s.seen->borrow(place, 4096).empty());
+    CHECK(s.memory->isLent(block)); // still
+    borrowed = Buffer();
+    CHECK_FALSE(s.memory->isLent(block));
+    CHECK(s.seen->borrow(place, 4096).empty());
+}
 #endif

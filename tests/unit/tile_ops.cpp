@@ -369,6 +369,23 @@ TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take i
     }
 }
 
+TEST_CASE("OrderedBlend does not take two inputs for the two that an opaque one waits for", "[ops]")
+{
+    using Op = dfb::BasicOrderedBlend<8>;
+    TileInputs<8> in;
+    for (int i = 0; i < 3; ++i) {
+        auto& tile = in.add(0, static_cast<std::uint32_t>(i), 0);
+        tile.fill({0.25f, 0, 0, i == 2 ? 1.0f : 0.5f}, 1.0f);
+        tile.generation = std::max(i, 1); // the first was damaged
+        tile.children = i < 2;
+    }
+    auto order = in.order();
+    do
+        CHECK_THROWS_AS(dfb::testing::runTileOp<Op>(in, order, dfb::OutputFormat::RGBA32F, false),
+                        dfb::InvalidArgument);
+    while (std::next_permutation(order.begin(), order.end()));
+}
+
 TEST_CASE("What a single layer covers comes out the same whether it is taken as it is or composited", "[ops]")
 {
     using Op = dfb::BasicAlphaBlend<64>;

@@ -7,9 +7,12 @@
 #include <cstdint>
 #include <numeric>
 #include <optional>
+#include <random>
 #include <string>
 #include <utility>
 #include <vector>
+
+#include <sys/resource.h>
 
 namespace {
 
@@ -33,15 +36,21 @@ const std::vector<Shape>& shapes()
         {"a root alone", 1, {{0, 9, 0, 0}}},
         {"1 + 1", 1, {{0, 9, 0, 1}, {1, 0, 0, 0}}},
         {"1 + 3", 1, {{0, 9, 0, 3}, {1, 0, 0, 0}, {1, 1, 0, 0}, {1, 2, 0, 0}}},
-        {"1 + 6, two parts a source", 1,
+        {"1 + 6, two parts a source",
+         1,
          {{0, 9, 0, 6}, {1, 0, 0, 0}, {1, 0, 1, 0}, {1, 1, 0, 0}, {1, 1, 1, 0}, {1, 2, 0, 0}, {1, 2, 1, 0}}},
-        {"two roots, one of which announces all", 2, {{0, 8, 0, 0}, {0, 9, 0, 3}, {1, 0, 0, 0}, {1, 1, 0, 0}, {1, 2, 0, 0}}},
+        {"two roots, one of which announces all",
+         2,
+         {{0, 8, 0, 0}, {0, 9, 0, 3}, {1, 0, 0, 0}, {1, 1, 0, 0}, {1, 2, 0, 0}}},
         {"a chain of 6", 1, {{0, 0, 0, 1}, {1, 0, 0, 1}, {2, 0, 0, 1}, {3, 0, 0, 1}, {4, 0, 0, 1}, {5, 0, 0, 0}}},
         {"a list by generation, other sources", 1, {{0, 9, 0, 1}, {1, 3, 0, 1}, {2, 1, 0, 1}, {3, 2, 0, 0}}},
-        {"uneven", 1, {{0, 9, 0, 2}, {1, 0, 0, 3}, {1, 1, 0, 0}, {2, 0, 0, 0}, {2, 1, 0, 1}, {2, 2, 0, 0}, {3, 5, 0, 0}}},
+        {"uneven",
+         1,
+         {{0, 9, 0, 2}, {1, 0, 0, 3}, {1, 1, 0, 0}, {2, 0, 0, 0}, {2, 1, 0, 1}, {2, 2, 0, 0}, {3, 5, 0, 0}}},
         {"wide in the middle", 1, {{0, 9, 0, 1}, {1, 0, 0, 3}, {2, 1, 0, 0}, {2, 2, 0, 1}, {2, 3, 0, 0}, {3, 4, 0, 0}}},
         // Members count together: 1 announces nothing of its own, 0 announces 1's children too.
-        {"children announced by another's parent", 1,
+        {"children announced by another's parent",
+         1,
          {{0, 9, 0, 2}, {1, 0, 0, 4}, {1, 1, 0, 0}, {2, 0, 0, 0}, {2, 0, 1, 0}, {2, 1, 0, 0}, {2, 1, 1, 0}}},
     };
     return all;
@@ -58,7 +67,10 @@ void forAllOrders(std::size_t count, const F& f)
     while (std::next_permutation(order.begin(), order.end()));
 }
 
-void arrive(dfb::DependencyTracker& tracker, const Input& i) { tracker.arrive(i.generation, i.source, i.part, i.children); }
+void arrive(dfb::DependencyTracker& tracker, const Input& i)
+{
+    tracker.arrive(i.generation, i.source, i.part, i.children);
+}
 
 // The error of the first arrival that throws, if any does; `complete` is what the tracker said after the last one.
 struct Run {
@@ -82,6 +94,14 @@ Run run(const Tree& tree, const std::vector<std::size_t>& order)
         result.complete = tracker.complete();
     }
     return result;
+}
+
+// The most memory that this process has had.
+long peakKiB()
+{
+    rusage usage{};
+    getrusage(RUSAGE_SELF, &usage);
+    return usage.ru_maxrss;
 }
 
 } // namespace
@@ -156,15 +176,17 @@ TEST_CASE("One leaf too many is an error in every order", "[tracker]")
         for (const Input& i : shape.inputs)
             leaves = std::max(leaves, i.generation);
         Tree tree = shape.inputs;
-        const auto expected = std::count_if(tree.begin(), tree.end(), [&](const Input& i) { return i.generation == leaves; });
+        const auto expected =
+            std::count_if(tree.begin(), tree.end(), [&](const Input& i) { return i.generation == leaves; });
         tree.push_back({leaves, 77, 3, 0});
         std::size_t wrong = 0;
         std::string example;
         forAllOrders(tree.size(), [&](const std::vector<std::size_t>& order) {
             const Run r = run(tree, order);
-            const bool isLeaf = r.error && std::any_of(tree.begin(), tree.end(), [&](const Input& i) {
-                return i.generation == leaves && static_cast<std::int64_t>(i.source) == r.error->source;
-            });
+            const bool isLeaf =
+                r.error && std::any_of(tree.begin(), tree.end(), [&](const Input& i) {
+                    return i.generation == leaves && static_cast<std::int64_t>(i.source) == r.error->source;
+                });
             // Who is the one too many can not be told; but it is one of that generation.
             if (!isLeaf || r.error->kind != dfb::ErrorKind::TooManyInputs || r.error->generation != leaves
                 || r.error->expected != expected || r.error->got != expected + 1) {
@@ -186,7 +208,8 @@ TEST_CASE("One inner input too many never passes unnoticed", "[tracker]")
             for (int generation = 0; generation < 3; ++generation) {
                 Tree tree = shape.inputs;
                 tree.push_back({generation, 77, 0, children});
-                // With its announced children it would be another valid tree if its generation had the room; it has not.
+                // With its announced children it would be another valid tree if its generation had the room; it has
+                // not.
                 std::size_t unnoticed = 0;
                 forAllOrders(tree.size(), [&](const std::vector<std::size_t>& order) {
                     const Run r = run(tree, order);
@@ -215,8 +238,9 @@ TEST_CASE("A duplicate is an error in every order, also after completion", "[tra
             std::string example;
             forAllOrders(tree.size(), [&](const std::vector<std::size_t>& order) {
                 const Run r = run(tree, order);
-                if (!r.error || r.error->kind != dfb::ErrorKind::DuplicateInput || r.error->generation != culprit.generation
-                    || r.error->source != culprit.source || r.error->expected != 1 || r.error->got != 2) {
+                if (!r.error || r.error->kind != dfb::ErrorKind::DuplicateInput
+                    || r.error->generation != culprit.generation || r.error->source != culprit.source
+                    || r.error->expected != 1 || r.error->got != 2) {
                     ++wrong;
                     example = r.error ? r.error->describe() : "no error";
                 }
@@ -242,9 +266,9 @@ TEST_CASE("An input of a generation that nobody announced is an error in every o
             std::string example;
             forAllOrders(tree.size(), [&](const std::vector<std::size_t>& order) {
                 const Run r = run(tree, order);
-                if (!r.error || r.error->kind != dfb::ErrorKind::UnannouncedInput || r.error->generation != leaves + beyond
-                    || r.error->source != 42 || r.error->expected != 0 || r.error->got != 1
-                    || r.arrivals + 1 != tree.size()) {
+                if (!r.error || r.error->kind != dfb::ErrorKind::UnannouncedInput
+                    || r.error->generation != leaves + beyond || r.error->source != 42 || r.error->expected != 0
+                    || r.error->got != 1 || r.arrivals + 1 != tree.size()) {
                     ++wrong;
                     example = r.error ? r.error->describe() : "no error";
                 }
@@ -286,6 +310,58 @@ TEST_CASE("Negative children and impossible generations are errors at once", "[t
     CHECK_FALSE(tracker.complete());
     REQUIRE(tracker.missing());
     CHECK(tracker.missing()->text() == "generation 2 has 0 of 4294967294 inputs");
+}
+
+TEST_CASE("Generations may come in any order, however far from each other", "[tracker]")
+{
+    constexpr int count = 3000;
+    std::vector<int> order(count);
+    std::iota(order.begin(), order.end(), 0);
+    const auto fine = [&](bool isClosed) {
+        dfb::DependencyTracker tracker;
+        for (int run = 0; run < 2; ++run) { // reused as the framebuffer reuses it
+            tracker.reset();
+            for (std::size_t i = 0; i < order.size(); ++i) {
+                if (tracker.complete())
+                    return false;
+                tracker.arrive(order[i], static_cast<std::uint32_t>(i), 0, order[i] + 1 < count);
+            }
+            if (tracker.complete() != isClosed)
+                return false;
+        }
+        return true;
+    };
+    CHECK(fine(true));
+    std::reverse(order.begin(), order.end());
+    CHECK(fine(true));
+    std::mt19937 random(1);
+    for (int i = 0; i < 20; ++i) {
+        std::shuffle(order.begin(), order.end(), random);
+        CHECK(fine(true));
+    }
+    order.erase(std::find(order.begin(), order.end(), count / 2));
+    CHECK(fine(false));
+}
+
+TEST_CASE("An input that is far from all others takes no memory for those between", "[tracker]")
+{
+    constexpr int last = dfb::DependencyTracker::maxGenerations - 1;
+    std::vector<dfb::DependencyTracker> trackers(100);
+    const long before = peakKiB();
+    for (auto& tracker : trackers)
+        tracker.arrive(last, 7, 0, 1);
+    CHECK(peakKiB() - before < 50000); // a third of what they would take
+    for (auto& tracker : trackers) {
+        try {
+            tracker.arrive(0, 1, 0, 0);
+            FAIL("nobody announced it");
+        } catch (const dfb::Error& e) {
+            CHECK(e.info().kind == dfb::ErrorKind::UnannouncedInput);
+            CHECK(e.info().source == 7);
+            CHECK(e.info().generation == last);
+            CHECK(e.info().got == 1);
+        }
+    }
 }
 
 TEST_CASE("Declared inputs: any order of declaration and arrivals completes at the last", "[tracker]")

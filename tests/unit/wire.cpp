@@ -319,6 +319,44 @@ void prefixesAndFlips(const dfb::Codec* codec)
 
 TEST_CASE("Tiles come through the wire as they were, in the smallest encoding", "[wire]") { allRoundTrips(nullptr); }
 
+TEST_CASE("A colour that is out of its format's range is refused, in every place of it", "[wire]")
+{
+    const auto pool = dfb::MemoryPool::create();
+    const dfb::TileLayout layout(5, 3, 8);
+    const dfb::detail::WireCoder coder{dfb::WirePrecision(dfb::WireFormat::Float16)};
+    auto tile = makeTile<8>(layout, 0);
+    for (int y = 0; y < 3; ++y)
+        for (int x = 0; x < 5; ++x) {
+            const float red = x % 2 == 0 ? 1.0f : 0.5f; // the largest that there is
+            const float rgba[4] = {red, -0.0f, 0.25f, 1};
+            std::copy_n(rgba, 4, tile->pixel(x, y));
+        }
+    const auto isRefused = [&](std::size_t place, std::uint16_t code) {
+        dfb::detail::InputFaults faults;
+        dfb::Buffer message = dfb::detail::encodeFragment(*pool, *tile, dfb::colorChannel, 9, nullptr, coder,
+                                                          dfb::WireFormat::Float16, faults);
+        REQUIRE(message.size() == fragmentPrefix + (4 * 15 * 2 + 3) / 4 * 4);
+        if (code != 0)
+            std::memcpy(message.data() + fragmentPrefix + 2 * place, &code, sizeof code);
+        try {
+            dfb::detail::decodeFragment(
+                *pool, std::move(message), layout, [](int) { return 3; }, nullptr, coder);
+            return false;
+        } catch (const dfb::Error& e) {
+            return e.info().kind == dfb::ErrorKind::MalformedMessage;
+        }
+    };
+    CHECK_FALSE(isRefused(0, 0));
+    int wrong = 0;
+    for (std::size_t place = 0; place < 4 * 15; ++place) {
+        for (const std::uint16_t none : {0x7801, 0x7bff, 0x7c00, 0x7e00, 0x8000, 0x8001, 0xbc00, 0xfc00, 0xffff})
+            wrong += !isRefused(place, none);
+        for (const std::uint16_t code : {1, 0x0400, 0x7800})
+            wrong += isRefused(place, code);
+    }
+    CHECK(wrong == 0);
+}
+
 TEST_CASE("Depth travels in canonical form, and what is not finite is counted once a pixel", "[wire]")
 {
     const auto pool = dfb::MemoryPool::create();

@@ -106,18 +106,19 @@ int wrongDecoded(std::size_t count)
     int wrong = 0;
     const auto check = [&](std::size_t first, int pixels) { // not at the start of a word: as bytes they are as good
         std::vector<float> fast(4 * static_cast<std::size_t>(pixels) + 8, -7), plain(fast);
-        decodePixels<Code>(bytes.data() + first, pixels, by, plain.data());
-        if (cpuHasF16c())
-            decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data());
-        else
-            decodePixels<Code>(bytes.data() + first, pixels, by, fast.data());
+        const bool plainIn = decodePixels<Code>(bytes.data() + first, pixels, by, plain.data());
+        const bool fastIn = cpuHasF16c() ? decodePixelsAvx2<Code>(bytes.data() + first, pixels, by, fast.data())
+                                         : decodePixels<Code>(bytes.data() + first, pixels, by, fast.data());
+        bool isIn = true;
         wrong += std::memcmp(fast.data(), plain.data(), fast.size() * sizeof(float)) != 0;
         wrong += std::count(plain.end() - 8, plain.end(), -7.0f) != 8;
         for (std::size_t i = 0; i < 4 * static_cast<std::size_t>(pixels); ++i) {
             Word word = 0;
             std::memcpy(&word, bytes.data() + first + i * sizeof word, sizeof word);
             wrong += bitsOf(plain[i]) != bitsOf(Code::valueOf(word) * (i % 4 == 3 ? by.alpha : by.color));
+            isIn = isIn && word <= Code::most;
         }
+        wrong += plainIn != isIn || fastIn != isIn;
     };
     check(0, static_cast<int>(count / 4));
     for (int width = 0; width <= std::min(70, static_cast<int>(count / 4) - 3); ++width)

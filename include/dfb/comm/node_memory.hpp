@@ -123,14 +123,15 @@ public:
     }
 
     bool holds(const std::byte* block) const noexcept override { return block >= base_ && block < base_ + capacity; }
-    void lend(std::byte* block) noexcept override { stateOf(block).isLent.store(1, std::memory_order_relaxed); }
+    void lend(std::byte* block) noexcept override { stateOf(block).is.store(lent, std::memory_order_relaxed); }
     bool isLent(const std::byte* block) const noexcept override
     {
-        return stateOf(block).isLent.load(std::memory_order_acquire) != 0;
+        return stateOf(block).is.load(std::memory_order_acquire) != mine;
     }
 
     // Where a block lies, in units of `alignment`, for others; and what another process has lent of its memory: the
-    // first `byteCount` bytes of the block there, to be given back by the Buffer's end. Empty if there can be none.
+    // first `byteCount` bytes of the block there, to be given back by the Buffer's end. Empty if there can be none, or
+    // somebody has it: it would be given back twice.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         return static_cast<std::int32_t>(static_cast<std::size_t>(block - base_) / alignment);
@@ -138,7 +139,10 @@ public:
     Buffer borrow(std::int32_t place, std::uint64_t byteCount)
     {
         std::byte* block = at(place, byteCount);
-        if (!block || !isLent(block))
+        std::uint32_t was = lent;
+        if (!block
+            || !stateOf(block).is.compare_exchange_strong(was, borrowed, std::memory_order_acquire,
+                                                          std::memory_order_relaxed))
             return Buffer();
         return Buffer(shared_from_this(), block, static_cast<std::size_t>(byteCount), 0);
     }
@@ -153,9 +157,11 @@ public:
     }
 
 private:
-    // In front of each block.
+    // In front of each block. As a float `lent` is a NaN that nobody makes: pixels do not pass for it, wherever a place
+    // may point to.
+    static constexpr std::uint32_t mine = 0, lent = 0xffa5d3b7, borrowed = 1;
     struct alignas(alignment) State {
-        std::atomic<std::uint32_t> isLent{0};
+        std::atomic<std::uint32_t> is{mine};
     };
     static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(State) == alignment);
     static_assert(capacity / alignment <= std::size_t{1} << 31);
@@ -169,10 +175,7 @@ private:
         return *reinterpret_cast<State*>(base_ + offset);
     }
 
-    void giveBack(std::byte* block, int) noexcept override
-    {
-        stateOf(block).isLent.store(0, std::memory_order_release);
-    }
+    void giveBack(std::byte* block, int) noexcept override { stateOf(block).is.store(mine, std::memory_order_release); }
 
 #if defined(MFD_CLOEXEC)
     static std::byte* map(int file)

@@ -250,7 +250,7 @@ inline ConstPlanes planesAt(const std::byte* data, ChannelMask channels, std::si
     return planes;
 }
 
-// A body with its planes as Float32.
+// A body with its planes as Float32. Throws Error (MalformedMessage) for a colour that no sender makes.
 inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t tableBytes, std::size_t pixels,
                        const std::byte* body, const WireCoder& coder)
 {
@@ -262,11 +262,11 @@ inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t ta
     for (std::size_t c = 0; c < channelCount; ++c) {
         if (!hasChannel(h.channels, c))
             continue;
-        if (c == Color)
-            coder.decodeColor(h.colorFormat, in, pixels, floatsOf(out));
-        else if (c == Depth)
+        if (c == Color && !coder.decodeColor(h.colorFormat, in, pixels, floatsOf(out)))
+            failMalformed("a colour that is out of its format's range");
+        if (c == Depth)
             coder.decodeDepth(h.depthFormat, in, pixels, floatsOf(out));
-        else
+        else if (c != Color)
             std::memcpy(out, in, planeBytes(h, c, pixels));
         in += planeBytes(h, c, pixels);
         out += planeBytes(wide, c, pixels);

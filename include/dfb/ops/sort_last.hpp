@@ -374,10 +374,15 @@ public:
             throw InvalidArgument("inputs in order form a list: at most 1 child each, not "
                                   + std::to_string(fragment.header().children));
         const int generation = fragment.header().generation;
+        const bool hides = opaqueHides(this->store_.info());
+        // Else the tracker says so in the end; here the tile may not wait for that.
+        if (hides && std::find(generations_.begin(), generations_.end(), generation) != generations_.end())
+            throw InvalidArgument("inputs in order form a list: there can not be two of generation "
+                                  + std::to_string(generation));
         generations_.push_back(generation);
         if (generation > opaque_)
             return;
-        if (opaqueHides(this->store_.info()) && fragment.isOpaque()) {
+        if (hides && fragment.isOpaque()) {
             opaque_ = generation;
             this->store_.removeBehind(generation);
         }

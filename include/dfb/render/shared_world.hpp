@@ -24,7 +24,7 @@ struct SharedBrick {
 class SharedWorld {
 public:
     // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks
-    // if their bounds differ.
+    // if their bounds differ, or if what comes from a rank is no World.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {
@@ -35,12 +35,19 @@ public:
         }
         const std::vector<std::vector<std::byte>> all = fb.allGather(mine);
         std::vector<std::pair<Record, int>> held;
-        for (std::size_t rank = 0; rank < all.size(); ++rank)
-            for (std::size_t at = 0; at + sizeof(Record) <= all[rank].size(); at += sizeof(Record)) {
+        for (std::size_t rank = 0; rank < all.size(); ++rank) {
+            if (all[rank].size() % sizeof(Record) != 0)
+                throw InvalidArgument("the bricks of rank " + std::to_string(rank) + " have "
+                                      + std::to_string(all[rank].size()) + " bytes");
+            for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Record)) {
                 Record record;
                 std::memcpy(&record, all[rank].data() + at, sizeof record);
+                if (!detail::isBox(record.bounds))
+                    throw InvalidArgument("the bounds of brick " + std::to_string(record.id) + " of rank "
+                                          + std::to_string(rank) + " are not a box");
                 held.emplace_back(record, static_cast<int>(rank));
             }
+        }
         std::sort(held.begin(), held.end(), [](const auto& a, const auto& b) {
             return a.first.id != b.first.id ? a.first.id < b.first.id : a.second < b.second;
         });
@@ -55,6 +62,9 @@ public:
                 throw InvalidArgument("brick " + std::to_string(record.id) + " has other bounds on rank "
                                       + std::to_string(rank) + " than on rank "
                                       + std::to_string(bricks_.back().ranks.front()));
+            if (!bricks_.back().ranks.empty() && bricks_.back().ranks.back() == rank)
+                throw InvalidArgument("brick " + std::to_string(record.id) + " comes twice from rank "
+                                      + std::to_string(rank));
             bricks_.back().ranks.push_back(rank);
         }
     }

@@ -33,6 +33,19 @@ struct Box3 {
     Vec3 lower, upper;
 };
 
+namespace detail {
+
+// Finite, and lower <= upper.
+inline bool isBox(const Box3& b) noexcept
+{
+    const auto ordered = [](float lower, float upper) {
+        return std::isfinite(lower) && std::isfinite(upper) && lower <= upper;
+    };
+    return ordered(b.lower.x, b.upper.x) && ordered(b.lower.y, b.upper.y) && ordered(b.lower.z, b.upper.z);
+}
+
+} // namespace detail
+
 // A convex region of space that overlaps no other brick, with what it holds. Camera rays see it within `bounds` only:
 // renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion,
 // which secondary rays see beyond the bounds as well.
@@ -77,11 +90,8 @@ public:
 private:
     void check(const Brick& brick)
     {
-        const auto ordered = [](float lower, float upper) {
-            return std::isfinite(lower) && std::isfinite(upper) && lower <= upper;
-        };
         const Box3& b = brick.bounds;
-        if (!ordered(b.lower.x, b.upper.x) || !ordered(b.lower.y, b.upper.y) || !ordered(b.lower.z, b.upper.z))
+        if (!detail::isBox(b))
             throw InvalidArgument("the bounds of brick " + std::to_string(brick.id) + " are not a box");
         const Box3& d = brick.data();
         if (!(d.lower.x <= b.lower.x && d.lower.y <= b.lower.y && d.lower.z <= b.lower.z && d.upper.x >= b.upper.x
