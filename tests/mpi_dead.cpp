@@ -1,7 +1,8 @@
 // A rank that dies or hangs under MPI: the others say which, in time, and come to an end.
 //   mpirun -n 4 mpi_dead <how> <where> <reaction> <victim> <folder>
 //     how:      kill (SIGKILL), exit (without MPI_Finalize), stop (SIGSTOP), resume (SIGSTOP, and SIGCONT later)
-//     where:    constructor, frame (while rendering), reduction (between frames), end (destruction)
+//     where:    constructor, frame (while rendering), pixels (the same, with tiles on their way to and from everybody),
+//               reduction (between frames), end (destruction)
 //     reaction: abort (the default: MPI_Abort), handler (the other ranks go on, as far as they can)
 // Launchers end a job when a rank dies, in most cases, or do not let it live on. Therefore each process forks first:
 // what the launcher sees goes on until all ranks have been told, whatever has become of the rank itself. So this is the
@@ -91,6 +92,27 @@ void emptyFrame(
     frame.end();
 }
 
+// Each rank sends all tiles; after one half of them calls `halfway`.
+void fullFrame(FrameBuffer& fb, const std::function<void()>& halfway)
+{
+    auto frame = fb.begin({});
+    const auto tile = std::make_unique<FrameBuffer::Tile>();
+    for (const int index : fb.ownedTiles()) {
+        frame.start(*tile, index);
+        tile->children = fb.size();
+        frame.setTile(*tile);
+    }
+    for (int index = 0; index < fb.layout().tileCount(); ++index) {
+        if (index == fb.layout().tileCount() / 2)
+            halfway();
+        frame.start(*tile, index);
+        tile->generation = 1;
+        tile->fill({0.5f, 0.25f, 0, 0.5f});
+        frame.setTile(*tile);
+    }
+    frame.end();
+}
+
 void runRank(const Run& run, int& argc, char**& argv)
 {
     dfb::MpiSession mpi(argc, argv);
@@ -116,7 +138,12 @@ void runRank(const Run& run, int& argc, char**& argv)
         auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(mpi.communicator(), options);
         try {
             const auto make = [&] {
-                return std::make_unique<FrameBuffer>(messenger, dfb::FrameBufferConfig{256, 256});
+                dfb::FrameBufferConfig config{256, 256};
+                if (run.where == "pixels") {
+                    config.width = config.height = 2048;
+                    config.messagePoolBytes = 0; // as small as can be: who sends waits for who takes
+                }
+                return std::make_unique<FrameBuffer>(messenger, config);
             };
             std::unique_ptr<FrameBuffer> fb;
             if (run.where == "constructor") {
@@ -126,13 +153,18 @@ void runRank(const Run& run, int& argc, char**& argv)
                 emptyFrame(*fb);
             }
             start = Clock::now();
-            if (isVictim && run.where != "frame")
+            if (isVictim && run.where != "frame" && run.where != "pixels")
                 die(run);
             if (run.where == "constructor")
                 fb = make();
             else if (run.where == "frame")
                 emptyFrame(*fb, [&] {
                     std::this_thread::sleep_for(milliseconds(50));
+                    if (isVictim)
+                        die(run);
+                });
+            else if (run.where == "pixels")
+                fullFrame(*fb, [&] {
                     if (isVictim)
                         die(run);
                 });

@@ -1,11 +1,18 @@
-// mpirun -n 2 mpi_failing_calls: what MPI says of a call that fails comes out of the library, with the call's name.
-// Returns 0 if all is well.
+// mpirun -n 2 mpi_failing_calls: what MPI says of a call that fails, on one rank or on all, comes out of the library on
+// all ranks, with the call's name. Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
 #include <atomic>
+#include <chrono>
+#include <cstddef>
 #include <cstdio>
+#include <cstdlib>
+#include <future>
 #include <memory>
+#include <new>
 #include <string>
+#include <thread>
+#include <utility>
 
 namespace {
 
@@ -28,17 +35,28 @@ void check(bool fine, const std::string& what, const std::string& text)
     std::fprintf(stderr, "mpi_failing_calls: %s: %s\n", what.c_str(), text.c_str());
 }
 
+// If it takes too long ends the job.
 template <class Action>
-std::string transportErrorOf(const Action& action)
+std::string transportErrorOf(const std::string& what, const Action& action)
 {
+    std::promise<void> done;
+    std::thread watch([&what, over = done.get_future()] {
+        if (over.wait_for(std::chrono::seconds(10)) == std::future_status::ready)
+            return;
+        std::fprintf(stderr, "mpi_failing_calls: %s: a rank waits\n", what.c_str());
+        MPI_Abort(MPI_COMM_WORLD, 3);
+    });
+    std::string text = "no exception";
     try {
         action();
     } catch (const dfb::TransportError& e) {
-        return e.what();
+        text = e.what();
     } catch (const std::exception& e) {
-        return std::string("another exception: ") + e.what();
+        text = std::string("another exception: ") + e.what();
     }
-    return "no exception";
+    done.set_value();
+    watch.join();
+    return text;
 }
 
 std::string expected(const std::string& call)
@@ -56,6 +74,19 @@ const dfb::FrameBufferConfig config{64, 64};
 
 } // namespace
 
+// What the library's blocks come from.
+void* operator new(std::size_t byteCount, std::align_val_t alignment)
+{
+    const auto multiple = static_cast<std::size_t>(alignment);
+    void* block =
+        fails("memory") ? nullptr : std::aligned_alloc(multiple, (byteCount + multiple - 1) / multiple * multiple);
+    if (!block)
+        throw std::bad_alloc();
+    return block;
+}
+void operator delete(void* block, std::align_val_t) noexcept { std::free(block); }
+void operator delete(void* block, std::size_t, std::align_val_t) noexcept { std::free(block); }
+
 #define DFB_FAILING(name, parameters, arguments) \
     extern "C" int name parameters { return fails(#name) ? code : P##name arguments; }
 DFB_FAILING(MPI_Comm_idup, (MPI_Comm a, MPI_Comm* b, MPI_Request* c), (a, b, c))
@@ -65,6 +96,11 @@ DFB_FAILING(MPI_Get_processor_name, (char* a, int* b), (a, b))
 DFB_FAILING(MPI_Iallgather,
             (const void* a, int b, MPI_Datatype c, void* d, int e, MPI_Datatype f, MPI_Comm g, MPI_Request* h),
             (a, b, c, d, e, f, g, h))
+DFB_FAILING(MPI_Ialltoall,
+            (const void* a, int b, MPI_Datatype c, void* d, int e, MPI_Datatype f, MPI_Comm g, MPI_Request* h),
+            (a, b, c, d, e, f, g, h))
+DFB_FAILING(MPI_Iallreduce, (const void* a, void* b, int c, MPI_Datatype d, MPI_Op e, MPI_Comm f, MPI_Request* g),
+            (a, b, c, d, e, f, g))
 DFB_FAILING(MPI_Irecv, (void* a, int b, MPI_Datatype c, int d, int e, MPI_Comm f, MPI_Request* g),
             (a, b, c, d, e, f, g))
 DFB_FAILING(MPI_Isend, (const void* a, int b, MPI_Datatype c, int d, int e, MPI_Comm f, MPI_Request* g),
@@ -75,16 +111,38 @@ DFB_FAILING(MPI_Get_count, (const MPI_Status* a, MPI_Datatype b, int* c), (a, b,
 int main(int argc, char** argv)
 {
     const dfb::MpiSession mpi(argc, argv);
-    for (const char* call : {"MPI_Comm_idup", "MPI_Comm_set_errhandler", "MPI_Comm_get_attr", "MPI_Get_processor_name",
-                             "MPI_Iallgather", "MPI_Irecv"}) {
-        failing = call;
-        const std::string text = transportErrorOf([&] { FrameBuffer fb(mpi.communicator(), config); });
-        check(has(text, "transport failure") && has(text, expected(call)), std::string("made with a failing ") + call,
-              text);
+    const auto make = [&](const char* call, bool everywhere, bool shared = true) {
+        const std::string what =
+            std::string("made with a failing ") + call + (everywhere ? " on all ranks" : " on the last rank");
+        const int last = mpi.size() - 1;
+        if (everywhere || mpi.rank() == last)
+            failing = call;
+        const std::string text = transportErrorOf(what, [&] {
+            auto its = config;
+            its.sharedMemory = shared;
+            FrameBuffer fb(mpi.communicator(), its);
+        });
         failing = nullptr;
+        return std::make_pair(what, text);
+    };
+    // Without them the ranks can not say anything to each other.
+    for (const char* call : {"MPI_Comm_idup", "MPI_Iallgather", "MPI_Ialltoall", "MPI_Iallreduce"}) {
+        const auto [what, text] = make(call, true);
+        check(has(text, "transport failure: rank ") && has(text, expected(call)), what, text);
+    }
+    for (const bool everywhere : {false, true}) {
+        const std::string who = "transport failure: rank " + std::to_string(everywhere ? 0 : mpi.size() - 1) + ": ";
+        for (const char* call :
+             {"MPI_Comm_set_errhandler", "MPI_Comm_get_attr", "MPI_Get_processor_name", "MPI_Irecv"}) {
+            const auto [what, text] = make(call, everywhere);
+            check(has(text, who + expected(call)), what, text);
+        }
+        const auto [what, text] = make("memory", everywhere, false);
+        check(has(text, who + "std::bad_alloc"), what, text);
     }
     for (const char* call : {"MPI_Isend", "MPI_Irecv", "MPI_Testsome", "MPI_Get_count"}) {
-        const std::string text = transportErrorOf([&] {
+        const std::string what = std::string("a frame with a failing ") + call;
+        const std::string text = transportErrorOf(what, [&] {
             FrameBuffer fb(mpi.communicator(), config);
             for (int i = 0; i < 2; ++i) {
                 dfb::FrameParams params;
@@ -96,8 +154,7 @@ int main(int argc, char** argv)
                 frame.end();
             }
         });
-        check(has(text, "transport failure: rank 0") && has(text, expected(call)),
-              std::string("a frame with a failing ") + call, text);
+        check(has(text, "transport failure: rank 0") && has(text, expected(call)), what, text);
         failing = nullptr;
     }
     return failures;

@@ -3,6 +3,7 @@
 
 #include <dfb/comm/inproc_transport.hpp>
 #include <dfb/testing/fault_transport.hpp>
+#include <dfb/testing/transport_conformance.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -293,6 +294,80 @@ TEST_CASE("At most so many are lost or damaged, and only those asked for")
     for (const std::string& text : allOf(100))
         changed += std::find(damaged.received.begin(), damaged.received.end(), text) == damaged.received.end();
     CHECK(changed == 1);
+}
+
+TEST_CASE("A message is damaged in up to 8 bytes, or its end is missing")
+{
+    FaultOptions faults;
+    faults.seed = 3;
+    faults.corrupt = 1;
+    const Run damaged = run(faults, 2000);
+    const std::vector<std::string> sent = allOf(2000);
+    REQUIRE(damaged.received.size() == sent.size());
+    int cut = 0, wrong = 0;
+    for (std::size_t i = 0; i < sent.size(); ++i) {
+        const std::string& text = damaged.received[i];
+        std::size_t changed = 0;
+        for (std::size_t c = 0; c < std::min(text.size(), sent[i].size()); ++c)
+            changed += text[c] != sent[i][c];
+        const bool isCut = text.size() < sent[i].size();
+        cut += isCut;
+        wrong += text.size() > sent[i].size() || (isCut ? changed > 0 : changed < 1 || changed > 8);
+    }
+    CHECK(wrong == 0);
+    CHECK(cut == Approx(500).epsilon(0.1)); // one in four
+}
+
+namespace {
+
+// Sees what has become of the message that faults were asked for last.
+struct Measuring : InprocTransport {
+    using InprocTransport::InprocTransport;
+    void send(int destination, Buffer&& message)
+    {
+        if (message.size() < std::exchange(bytesAsked, 0))
+            ++cutMessages;
+        InprocTransport::send(destination, std::move(message));
+    }
+
+    inline static thread_local std::size_t bytesAsked = 0;
+    inline static std::atomic<int> cutMessages{0};
+};
+
+} // namespace
+
+TEST_CASE("A message without its end is found")
+{
+    FaultOptions faults;
+    faults.corrupt = 0.1;
+    faults.maxLethal = 1;
+    faults.only = [](int, const Buffer& message) {
+        Measuring::bytesAsked = message.size();
+        return message.size() >= 1000;
+    };
+    testing::ConformanceOptions options;
+    options.largestMessage = std::size_t{1} << 16;
+    options.smallMessages = 100;
+    options.modes = {Progress::Caller};
+    options.timeLimit = std::chrono::milliseconds(300);
+    bool found = false;
+    for (faults.seed = 1; !found && faults.seed <= 60; ++faults.seed) {
+        Measuring::cutMessages = 0;
+        faults.counts = std::make_shared<testing::FaultCounts>();
+        std::string text;
+        runRanks(2, [&](const InprocCommunicator& communicator) {
+            const auto failures =
+                testing::checkTransport<testing::FaultTransport<Measuring>>({communicator, faults}, options);
+            if (communicator.rank() == 0)
+                text = testing::describeFailures(failures);
+        });
+        if (Measuring::cutMessages == 0 || faults.counts->corrupted > Measuring::cutMessages)
+            continue;
+        found = true;
+        INFO("seed " << faults.seed << ": " << text);
+        CHECK(text.find(" bytes came") != std::string::npos);
+    }
+    CHECK(found);
 }
 
 TEST_CASE("A nap is not longer than what is held")

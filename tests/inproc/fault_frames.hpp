@@ -7,10 +7,15 @@
 #include <dfb/testing/fault_transport.hpp>
 
 #include <algorithm>
+#include <chrono>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <future>
 #include <memory>
 #include <numeric>
 #include <string>
+#include <thread>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -22,7 +27,7 @@ struct FaultGroup {
     std::uint64_t seed = 0;
     int ranks = 2;
     bool harmless = false; // nothing is lost or damaged: all frames must be right
-    enum class Op { Sorted, Ordered, Nearest, Average } op = Op::Sorted;
+    enum class Op { Sorted, Ordered, Nearest, Average, Deep, Accumulated } op = Op::Sorted;
     Loop loop = Loop::Listing3; // of Op::Sorted; the others have one each
     Scene scene;
     dfb::testing::FaultOptions faults;
@@ -36,7 +41,7 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     g.seed = seed;
     g.ranks = 2 + pick(0, 4);
     g.loop = std::vector<Loop>{Loop::Listing3, Loop::Declared, Loop::ImageDealt}[static_cast<std::size_t>(pick(4, 3))];
-    g.op = static_cast<FaultGroup::Op>(std::max(0, pick(50, 6) - 2)); // half of them sorted
+    g.op = static_cast<FaultGroup::Op>(std::max(0, pick(50, 8) - 2)); // three in eight sorted
     const bool isImageParallel =
         g.op == FaultGroup::Op::Average || (g.op == FaultGroup::Op::Sorted && !isDataParallel(g.loop));
     g.scene =
@@ -66,20 +71,57 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     return g;
 }
 
+// Ends the process if it lives too long, and says what it was.
+class Limit {
+public:
+    explicit Limit(std::string what)
+        : watch_([over = over_.get_future(), what = std::move(what)] {
+              if (over.wait_for(std::chrono::seconds(60)) == std::future_status::ready)
+                  return;
+              std::fprintf(stderr, "a test hangs: %s\n", what.c_str());
+              std::abort();
+          })
+    {
+    }
+    Limit(const Limit&) = delete;
+    Limit& operator=(const Limit&) = delete;
+    ~Limit()
+    {
+        over_.set_value();
+        watch_.join();
+    }
+
+private:
+    std::promise<void> over_;
+    std::thread watch_;
+};
+
 struct FaultEnding {
     std::string text;      // as of outcomeOf(); "partial" and why, if that is what the image is
     std::size_t wrong = 0; // values, on the display rank
 };
 
-// A frame of a group with the loop that goes with the operation.
+// Each sample as a segment of no length.
+inline void renderDeep(const Scene& s, const dfb::Brick& brick, dfb::DeepTile& deep)
+{
+    const dfb::Region& r = deep.header().region;
+    for (int y = r.y0; y < r.y1; ++y)
+        for (int x = r.x0; x < r.x1; ++x)
+            if (const auto sample = sampleOf(s, brick, deep.header().pass, x, y))
+                deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
+}
+
+// A frame of a group, from 1, with the loop that goes with the operation.
 template <class TileOp, class FrameBuffer>
-dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group)
+dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group, int frame)
 {
     using Op = FaultGroup::Op;
     constexpr Op op = std::is_same_v<TileOp, dfb::BasicAlphaBlend<16>>       ? Op::Sorted
                       : std::is_same_v<TileOp, dfb::BasicOrderedBlend<16>>   ? Op::Ordered
                       : std::is_same_v<TileOp, dfb::BasicDepthComposite<16>> ? Op::Nearest
-                                                                             : Op::Average;
+                      : std::is_same_v<TileOp, dfb::BasicImageParallel<16>>  ? Op::Average
+                      : std::is_same_v<TileOp, dfb::BasicDeepBlend<16>>      ? Op::Deep
+                                                                             : Op::Accumulated;
     const Scene& s = group.scene;
     const auto renderOne = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
     if constexpr (op == Op::Sorted) {
@@ -88,6 +130,15 @@ dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group)
         return dfb::renderImageParallel(
             fb, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); },
             paramsOf(s));
+    } else if constexpr (op == Op::Deep) {
+        return dfb::renderDeepParallel(
+            fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), FlatCamera(), 2,
+            [&](const dfb::Brick& b, dfb::DeepTile& deep) { renderDeep(s, b, deep); }, paramsOf(s));
+    } else if constexpr (op == Op::Accumulated) {
+        dfb::FrameParams params = paramsOf(s);
+        params.accumulationId = static_cast<std::uint64_t>(frame); // one that fails leaves tiles without samples
+        return dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), FlatCamera(), renderOne,
+                                       params);
     } else {
         const dfb::SharedWorld world(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())));
         dfb::RoundRobinBricks inTurn;
@@ -130,7 +181,7 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
         FaultEnding ending;
         std::string why;
         ending.text = outcomeOf([&] {
-            const auto report = faultFrame<TileOp>(fb, group);
+            const auto report = faultFrame<TileOp>(fb, group, frame + 1);
             if (report.failure)
                 why = "partial: " + report.failure->message;
             if (fb.isDisplayRank())

@@ -4,6 +4,8 @@
 
 #include <algorithm>
 #include <cstdint>
+#include <map>
+#include <memory>
 #include <string>
 #include <vector>
 
@@ -11,7 +13,8 @@ namespace {
 
 struct Tally {
     int frames = 0, right = 0, partial = 0, frameErrors = 0, transportErrors = 0;
-    std::string wrong; // the first, with its seed
+    std::map<scene::FaultGroup::Op, int> rightOf; // by operation, where something was disturbed
+    std::string wrong;                            // the first, with its seed
 };
 
 // Groups of frames, of all operations and loops, until there are `frames`.
@@ -19,9 +22,11 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
 {
     Tally tally;
     for (std::uint64_t seed = firstSeed; tally.frames < frames && tally.wrong.empty(); ++seed) {
-        const scene::FaultGroup group = scene::faultGroup(seed);
+        scene::FaultGroup group = scene::faultGroup(seed);
+        group.faults.counts = std::make_shared<dfb::testing::FaultCounts>();
         const auto expected = scene::referenceOf(group.scene);
         std::vector<std::vector<scene::FaultEnding>> endings(static_cast<std::size_t>(group.ranks));
+        const scene::Limit limit("seed " + std::to_string(seed));
         dfb::runRanks(group.ranks, [&](dfb::InprocCommunicator communicator) {
             using Op = scene::FaultGroup::Op;
             using Base = dfb::InprocTransport;
@@ -37,8 +42,18 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
             case Op::Average:
                 mine = scene::faultFrames<Base, dfb::BasicImageParallel<16>>(communicator, group, expected, 10);
                 break;
+            case Op::Deep:
+                mine = scene::faultFrames<Base, dfb::BasicDeepBlend<16>>(communicator, group, expected, 10);
+                break;
+            case Op::Accumulated:
+                mine = scene::faultFrames<Base, dfb::Progressive<dfb::BasicAlphaBlend<16>>>(communicator, group,
+                                                                                            expected, 10);
+                break;
             }
         });
+        const auto& counts = *group.faults.counts;
+        const bool disturbed =
+            counts.reordered + counts.delayed + counts.duplicated + counts.dropped + counts.corrupted > 0;
         std::size_t longest = 0;
         for (const auto& e : endings)
             longest = std::max(longest, e.size());
@@ -55,14 +70,16 @@ Tally faultGroups(std::uint64_t firstSeed, int frames)
                                    [how](const scene::FaultEnding& r) { return scene::has(r.text, how); });
             };
             ++tally.frames;
-            if (ended("TransportError"))
+            if (ended("TransportError")) {
                 ++tally.transportErrors;
-            else if (ended("FrameError"))
+            } else if (ended("FrameError")) {
                 ++tally.frameErrors;
-            else if (ended("partial"))
+            } else if (ended("partial")) {
                 ++tally.partial;
-            else
+            } else {
                 ++tally.right;
+                tally.rightOf[group.op] += disturbed;
+            }
         }
     }
     return tally;
@@ -76,6 +93,11 @@ void check(const Tally& tally, int frames)
     CHECK(tally.wrong.empty());
     CHECK(tally.frames >= frames);
     CHECK(10 * tally.right >= 3 * frames);
+    CHECK(tally.rightOf.size() == 6);
+    for (const auto& [op, right] : tally.rightOf) {
+        CAPTURE(static_cast<int>(op));
+        CHECK(right > 0);
+    }
     CHECK(tally.partial > 0);
     CHECK(tally.frameErrors > 0);
     CHECK(tally.transportErrors > 0);

@@ -6,6 +6,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <string>
 #include <thread>
 #include <vector>
@@ -32,22 +33,26 @@ std::vector<std::string> gathered(const std::string& mine)
 
 TEST_CASE("Disturbed frames over MPI end in the right image or in an error of dfb", "[faults]")
 {
-    int frames = 0, right = 0;
+    int frames = 0, right = 0, failed = 0;
+    const auto counts = std::make_shared<dfb::testing::FaultCounts>();
     // A communicator that is not shut down in order is not freed, and there may be a thousand or two of them.
-    for (std::uint64_t seed = 500; seed < 560; ++seed) {
-        const scene::FaultGroup group = scene::faultGroup(seed);
+    for (std::uint64_t seed = 500; seed < 580; ++seed) {
+        scene::FaultGroup group = scene::faultGroup(seed);
+        group.faults.counts = counts;
         if (group.op != scene::FaultGroup::Op::Sorted)
             continue; // the others have their turn without MPI
         const auto expected = scene::referenceOf(group.scene);
         constexpr int most = 6;
+        const scene::Limit limit("seed " + std::to_string(seed));
         const auto mine = scene::faultFrames<dfb::MpiTransport>(MPI_COMM_WORLD, group, expected, most);
         for (std::size_t frame = 0; frame < most; ++frame) {
             const bool ran = frame < mine.size();
             const std::string text = !ran ? "not run" : mine[frame].wrong > 0 ? "wrong" : mine[frame].text;
             std::vector<scene::FaultEnding> ranks;
-            bool allRight = true;
+            bool allRight = true, anyError = false;
             for (const std::string& ending : gathered(text)) {
                 allRight = allRight && ending == "fine";
+                anyError = anyError || scene::has(ending, "Error: ");
                 if (ending != "not run")
                     ranks.push_back({ending, ending == "wrong" ? std::size_t{1} : 0});
             }
@@ -57,8 +62,20 @@ TEST_CASE("Disturbed frames over MPI end in the right image or in an error of df
             CHECK(scene::verdictOn(ranks, group.harmless) == "");
             ++frames;
             right += allRight;
+            failed += anyError;
         }
     }
-    INFO(right << " of " << frames << " right");
+    std::int64_t lethal = 0, harmless = 0;
+    for (const std::string& count : gathered(std::to_string(counts->dropped + counts->corrupted)))
+        lethal += std::stoll(count);
+    for (const std::string& count : gathered(std::to_string(counts->reordered + counts->delayed + counts->duplicated)))
+        harmless += std::stoll(count);
+    INFO(right << " of " << frames << " right, " << failed << " failed; " << lethal << " messages lost or damaged, "
+               << harmless << " disturbed otherwise");
     CHECK(10 * right >= 3 * frames);
+    if (sizeOf(MPI_COMM_WORLD) > 1) {
+        CHECK(failed > 0);
+        CHECK(lethal > 0);
+        CHECK(harmless > 100);
+    }
 }

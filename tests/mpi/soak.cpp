@@ -1,15 +1,14 @@
 // Many framebuffers and frames, one after the other: sizes, bricks, loops and communicators change, some frames are
-// cancelled; memory does not grow, and no thread, file descriptor or communicator is left behind.
+// cancelled or fail; memory does not grow, and no thread, file descriptor or communicator is left behind.
 #include "../inproc/scene.hpp"
 #include "catch.hpp"
 #include "ranks.hpp"
 
-#include <array>
+#include <atomic>
 #include <cstdint>
-#include <cstdio>
 #include <filesystem>
 #include <fstream>
-#include <memory>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
@@ -52,6 +51,39 @@ struct Holdings {
     }
 };
 
+// Of a communicator and all that were made of it, how many there are: each has the attribute.
+class Communicators {
+public:
+    Communicators() { MPI_Comm_create_keyval(copied, freed, &key_, nullptr); }
+    Communicators(const Communicators&) = delete;
+    Communicators& operator=(const Communicators&) = delete;
+    ~Communicators() { MPI_Comm_free_keyval(&key_); }
+
+    void count(MPI_Comm communicator)
+    {
+        count_ = 1;
+        MPI_Comm_set_attr(communicator, key_, &count_);
+    }
+    int count() const { return count_; }
+
+private:
+    static int copied(MPI_Comm, int, void*, void* in, void* out, int* isCopied)
+    {
+        ++*static_cast<std::atomic<int>*>(in);
+        *static_cast<void**>(out) = in;
+        *isCopied = 1;
+        return MPI_SUCCESS;
+    }
+    static int freed(MPI_Comm, int, void* value, void*)
+    {
+        --*static_cast<std::atomic<int>*>(value);
+        return MPI_SUCCESS;
+    }
+
+    int key_ = MPI_KEYVAL_INVALID;
+    std::atomic<int> count_{0}; // any thread may duplicate
+};
+
 // One framebuffer on a part of the ranks, and `frames` frames; what is wrong with them, or nothing.
 std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
 {
@@ -65,7 +97,7 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config);
     std::string wrong;
     for (int frame = 0; frame < frames; ++frame) {
-        scene::Scene s = first; // other bricks, and seen from elsewhere
+        scene::Scene s = first; // with other bricks
         s.bricks = scene::makeScene(1 + frame % 7, seed + static_cast<std::uint64_t>(frame), s.width, s.height).bricks;
         if (frame % 9 == 4) {
             auto open = fb.begin(paramsOf(s));
@@ -73,6 +105,21 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
                 open.cancel();
             const std::string outcome = scene::outcomeOf([&] { open.end(); });
             if (!scene::has(outcome, "cancelled"))
+                wrong += "frame " + std::to_string(frame) + ": " + outcome + "\n";
+            continue;
+        }
+        if (frame % 9 == 7) {
+            const std::string outcome = scene::outcomeOf([&] {
+                dfb::renderDataParallel(
+                    fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
+                    [&](const dfb::Brick& brick, auto& tile) {
+                        if (brick.id == s.bricks.back().id)
+                            throw std::runtime_error("on purpose");
+                        renderBrick(s, brick, tile);
+                    },
+                    paramsOf(s));
+            });
+            if (!scene::has(outcome, "FrameError") || !scene::has(outcome, "on purpose"))
                 wrong += "frame " + std::to_string(frame) + ": " + outcome + "\n";
             continue;
         }
@@ -88,7 +135,8 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
 // Framebuffers on parts of the ranks, until there have been so many frames.
 void soak(int frames)
 {
-    constexpr int each = 20, warmUp = 25;
+    constexpr int each = 20, warmUp = 5; // rounds, in which MPI makes what it keeps for good
+    Communicators communicators;
     Holdings before;
     for (int round = 0; round < frames / each; ++round) {
         const std::uint64_t h = mix(static_cast<std::uint64_t>(round));
@@ -97,9 +145,11 @@ void soak(int frames)
         MPI_Comm part = MPI_COMM_NULL;
         MPI_Comm_split(MPI_COMM_WORLD, rank < border, rank, &part);
         INFO("round " << round << ", ranks " << (rank < border ? 0 : border) << " and up");
+        communicators.count(part);
         REQUIRE(live(part, static_cast<std::uint64_t>(2 * round + (rank < border)), each) == "");
+        CHECK(communicators.count() == 1);
         MPI_Comm_free(&part);
-        if (round == warmUp)
+        if (round + 1 == warmUp)
             before = Holdings::now();
     }
     const Holdings after = Holdings::now();
@@ -107,7 +157,9 @@ void soak(int frames)
     CHECK(after.threads == before.threads);
     CHECK(after.files == before.files);
 #if !defined(SOAK_WITHOUT_MEMORY)
-    CHECK(after.megabytes < 1.1 * before.megabytes + 16); // the largest of all framebuffers may come late
+    // The largest framebuffers come later, and MPI and malloc keep more for them: about 2 MB, with 7 ranks. To lose
+    // 256 KB with each framebuffer is more than this.
+    CHECK(after.megabytes < before.megabytes + 8);
 #endif
 }
 

@@ -22,6 +22,7 @@
 #include <mpi.h>
 
 #include <algorithm>
+#include <array>
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
@@ -86,62 +87,35 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // at a lower thread level than `progress` needs; and on all ranks if they were built with different packet formats.
-    // At MPI_THREAD_FUNNELED to be called by the thread that initialised MPI.
+    // at a lower thread level than `progress` needs; and on all ranks if they were built with different packet formats,
+    // or if one of them can not make its transport, with its rank and what has failed there. The others can not be
+    // told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result. At
+    // MPI_THREAD_FUNNELED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
-        int initialized = 0, finalized = 0;
-        MPI_Initialized(&initialized);
-        MPI_Finalized(&finalized);
-        if (!initialized || finalized)
-            throw TransportError(finalized ? "MPI has been finalised"
-                                           : "MPI is not initialised: call MPI_Init_thread first");
-        int level = MPI_THREAD_SINGLE;
-        MPI_Query_thread(&level);
-        const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
-        if (level < needed)
-            throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
-                                 + ", " + detail::mpiLevelName(needed) + " is needed: call MPI_Init_thread with it"
-                                 + (progress == Progress::Thread ? ", or configure Progress::Caller" : ""));
-        if (level == MPI_THREAD_FUNNELED) {
-            int isMain = 0;
-            MPI_Is_thread_main(&isMain);
-            if (!isMain)
-                throw TransportError("MPI was initialised at thread level MPI_THREAD_FUNNELED by another thread: only "
-                                     "that one may call MPI");
-            onlyThread_ = std::this_thread::get_id();
-        }
-
-        MPI_Request duplicated = MPI_REQUEST_NULL;
-        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
-        for (detail::Patience patience; !completed(duplicated);)
-            patience.nap();
-        check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
-        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
-        const int* tagBound = nullptr;
-        int found = 0;
-        check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
-        lastTag_ = found ? std::min(*tagBound - 1, 1 << 20) : 32766;
-
+        checkLevel(progress);
+        duplicate(communicator);
+        Reason wrong{};
+        attempt(wrong, [this] { prepare(); });
         try {
             compareFormats();
         } catch (...) {
             MPI_Comm_free(&comm_);
             throw;
         }
-        peers_.resize(static_cast<std::size_t>(size_));
-        meetNode();
-
-        packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
-        packets_ = pool_->acquire(detail::packetBytes * postedPackets);
+        int failed = size_;
         try {
-            for (int slot = 0; slot < postedPackets; ++slot)
-                postPacket(slot);
+            meetNode(wrong);
+            attempt(wrong, [this] { postPackets(); });
+            failed = firstFailed(wrong);
         } catch (...) {
             abandon();
             throw;
+        }
+        if (failed < size_) {
+            release();
+            throw TransportError(wrong.data(), failed);
         }
     }
     MpiTransport(const MpiTransport&) = delete;
@@ -150,13 +124,8 @@ public:
     {
         int finalized = 0;
         MPI_Finalized(&finalized);
-        if (comm_ == MPI_COMM_NULL || finalized)
-            return;
-        try {
-            cancelPackets([](int, std::size_t) {}); // if stop() was never called
-        } catch (const std::exception&) {
-        }
-        MPI_Comm_free(&comm_);
+        if (comm_ != MPI_COMM_NULL && !finalized)
+            release();
     }
 
     int rank() const noexcept { return rank_; }
@@ -240,6 +209,95 @@ public:
     }
 
 private:
+    // --- the beginning
+
+    void checkLevel(Progress progress)
+    {
+        int initialized = 0, finalized = 0;
+        MPI_Initialized(&initialized);
+        MPI_Finalized(&finalized);
+        if (!initialized || finalized)
+            throw TransportError(finalized ? "MPI has been finalised"
+                                           : "MPI is not initialised: call MPI_Init_thread first");
+        int level = MPI_THREAD_SINGLE;
+        MPI_Query_thread(&level);
+        const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
+        if (level < needed)
+            throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
+                                 + ", " + detail::mpiLevelName(needed) + " is needed: call MPI_Init_thread with it"
+                                 + (progress == Progress::Thread ? ", or configure Progress::Caller" : ""));
+        if (level == MPI_THREAD_FUNNELED) {
+            int isMain = 0;
+            MPI_Is_thread_main(&isMain);
+            if (!isMain)
+                throw TransportError("MPI was initialised at thread level MPI_THREAD_FUNNELED by another thread: only "
+                                     "that one may call MPI");
+            onlyThread_ = std::this_thread::get_id();
+        }
+    }
+
+    void duplicate(MPI_Comm communicator)
+    {
+        MPI_Request duplicated = MPI_REQUEST_NULL;
+        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
+        wait(duplicated);
+        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
+    }
+
+    // Why this rank can have no transport; empty if nothing is wrong. Takes no memory, of which there may be none.
+    using Reason = std::array<char, 512>;
+
+    // What a rank does alone. If it fails the rank does nothing more of that kind, but still takes part in what all do
+    // together, as they wait for it there, until it can tell them.
+    template <class Step>
+    static void attempt(Reason& wrong, const Step& step)
+    {
+        if (wrong[0] != 0)
+            return;
+        try {
+            step();
+        } catch (const Error& e) {
+            std::snprintf(wrong.data(), wrong.size(), "%s", e.info().message.c_str());
+        } catch (const std::exception& e) {
+            std::snprintf(wrong.data(), wrong.size(), "%s", e.what());
+        }
+    }
+
+    // The first rank that something is wrong on, and on all ranks its reason; size() if there is none.
+    int firstFailed(Reason& wrong) const
+    {
+        const int mine = wrong[0] != 0 ? rank_ : size_;
+        int first = size_;
+        MPI_Request request = MPI_REQUEST_NULL;
+        check(MPI_Iallreduce(&mine, &first, 1, MPI_INT, MPI_MIN, comm_, &request), "MPI_Iallreduce");
+        wait(request);
+        if (first < size_) {
+            check(MPI_Ibcast(wrong.data(), static_cast<int>(wrong.size()), MPI_CHAR, first, comm_, &request),
+                  "MPI_Ibcast");
+            wait(request);
+        }
+        return first;
+    }
+
+    void prepare()
+    {
+        check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
+        const int* tagBound = nullptr;
+        int found = 0;
+        check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
+        lastTag_ = found ? std::min(*tagBound, 1 << 20) : 32767;
+        peers_.resize(static_cast<std::size_t>(size_));
+    }
+
+    void postPackets()
+    {
+        packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
+        packets_ = pool_->acquire(detail::packetBytes * postedPackets);
+        for (int slot = 0; slot < postedPackets; ++slot)
+            postPacket(slot);
+    }
+
     // The first thing that ranks say to each other, see above. Throws the same TransportError on all.
     void compareFormats() const
     {
@@ -248,8 +306,7 @@ private:
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
               "MPI_Iallgather");
-        for (detail::Patience patience; !completed(request);)
-            patience.nap();
+        wait(request);
         const auto differs = std::find_if(all.begin(), all.end(), [&](std::uint64_t f) { return f != all.front(); });
         if (differs == all.end())
             return;
@@ -273,44 +330,46 @@ private:
     };
 
     // Finds the ranks of this node, and shares memory with those that it can be shared with.
-    void meetNode()
+    void meetNode(Reason& wrong)
     {
-        char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
-        int length = 0;
-        check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
-        const auto memory = memoryToShare();
-        const Card mine{std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
-                        memory ? memory->address() : detail::NodeMemory::Address()};
+        std::shared_ptr<detail::NodeMemory> memory;
+        Card mine{};
+        attempt(wrong, [&] {
+            char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
+            int length = 0;
+            check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
+            memory = memoryToShare();
+            mine = {std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
+                    memory ? memory->address() : detail::NodeMemory::Address()};
+        });
         std::vector<Card> all(static_cast<std::size_t>(size_));
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
               "MPI_Iallgather");
-        for (detail::Patience patience; !completed(request);)
-            patience.nap();
+        wait(request);
         const auto isHere = [&](const Card& card) { return card.host == mine.host; };
         findCrowding(std::count_if(all.begin(), all.end(), isHere));
 
         // Each tells the others whose memory it sees.
         std::vector<std::uint8_t> sees(all.size()), seen(all.size());
-        std::vector<MPI_Request> requests;
-        for (int other = 0; other < size_; ++other) {
-            const auto i = static_cast<std::size_t>(other);
-            if (other == rank_ || !isHere(all[i]) || !memory || all[i].memory.process == 0)
-                continue;
-            peers_[i].itsMemory = detail::NodeMemory::open(all[i].memory);
-            sees[i] = peers_[i].itsMemory != nullptr;
-            requests.resize(requests.size() + 2, MPI_REQUEST_NULL);
-            check(MPI_Irecv(&seen[i], 1, MPI_BYTE, other, lastTag_ + 1, comm_, &*(requests.end() - 2)), "MPI_Irecv");
-            check(MPI_Isend(&sees[i], 1, MPI_BYTE, other, lastTag_ + 1, comm_, &requests.back()), "MPI_Isend");
-        }
-        for (detail::Patience patience; !completed(requests);)
-            patience.nap();
-        for (std::size_t i = 0; i < all.size(); ++i)
-            peers_[i].seesMine = seen[i] != 0;
-        if (std::count(seen.begin(), seen.end(), 1) > 0) {
-            memory_ = memory;
-            pool_->share(memory);
-        }
+        attempt(wrong, [&] {
+            for (std::size_t i = 0; i < all.size() && memory; ++i) {
+                if (static_cast<int>(i) == rank_ || !isHere(all[i]) || all[i].memory.process == 0)
+                    continue;
+                peers_[i].itsMemory = detail::NodeMemory::open(all[i].memory);
+                sees[i] = peers_[i].itsMemory != nullptr;
+            }
+        });
+        check(MPI_Ialltoall(sees.data(), 1, MPI_BYTE, seen.data(), 1, MPI_BYTE, comm_, &request), "MPI_Ialltoall");
+        wait(request);
+        attempt(wrong, [&] {
+            for (std::size_t i = 0; i < all.size(); ++i)
+                peers_[i].seesMine = seen[i] != 0;
+            if (std::count(seen.begin(), seen.end(), 1) > 0) {
+                memory_ = memory;
+                pool_->share(memory);
+            }
+        });
     }
 
     std::shared_ptr<detail::NodeMemory> memoryToShare() const
@@ -438,6 +497,12 @@ private:
         int done = 0;
         check(MPI_Test(&request, &done, MPI_STATUS_IGNORE), "MPI_Test");
         return done != 0;
+    }
+
+    void wait(MPI_Request& request) const
+    {
+        for (detail::Patience patience; !completed(request);)
+            patience.nap();
     }
 
     bool completed(std::vector<MPI_Request>& requests) const
@@ -771,18 +836,28 @@ private:
             if (request != MPI_REQUEST_NULL)
                 check(MPI_Cancel(&request), "MPI_Cancel");
         statuses_.resize(std::max(statuses_.size(), packetRequests_.size()));
-        for (int slot = 0; slot < postedPackets; ++slot) {
-            MPI_Request& request = packetRequests_[static_cast<std::size_t>(slot)];
+        for (std::size_t slot = 0; slot < packetRequests_.size(); ++slot) {
+            MPI_Request& request = packetRequests_[slot];
             if (request == MPI_REQUEST_NULL)
                 continue;
-            MPI_Status& status = statuses_[static_cast<std::size_t>(slot)];
+            MPI_Status& status = statuses_[slot];
             int done = 0, cancelled = 0;
             for (detail::Patience patience; check(MPI_Test(&request, &done, &status), "MPI_Test"), !done;)
                 patience.nap();
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
-                came(slot, byteCountOf(status));
+                came(static_cast<int>(slot), byteCountOf(status));
         }
+    }
+
+    // When no rank needs it any more.
+    void release()
+    {
+        try {
+            cancelPackets([](int, std::size_t) {}); // if stop() was never called
+        } catch (const std::exception&) {
+        }
+        MPI_Comm_free(&comm_);
     }
 
     // What tells the others why this rank goes should still leave, but not at any cost.

@@ -25,7 +25,7 @@ constexpr std::size_t packetBytes = 8192; // at most
 
 // Of packets, and of all else that transports over a network say to each other. To be raised with every change: ranks
 // that were built with different ones can not read each other, and find out before the first packet.
-constexpr std::uint64_t packetFormat = 1;
+constexpr std::uint64_t packetFormat = 2;
 
 // Fills one packet after the other. Records begin at multiples of 16.
 class PacketWriter {
@@ -69,8 +69,8 @@ private:
     std::size_t used_ = 0;
 };
 
-// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the bytes, which need not be
-// trusted, are no packet: then what came before has been visited. An empty packet is one.
+// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the bytes,
+// which need not be trusted, are no packet: then what came before has been visited. An empty packet is one.
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
 {
