@@ -4,24 +4,11 @@
 # BACK: the lost rank comes back, and is told, too. Ranks that are in a destructor can not be told, but for those whose
 # handler is called; they are gone in time.
 cmake_policy(VERSION 3.16)
-set(command "")
-set(own OFF)
-foreach(i RANGE ${CMAKE_ARGC})
-  if(own AND DEFINED CMAKE_ARGV${i})
-    list(APPEND command "${CMAKE_ARGV${i}}")
-  elseif("${CMAKE_ARGV${i}}" STREQUAL "--")
-    set(own ON)
-  endif()
-endforeach()
-
 file(REMOVE_RECURSE ${FOLDER})
 file(MAKE_DIRECTORY ${FOLDER})
-string(TIMESTAMP start "%s" UTC)
-execute_process(COMMAND ${command} ${FOLDER} RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err TIMEOUT 50)
-string(TIMESTAMP end "%s" UTC)
-math(EXPR seconds "${end} - ${start}")
+set(arguments ${FOLDER})
+include(${CMAKE_CURRENT_LIST_DIR}/mpi_job.cmake)
 file(REMOVE_RECURSE ${FOLDER})
-message(STATUS "${seconds} s, code ${code}\n${out}${err}")
 
 set(margin 5000) # ms, on a machine that is busy with other things
 math(EXPR limit "${TIMEOUT_MS} + ${margin}")

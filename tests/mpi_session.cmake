@@ -2,21 +2,7 @@
 # Starts an mpi_session that rank 1 leaves, and looks at what comes of it: the job ends by itself, soon and with code 1,
 # once rank 1 has said why and so many other ranks that they were told.
 cmake_policy(VERSION 3.16)
-set(command "")
-set(own OFF)
-foreach(i RANGE ${CMAKE_ARGC})
-  if(own AND DEFINED CMAKE_ARGV${i})
-    list(APPEND command "${CMAKE_ARGV${i}}")
-  elseif("${CMAKE_ARGV${i}}" STREQUAL "--")
-    set(own ON)
-  endif()
-endforeach()
-
-string(TIMESTAMP start "%s" UTC)
-execute_process(COMMAND ${command} RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err TIMEOUT 60)
-string(TIMESTAMP end "%s" UTC)
-math(EXPR seconds "${end} - ${start}")
-message(STATUS "${seconds} s, code ${code}\n${out}${err}")
+include(${CMAKE_CURRENT_LIST_DIR}/mpi_job.cmake)
 
 set(limit 12) # s, on a machine that is busy with other things; less than the others would wait
 if(seconds GREATER limit)
