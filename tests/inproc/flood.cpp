@@ -456,3 +456,74 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
                 CHECK(report.peakInboxBytes <= 1 << 20);
             }
 }
+
+TEST_CASE("What an owner keeps of inputs is their active bytes, once for each frame in flight", "[messaging][flood]")
+{
+    // 16 tiles with 8 full inputs and one that comes when all others have; ranks in one process, so that all inputs
+    // lie in the memory of their sender.
+    using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, BoardTransport>;
+    constexpr int tiles = 16, parts = 8, side = dfb::AlphaBlend::tileSize, width = 4 * side;
+    constexpr std::size_t active = std::size_t{20} * side * side;
+    for (const int frames : {1, 2}) {
+        const auto board = std::make_shared<Board>();
+        std::atomic<int> arrived{0};
+        std::promise<void> all;
+        board->passed = [&](int, int, const MessageHeader& header) {
+            if (header.kind == MessageKind::Fragment && ++arrived == frames * tiles * parts)
+                all.set_value();
+        };
+        std::vector<dfb::FrameReport> reports(2);
+        runOn(board, 2, [&](const auto& communicator) {
+            dfb::FrameBufferConfig config;
+            config.width = config.height = width;
+            config.framesInFlight = frames;
+            config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            config.messagePoolBytes = std::size_t{1} << 30; // not what limits it here
+            Fb fb(communicator, config);
+            std::vector<typename Fb::Frame> open;
+            const auto tile = std::make_unique<Fb::Tile>();
+            const auto send = [&](auto& frame, int index, int generation, int children) {
+                frame.start(*tile, index);
+                tile->generation = generation;
+                tile->children = children;
+                frame.setTile(*tile);
+            };
+            for (int i = 0; i < frames; ++i) {
+                open.push_back(fb.begin());
+                for (int index = 0; index < tiles; ++index) {
+                    if (fb.rank() == 0) {
+                        send(open.back(), index, 0, parts + 1);
+                        continue;
+                    }
+                    for (int part = 0; part < parts; ++part) {
+                        open.back().start(*tile, index);
+                        tile->generation = 1;
+                        tile->part = static_cast<std::uint16_t>(part + 1);
+                        tile->forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                            rgba[0] = static_cast<float>((31 * x + 17 * y) % 97) / 400;
+                            rgba[3] = 0.25f;
+                            depth = static_cast<float>(part * 100 + x + y);
+                        });
+                        open.back().setTile(*tile);
+                    }
+                }
+            }
+            if (fb.rank() == 0) {
+                all.get_future().wait_for(std::chrono::seconds(20));
+                for (auto& frame : open)
+                    for (int index = 0; index < tiles; ++index)
+                        send(frame, index, 1, 0);
+            }
+            for (auto& frame : open)
+                reports[static_cast<std::size_t>(fb.rank())] = frame.end();
+        });
+        const auto inputs = static_cast<std::size_t>(frames * tiles * parts);
+        const std::size_t images = static_cast<std::size_t>(frames) * blockBytes(std::size_t{4} * width * width);
+        const std::size_t limit = inputs * blockBytes(dfb::detail::fragmentPrefix + active) + images
+                                  + 4 * blockBytes(dfb::detail::fragmentPrefix + active) + (std::size_t{1} << 18);
+        INFO(frames << " in flight: " << reports[0].peakMemoryBytes << " bytes, limit " << limit);
+        CHECK(reports[0].peakMemoryBytes >= static_cast<std::int64_t>(inputs * active));
+        CHECK(reports[0].peakMemoryBytes <= static_cast<std::int64_t>(limit));
+    }
+}
