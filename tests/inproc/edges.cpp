@@ -236,8 +236,15 @@ TEST_CASE("A framebuffer is used inside the user's own TBB arena, by several of 
             if (fb.isDisplayRank())
                 wrong += wrongValues(scene::Picture(fb.image(), report), referenceOf(s)), ++images;
         }
+        for (const int slots : {1, 2}) { // a whole loop in there, also with no slot but the caller's
+            tbb::task_arena small(slots);
+            dfb::FrameReport report;
+            small.execute([&] { report = scene::renderLoop(fb, s, scene::Loop::Declared); });
+            if (fb.isDisplayRank())
+                wrong += wrongValues(scene::Picture(fb.image(), report), referenceOf(s)), ++images;
+        }
     });
     CHECK(wrong == 0);
-    CHECK(images == 5);
+    CHECK(images == 7);
 }
 #endif
