@@ -248,3 +248,30 @@ TEST_CASE("A tile that can not be right is refused at once", "[errors]")
         CHECK(has(text, "InvalidArgument"));
     CHECK(goodFrame(fb, s));
 }
+
+TEST_CASE("A rank that is built for other tiles or operations is refused on every rank", "[mpi]")
+{
+    using Blend = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>>;
+    using Smaller = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<8>>;
+    using Nearest = dfb::DistributedFrameBuffer<dfb::BasicDepthComposite<16>>;
+    const int rank = rankIn(MPI_COMM_WORLD), size = sizeOf(MPI_COMM_WORLD);
+    if (size == 1)
+        return;
+    const auto config = scene::configOf(scene::makeScene(1));
+    for (int odd = 0; odd < size; odd += std::max(1, size - 1))
+        for (const bool smaller : {true, false}) {
+            const std::string text = outcomeOf([&] {
+                if (rank != odd)
+                    Blend fb(MPI_COMM_WORLD, config);
+                else if (smaller)
+                    Smaller fb(MPI_COMM_WORLD, config);
+                else
+                    Nearest fb(MPI_COMM_WORLD, config);
+            });
+            INFO("rank " << odd << ": " << text);
+            CHECK(sameEverywhere(text));
+            CHECK(has(text, "InvalidArgument"));
+            CHECK(has(text, smaller ? "[tiles of " : "[tile operation dfb::BasicDepthComposite<16"));
+        }
+    Blend fb(MPI_COMM_WORLD, config); // nothing is left of those
+}
