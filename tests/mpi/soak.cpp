@@ -1,5 +1,5 @@
-// Many framebuffers and frames, one after the other: sizes, bricks, loops and communicators change, some frames are
-// cancelled or fail; memory does not grow, and no thread, file descriptor or communicator is left behind.
+// Many framebuffers and frames, one after the other: sizes, cameras, bricks, loops and communicators change, some
+// frames are cancelled or fail; memory does not grow, and no thread, file descriptor or communicator is left behind.
 #include "../inproc/scene.hpp"
 #include "catch.hpp"
 #include "ranks.hpp"
@@ -106,6 +106,18 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
             const std::string outcome = scene::outcomeOf([&] { open.end(); });
             if (!scene::has(outcome, "cancelled"))
                 wrong += "frame " + std::to_string(frame) + ": " + outcome + "\n";
+            continue;
+        }
+        if (frame % 9 == 2) { // seen from elsewhere in each
+            const auto at = static_cast<float>(frame), x = static_cast<float>(s.width) / 2,
+                       y = static_cast<float>(s.height) / 2;
+            const dfb::PerspectiveCamera camera({x - 10 * at, y, -50 - 5 * at}, {x, y, 0}, {0, 1, 0}, 60);
+            dfb::renderDataParallel(
+                fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())), camera,
+                [&](const dfb::Brick&, auto& tile) {
+                    tile.fill({0.25f, 0.25f, 0.25f, 0.5f}, at);
+                },
+                paramsOf(s));
             continue;
         }
         if (frame % 9 == 7) {
