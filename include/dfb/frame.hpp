@@ -64,6 +64,8 @@ struct FrameBufferConfig {
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
     // 0, or 100 and more: a rank of which nothing has been heard for so long, in a frame or a call that waits for all
     // ranks, is lost, and the job ends with an error that names it, or onPeerLost says what else; see MessengerOptions.
+    // And what is waited for, at most, that a message which could not be read may have been; in a frame without a
+    // time-out 0 is no limit.
     int peerTimeoutMs = defaultPeerTimeoutMs;
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
