@@ -27,7 +27,7 @@ cmake --build --preset fuzz --parallel "$jobs" --target $programs || exit 1
 # A single input gets 10 seconds, 2 GB, and 256 MB at a time.
 export ASAN_OPTIONS="detect_stack_use_after_return=1" UBSAN_OPTIONS="print_stacktrace=1"
 printf '%s\n' "$@" | xargs -P "$jobs" -I{} sh -c '
-    build/fuzz/tests/test_fuzz_{} -max_total_time='"$seconds"' -timeout=10 -rss_limit_mb=2048 -malloc_limit_mb=256 -max_len=4096 \
+    build/fuzz/tests/test_fuzz_{} -max_total_time='"$seconds"' -timeout=10 -rss_limit_mb=2048 -malloc_limit_mb=256 -max_len=8192 \
         -use_value_profile=1 -print_final_stats=1 -artifact_prefix=build/fuzz/crashes/{}- \
         build/fuzz/corpus/{} tests/fuzz/corpus/{} >build/fuzz/{}.log 2>&1 || touch build/fuzz/{}.failed'
 

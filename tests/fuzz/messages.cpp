@@ -1,9 +1,9 @@
 // A framebuffer on rank 0 of 2 that gets whatever it is sent: each frame ends, well or with an error of dfb, and
 // nothing else gets out.
 //
-// An input: how the framebuffer is made, then messages: a byte for the kind and what is wrong with its header, a
-// length, the body. The other rank is played: when the input has nothing more it gives the frame up, as a rank does
-// that works.
+// An input: two bytes that say how the framebuffer is made, then messages: the kind, how it is sent, a length, the
+// body. The other rank is played: when the input has nothing more it gives the frame up, as a
+// rank does that works.
 #include "fuzz.hpp"
 
 #include <dfb/dfb.hpp>
@@ -13,6 +13,7 @@
 #include <functional>
 #include <memory>
 #include <optional>
+#include <thread>
 
 namespace {
 
@@ -21,6 +22,7 @@ using d::MessageKind;
 
 constexpr int side = 8, width = 20, height = 13, tileCount = 6;
 constexpr int jobCount = 9;
+constexpr int partialMs = 4; // what a partial frame waits for finished tiles that do not come
 enum Flags : std::uint8_t {
     DisplayElsewhere = 1,
     Declared = 2,
@@ -31,9 +33,32 @@ enum Flags : std::uint8_t {
     Gathers = 64,
     NoConfiguration = 128 // of the other rank: the input says what it was made with
 };
-// Beside the kind, in the byte of a message.
-enum How : std::uint8_t { NextFrame = 16, LastFrame = 32, OtherHeader = 48, how = 48 };
-constexpr std::uint8_t endOfFrame = 15; // in place of a kind
+enum More : std::uint8_t {
+    Partial = 1,
+    Checksums = 2,
+    InFlight = 4, // both frames are open at once
+    Wall = 8,     // of two displays, one of each rank
+    Ordered = 16, // opaque inputs hide others
+    more = 31
+};
+// How the framebuffer is made, and with what it begins its frames.
+struct Way {
+    std::uint8_t flags = 0, rest = 0;
+
+    bool has(Flags flag) const { return (flags & flag) != 0; }
+    bool has(More flag) const { return (rest & flag) != 0; }
+    std::size_t engineCount() const { return has(InFlight) ? 2 : 1; }
+    // The wall is made first.
+    std::uint32_t addressOf(std::int64_t frame) const
+    {
+        return (has(Wall) ? 1 : 0) + static_cast<std::uint32_t>((frame - 1) % static_cast<int>(engineCount()));
+    }
+};
+// How a message is sent. ToAnother: to the wall, or to an object that nobody has made. Awaited: when there is nothing
+// else to be done, such as an answer.
+enum How : std::uint8_t { NextFrame = 1, LastFrame = 2, OtherHeader = 3, numbered = 3, ToAnother = 4, Awaited = 8 };
+constexpr std::uint8_t kinds = 31, endOfFrame = 31; // in place of a kind
+static_assert(static_cast<int>(MessageKind::Hidden) < endOfFrame);
 
 // Tasks run where they are submitted, but never within the delivery of a message, which holds locks.
 class TaskList final : public dfb::Executor {
@@ -64,39 +89,58 @@ struct Peer {
     std::shared_ptr<TaskList> tasks = std::make_shared<TaskList>();
     std::shared_ptr<dfb::MemoryPool> pool = dfb::MemoryPool::create(false);
     dfb::TransportHandler* handler = nullptr;
-    std::vector<std::string> script; // messages with their headers
+    struct Message {
+        std::string bytes; // with its header
+        bool isAwaited = false;
+    };
+    std::vector<Message> script;
     std::size_t next = 0;
     std::uint32_t sequence = 0;
-    std::function<bool()> whenDone; // sends the rest; false if there is none
-    int idle = 0;                   // naps since something came
+    bool checksums = false, isTimed = false; // frames have a time-out
+    std::function<bool()> whenDone;          // sends the rest; false if there is none
+    bool isGone = false;
+    int idle = 0; // naps since something came
 
-    void send(std::string message)
+    void send(std::string message, bool isAwaited = false)
     {
-        if (message.size() >= sizeof(d::MessageHeader)) // or else only the first of a number would be looked at
-            message.replace(offsetof(d::MessageHeader, sequence), sizeof sequence,
-                            fuzz::Output().put(sequence++).bytes());
-        script.push_back(std::move(message));
+        if (message.size() >= sizeof(d::MessageHeader)) { // or else only the first of a number would be looked at
+            const auto put = [&](std::size_t at, std::uint32_t value) {
+                message.replace(at, sizeof value, fuzz::Output().put(value).bytes());
+            };
+            put(offsetof(d::MessageHeader, sequence), sequence++);
+            put(offsetof(d::MessageHeader, checksum), 0);
+            if (checksums)
+                put(offsetof(d::MessageHeader, checksum), dfb::crc32c(fuzz::bytesOf(message), message.size()));
+        }
+        script.push_back({std::move(message), isAwaited});
     }
     bool poll()
     {
         tasks->hold(false);
-        if (next == script.size())
+        if (next == script.size() || script[next].isAwaited)
             return false;
         idle = 0;
         tasks->hold(true);
-        handler->receive(1, fuzz::ExactBlocks::copyOf(script[next++]));
+        handler->receive(1, fuzz::ExactBlocks::copyOf(script[next++].bytes));
         tasks->hold(false);
         return true;
     }
     // Somebody waits and nothing comes.
     void nap()
     {
+        if (next < script.size()) {
+            script[next].isAwaited = false;
+            return;
+        }
         if (whenDone && whenDone())
             return;
         ++idle;
-        if (whenDone && idle > 2)
+        if (isTimed && whenDone)
+            std::this_thread::sleep_for(std::chrono::microseconds(100 * partialMs));
+        if (whenDone && idle > (isTimed ? 200 : 2))
             fuzz::fail("a frame that does not end");
-        if (idle == 3) { // outside frames a rank that is gone is what ends the wait
+        if (idle >= 3 && !whenDone && !isGone) { // outside frames a rank that is gone is what ends the wait
+            isGone = true;
             dfb::ErrorInfo gone;
             gone.kind = dfb::ErrorKind::Transport;
             gone.message = "the other rank is gone";
@@ -104,7 +148,7 @@ struct Peer {
             handler->fail(gone);
             tasks->hold(false);
         }
-        if (idle > 100)
+        if (idle > 300)
             fuzz::fail("a wait that does not end");
     }
 };
@@ -134,36 +178,57 @@ private:
 
 int ownerOf(int tile) { return tile % 2; }
 
-dfb::FrameBufferConfig configFor(std::uint8_t flags)
+dfb::WallLayout wallLayout()
+{
+    dfb::WallLayout layout;
+    layout.columns = 2;
+    layout.displayWidth = width / 2;
+    layout.displayHeight = height;
+    layout.ranks = {0, 1};
+    return layout;
+}
+
+// What the other rank says of it.
+const std::string wallText = "a wall of 2x1 displays of 10x13, bezels 0 0, format "
+                             + std::to_string(static_cast<int>(dfb::OutputFormat::RGBA8)) + ", ranks 0 1";
+
+dfb::FrameBufferConfig configFor(Way way)
 {
     dfb::FrameBufferConfig config;
     config.width = width;
     config.height = height;
-    config.depth = true;
-    config.displayRank = flags & DisplayElsewhere ? 1 : 0;
+    config.depth = !way.has(Ordered) && !way.has(Wall);
+    config.displayRank = way.has(DisplayElsewhere) ? 1 : 0;
     config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return ownerOf(tile); };
     config.progress = dfb::Progress::Caller;
     config.sharedMemory = false;
 #if defined(DFB_HAS_SNAPPY)
-    if (flags & HasCodec)
+    if (way.has(HasCodec))
         config.codec = std::make_shared<dfb::SnappyCodec>();
 #endif
-    if (flags & Rounded)
+    if (way.has(Rounded))
         config.wire = dfb::WireFormat::Unorm16;
+    config.checksums = way.has(Checksums);
+    config.framesInFlight = static_cast<int>(way.engineCount());
+    if (way.has(Wall))
+        config.format = dfb::OutputFormat::None;
     return config;
 }
 
-dfb::FrameParams paramsFor(std::uint8_t flags)
+dfb::FrameParams paramsFor(Way way)
 {
     dfb::FrameParams params;
-    params.declared = flags & Declared;
+    params.declared = way.has(Declared);
+    params.allowPartial = way.has(Partial);
+    params.timeoutMs = way.has(Partial) ? partialMs : 0;
     return params;
 }
 
-std::string messageOf(MessageKind kind, std::int64_t number, const std::string& body)
+std::string messageOf(MessageKind kind, std::uint32_t receiver, std::int64_t number, const std::string& body)
 {
     d::MessageHeader header;
     header.kind = kind;
+    header.receiver = receiver;
     header.number = number;
     return fuzz::Output().put(header).text(body).bytes();
 }
@@ -174,132 +239,235 @@ std::string reductionOf(std::uint32_t scope, const d::SmallBytes& bytes)
 }
 enum : std::uint32_t { OwnScope, AllDeclared, FrameVerdict };
 
-std::string vote(std::uint8_t flags)
+// `inputsOnTheWay`: how many more the other rank has sent than have arrived there.
+std::string vote(Way way, int inputsOnTheWay = 0)
 {
     d::Verdict verdict;
-    verdict.paramsHash = d::fingerprintOf(paramsFor(flags));
+    verdict.sums[9] = inputsOnTheWay;
+    verdict.paramsHash = d::fingerprintOf(paramsFor(way));
     return reductionOf(FrameVerdict, verdict.bytes());
 }
 
-// The next message of the input; empty at the end of a frame or of the input.
-std::string nextMessage(fuzz::Input& in, std::int64_t frame)
+// Has all messages sent that the input has up to the end of a frame.
+void sendAll(Peer& peer, fuzz::Input& in, Way way, std::int64_t frame)
 {
-    if (in.left() == 0)
-        return "";
-    const auto what = in.take<std::uint8_t>();
-    if (what % 16 == endOfFrame)
-        return "";
-    const std::string body = in.text(in.take<std::uint16_t>() % 8192);
-    switch (what & how) {
-    case NextFrame: return messageOf(static_cast<MessageKind>(what % 16), frame + 1, body);
-    case LastFrame: return messageOf(static_cast<MessageKind>(what % 16), frame - 1, body);
-    case OtherHeader: return body; // it is the whole message
-    default: return messageOf(static_cast<MessageKind>(what % 16), frame, body);
+    while (in.left() > 0) {
+        const int kind = in.take<std::uint8_t>() & kinds;
+        if (kind == endOfFrame)
+            return;
+        const auto how = in.take<std::uint8_t>();
+        std::string message = in.text(in.take<std::uint16_t>() % 8192);
+        if ((how & numbered) != OtherHeader) { // or else it is the whole message
+            const std::int64_t number =
+                frame + ((how & numbered) == NextFrame ? 1 : 0) - ((how & numbered) == LastFrame ? 1 : 0);
+            const std::uint32_t another = way.has(Wall) ? 0 : 2;
+            message = messageOf(static_cast<MessageKind>(kind),
+                                how & ToAnother ? another : way.addressOf(std::max<std::int64_t>(number, 1)), number,
+                                message);
+        }
+        peer.send(std::move(message), (how & Awaited) != 0);
     }
 }
 
-template <class TileOp>
-void play(std::uint8_t flags, fuzz::Input& in)
-{
-    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, PlayedTransport>;
-    using Pipeline = d::TilePipeline<TileOp, dfb::NoPixelOp>;
-    const auto peer = std::make_shared<Peer>();
-    auto config = configFor(flags);
-    config.executor = peer->tasks;
-    const auto agreement = d::Agreement::of<TileOp, dfb::NoPixelOp>(config, 1, side, Pipeline::travelling(config),
-                                                                    tileCount, [](int tile) { return ownerOf(tile); });
-    if (flags & NoConfiguration)
-        for (std::string message = nextMessage(in, 0); !message.empty(); message = nextMessage(in, 0))
-            peer->send(message);
-    else
-        peer->send(messageOf(MessageKind::ReduceUp, 0, reductionOf(OwnScope, agreement.bytes())));
-    std::optional<FrameBuffer> fb;
-    try {
-        fb.emplace(peer, config);
-        if (flags & Gathers) {
-            for (std::string message = nextMessage(in, 1); !message.empty(); message = nextMessage(in, 1))
-                peer->send(message);
-            const auto all = fb->allGather(std::vector<std::byte>(3));
+template <class TileOp, class PixelOp>
+class Player {
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, PlayedTransport>;
+    using Pipeline = d::TilePipeline<TileOp, PixelOp>;
+
+public:
+    Player(Way way, fuzz::Input& in) : way_(way), in_(in), peer_(std::make_shared<Peer>())
+    {
+        peer_->checksums = way.has(Checksums);
+        peer_->isTimed = way.has(Partial);
+    }
+
+    // Returns how many frames ended well.
+    int play()
+    {
+        try {
+            make();
+        } catch (const dfb::InvalidArgument&) {
+            fuzz::require(way_.has(NoConfiguration), "a framebuffer is made if the other rank agrees");
+            return 0;
+        } catch (const dfb::Error&) {
+            fuzz::require(way_.has(NoConfiguration) || way_.has(Gathers), "as is one that nobody disturbs");
+            return 0;
+        }
+        try {
+            if (way_.has(InFlight)) {
+                sendAll(*peer_, in_, way_, 1);
+                sendAll(*peer_, in_, way_, 2);
+                auto first = render(1);
+                auto second = render(2);
+                end(first, 1);
+                end(second, 2);
+            } else {
+                for (std::int64_t number = 1; number <= 2; ++number) {
+                    sendAll(*peer_, in_, way_, number);
+                    auto frame = render(number);
+                    end(frame, number);
+                }
+            }
+        } catch (const dfb::TransportError&) { // it is of no use any more
+        }
+        peer_->whenDone = nullptr;
+        return fine_;
+    }
+
+private:
+    using Frame = typename FrameBuffer::Frame;
+
+    void make()
+    {
+        auto config = configFor(way_);
+        config.executor = peer_->tasks;
+        const auto agreement = d::Agreement::of<TileOp, PixelOp>(config, 1, side, Pipeline::travelling(config),
+                                                                 tileCount, [](int tile) { return ownerOf(tile); });
+        const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
+            peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
+        };
+        messenger_ = std::make_shared<dfb::Messenger<PlayedTransport>>(
+            peer_, dfb::MessengerOptions{config.progress, config.checksums, config.sharedMemory, config.peerTimeoutMs,
+                                         config.onPeerLost});
+        if (way_.has(NoConfiguration))
+            sendAll(*peer_, in_, way_, 0);
+        PixelOp pixelOp;
+        if constexpr (!std::is_same_v<PixelOp, dfb::NoPixelOp>) {
+            if (!way_.has(NoConfiguration))
+                agree(0, d::Agreement{true, wallText, 1});
+            wall_.emplace(messenger_, wallLayout(), dfb::OutputFormat::RGBA8, peer_->tasks);
+            pixelOp.wall = &*wall_;
+        }
+        if (!way_.has(NoConfiguration))
+            for (std::size_t i = 0; i < way_.engineCount(); ++i)
+                agree(way_.addressOf(static_cast<std::int64_t>(i) + 1), agreement);
+        fb_.emplace(messenger_, config, pixelOp);
+        if (way_.has(Gathers)) {
+            sendAll(*peer_, in_, way_, 1);
+            const auto all = fb_->allGather(std::vector<std::byte>(3));
             fuzz::require(all.size() == 2 && all[0].size() == 3, "each rank's bytes are gathered");
         }
-    } catch (const dfb::Error&) {
-        return; // such as InvalidArgument and TransportError
     }
-    auto tile = std::make_unique<typename FrameBuffer::Tile>();
-    for (std::int64_t number = 1; number <= 2; ++number) {
+
+    Frame render(std::int64_t number)
+    {
+        whenNothingComes(number);
+        Frame frame = fb_->begin(paramsFor(way_));
         try {
-            for (std::string message = nextMessage(in, number); !message.empty(); message = nextMessage(in, number))
-                peer->send(message);
-            peer->whenDone = [&, done = false]() mutable {
-                if (std::exchange(done, true))
-                    return false;
-                d::ByteWriter reason;
-                dfb::ErrorInfo info;
-                info.kind = dfb::ErrorKind::Cancelled;
-                info.rank = 1;
-                put(reason, info);
-                peer->send(messageOf(MessageKind::Abort, number, fuzz::textOf(reason.bytes())));
-                peer->send(messageOf(MessageKind::ReduceUp, number, vote(flags)));
-                return true;
-            };
-            auto frame = fb->begin(paramsFor(flags));
-            fb->poll();
-            if (flags & Declared)
+            fb_->poll();
+            const bool declared = way_.has(Declared);
+            if (declared)
                 frame.declare({{0, 50, 0}, {1, 50, 0}});
             for (const int index : {0, 2, 4, 1}) {
-                if ((flags & Declared) && index > 1)
+                if (declared && index > 1)
                     continue;
-                frame.start(*tile, index);
-                tile->generation = (flags & Declared) || index == 1 ? 1 : 0;
-                tile->source = (flags & Declared) ? 50 : 0;
-                tile->children = tile->generation == 0 ? 1 : 0;
-                tile->pixel(1, 1)[3] = 1;
-                frame.setTile(*tile);
-                fb->poll();
+                frame.start(*tile_, index);
+                tile_->generation = declared || index == 1 ? 1 : 0;
+                tile_->source = declared ? 50 : 0;
+                tile_->children = tile_->generation == 0 ? 1 : 0;
+                tile_->pixel(1, 1)[3] = 1;
+                frame.setTile(*tile_);
+                fb_->poll();
             }
-            if (flags & NextJobs)
+            if (way_.has(NextJobs))
                 for (dfb::JobRange jobs = frame.nextJobs(jobCount); jobs.begin < jobs.end;
                      jobs = frame.nextJobs(jobCount))
                     fuzz::require(jobs.begin >= 0 && jobs.end <= jobCount, "jobs are such that there are");
+        } catch (const dfb::FrameError&) { // end() throws it again
+        }
+        return frame;
+    }
+
+    void end(Frame& frame, std::int64_t number)
+    {
+        try {
+            whenNothingComes(number);
             const auto report = frame.end();
             for (const dfb::TileError& error : report.tileErrors)
                 fuzz::require(error.tile >= 0 && error.tile < tileCount, "an error is of a tile that there is");
-        } catch (const dfb::FrameError&) {
-            // The next may be better.
+            fuzz::require(!report.failure || way_.has(Partial), "only a frame that may be partial is");
+            fuzz::require(report.tilesIncomplete >= 0 && report.tilesIncomplete <= tileCount,
+                          "tiles that miss are such that there are");
+            fuzz::require(report.failure || report.tilesIncomplete == 0, "what is not partial is complete");
+            peer_->whenDone = nullptr;
+            if (wall_)
+                wall_->finish(report.frame);
+            fine_ += report.failure ? 0 : 1;
         } catch (const dfb::TransportError&) {
-            break;
+            throw;
+        } catch (const dfb::Error&) { // FrameError, and of a wall: the next may be better
         }
-        peer->whenDone = nullptr;
+        peer_->whenDone = nullptr;
     }
-    peer->whenDone = nullptr;
-    fb.reset();
+
+    void whenNothingComes(std::int64_t number)
+    {
+        peer_->idle = 0;
+        peer_->whenDone = [this, number, done = false]() mutable {
+            if (std::exchange(done, true))
+                return false;
+            d::ByteWriter reason;
+            dfb::ErrorInfo info;
+            info.kind = dfb::ErrorKind::Cancelled;
+            info.rank = 1;
+            put(reason, info);
+            const std::uint32_t address = way_.addressOf(number);
+            peer_->send(messageOf(MessageKind::Abort, address, number, fuzz::textOf(reason.bytes())));
+            peer_->send(messageOf(MessageKind::ReduceUp, address, number, vote(way_)));
+            return true;
+        };
+    }
+
+    Way way_;
+    fuzz::Input& in_;
+    int fine_ = 0;
+    std::shared_ptr<Peer> peer_;
+    std::shared_ptr<dfb::Messenger<PlayedTransport>> messenger_;
+    std::optional<dfb::DisplayWall<PlayedTransport>> wall_;
+    std::optional<FrameBuffer> fb_;
+    std::unique_ptr<typename FrameBuffer::Tile> tile_ = std::make_unique<typename FrameBuffer::Tile>();
+};
+
+template <class TileOp>
+int play(Way way, fuzz::Input& in)
+{
+    if (way.has(Wall))
+        return Player<TileOp, dfb::ToWall<PlayedTransport>>(way, in).play();
+    return Player<TileOp, dfb::NoPixelOp>(way, in).play();
+}
+
+// Returns how many frames ended well.
+int play(const std::uint8_t* data, std::size_t size)
+{
+    fuzz::Input in(data, size);
+    Way way;
+    way.flags = in.take<std::uint8_t>();
+    way.rest = in.take<std::uint8_t>() & more;
+    return way.has(Deep)      ? play<dfb::BasicDeepBlend<side>>(way, in)
+           : way.has(Ordered) ? play<dfb::BasicOrderedBlend<side>>(way, in)
+                              : play<dfb::BasicAlphaBlend<side>>(way, in);
 }
 
 } // namespace
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
 {
-    fuzz::Input in(data, size);
-    const auto flags = in.take<std::uint8_t>();
-    if (flags & Deep)
-        play<dfb::BasicDeepBlend<side>>(flags, in);
-    else
-        play<dfb::BasicAlphaBlend<side>>(flags, in);
+    play(data, size);
     return 0;
 }
 
 namespace {
 
-// The body of the input of a tile.
+// The body of an input of a tile, the one that rank 0 announces or that source 9 has declared.
 template <class TileOp>
-std::string inputOf(std::uint8_t flags, int index, int generation, std::uint32_t source, int children, bool isDense)
+std::string inputFor(Way way, int index, bool isDense)
 {
     static const auto pool = dfb::MemoryPool::create(false);
     using Tile = dfb::Tile<TileOp::channels, side>;
-    const auto config = configFor(flags);
+    const auto config = configFor(way);
     const dfb::TileLayout layout(width, height, side);
     auto tile = std::make_unique<Tile>();
-    static_cast<dfb::TileHeader&>(*tile) = {1, index, layout.region(index), 0, generation, children, source, 0};
+    static_cast<dfb::TileHeader&>(*tile) = {1, index, layout.region(index), 0, 1, 0, 9, 0};
     tile->clear();
     tile->forEachPixel([&](int x, int y, float* rgba, float& depth) {
         if (!isDense && (x + y) % 3 != 0)
@@ -316,25 +484,32 @@ std::string inputOf(std::uint8_t flags, int index, int generation, std::uint32_t
     return fuzz::textOf(message.data() + prefix, message.size() - prefix);
 }
 
-std::string of(int what, const std::string& body)
+std::string inputOf(Way way, int index, bool isDense)
+{
+    return way.has(Deep)      ? inputFor<dfb::BasicDeepBlend<side>>(way, index, isDense)
+           : way.has(Ordered) ? inputFor<dfb::BasicOrderedBlend<side>>(way, index, isDense)
+                              : inputFor<dfb::BasicAlphaBlend<side>>(way, index, isDense);
+}
+
+std::string of(MessageKind kind, const std::string& body, int how = 0)
 {
     return fuzz::Output()
-        .put(static_cast<std::uint8_t>(what))
+        .put(kind)
+        .put(static_cast<std::uint8_t>(how))
         .put(static_cast<std::uint16_t>(body.size()))
         .text(body)
         .bytes();
 }
-std::string of(MessageKind kind, const std::string& body) { return of(static_cast<int>(kind), body); }
 
 // The finished tiles 1, 3 and 5 and their count, as two bodies.
-std::pair<std::string, std::string> finished(std::uint8_t flags)
+std::pair<std::string, std::string> finished(Way way)
 {
-    const auto config = configFor(flags);
+    const auto config = configFor(way);
     const auto pool = dfb::MemoryPool::create(false);
     std::vector<std::string> bodies;
     d::GatherSettings settings;
     settings.format = config.format;
-    settings.channels = dfb::depthChannel;
+    settings.channels = config.depth ? dfb::depthChannel : 0;
     settings.codec = config.codec;
     const dfb::TileLayout layout(width, height, side);
     d::FinalGather gather(pool, layout, settings, false, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
@@ -347,7 +522,8 @@ std::pair<std::string, std::string> finished(std::uint8_t flags)
         const dfb::Region region = layout.region(tile);
         for (int i = 0; i < region.width() * region.height(); ++i)
             for (const auto c : {d::Color, d::Depth})
-                std::memset(place.planes.at[c] + 4 * i, i % 5 == 2 ? 9 : 1, 4);
+                if (c == d::Color || config.depth)
+                    std::memset(place.planes.at[c] + 4 * i, i % 5 == 2 ? 9 : 1, 4);
         gather.commit(tile, std::move(place), region.width() * region.height());
     }
     gather.flush();
@@ -359,98 +535,125 @@ std::pair<std::string, std::string> finished(std::uint8_t flags)
 std::vector<std::pair<std::string, std::string>> fuzz::seeds()
 {
     std::vector<std::pair<std::string, std::string>> all;
-    const auto add = [&](const std::string& name, std::uint8_t flags, const std::string& messages) {
-        all.emplace_back(name, Output().put(flags).text(messages).bytes());
+    const auto add = [&](const std::string& name, Way way, const std::string& messages) {
+        all.emplace_back(name, Output().put(way.flags).put(way.rest).text(messages).bytes());
     };
-    const auto inputs = [](std::uint8_t flags, int generation, std::uint32_t source) {
+    const auto inputs = [](Way way) {
         std::string text;
         for (const int tile : {0, 2, 4})
-            text +=
-                of(MessageKind::Fragment,
-                   flags & Deep ? inputOf<dfb::BasicDeepBlend<side>>(flags, tile, generation, source, 0, tile == 2)
-                                : inputOf<dfb::BasicAlphaBlend<side>>(flags, tile, generation, source, 0, tile == 2));
+            text += of(MessageKind::Fragment, inputOf(way, tile, tile == 2));
         return text;
     };
     const std::string end(1, static_cast<char>(endOfFrame));
-    const auto frameOf = [&](std::uint8_t flags) {
-        std::string text = inputs(flags, 1, 9);
-        if (flags & Declared) {
+    const auto partsOf = [](std::initializer_list<dfb::Region> regions) {
+        std::string text;
+        for (const dfb::Region& region : regions)
+            text += of(MessageKind::FinishedTiles,
+                       Output()
+                           .put(std::int32_t{0})
+                           .put(region)
+                           .put(std::int32_t{0})
+                           .text(std::string(static_cast<std::size_t>(4 * region.width() * region.height()), '\7'))
+                           .bytes(),
+                       ToAnother);
+        return text;
+    };
+    const std::string wallVote =
+        of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "", 1}.bytes()), ToAnother);
+    const auto frameOf = [&](Way way) {
+        std::string text = inputs(way);
+        if (way.has(Declared)) {
             text = of(MessageKind::Manifest, Output().put(2).put(9u).put(std::uint16_t{0}).bytes());
             text += of(MessageKind::ManifestAck, "") + of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}));
-            text += of(MessageKind::Fragment, inputOf<dfb::BasicAlphaBlend<side>>(flags, 2, 1, 9, 0, true));
+            text += of(MessageKind::Fragment, inputOf(way, 2, true));
         }
-        if (!(flags & DisplayElsewhere)) {
-            const auto [tiles, count] = finished(flags);
+        if (!way.has(DisplayElsewhere) && !way.has(Wall)) {
+            const auto [tiles, count] = finished(way);
             text += of(MessageKind::FinishedTiles, tiles) + of(MessageKind::TilesDone, count);
         }
-        return text + of(MessageKind::ReduceUp, vote(flags)) + end;
+        if (way.has(Wall)) // what the other rank owns of the display: tiles 1, 3 and 5
+            text += partsOf({{8, 0, 10, 8}, {0, 8, 8, 13}}) + wallVote;
+        return text + of(MessageKind::ReduceUp, vote(way, way.has(Declared) ? 0 : 2)) + end;
     };
-    for (const std::uint8_t flags :
+    const auto addFrames = [&](Way way) {
+        add("frame_" + std::to_string(way.flags) + (way.rest ? "_" + std::to_string(way.rest) : ""), way,
+            frameOf(way) + frameOf(way));
+        const std::string& bytes = all.back().second;
+        require(play(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size()) == 2, "both frames end well");
+    };
+    for (const int flags :
          {0, +DisplayElsewhere, +Declared, +HasCodec, +Rounded, +Deep, Declared | HasCodec, Rounded | HasCodec})
-        add("frame_" + std::to_string(flags), flags, frameOf(flags) + frameOf(flags));
+        addFrames({static_cast<std::uint8_t>(flags)});
+    for (const int rest :
+         {+Partial, +Checksums, +InFlight, +Wall, +Ordered, Partial | InFlight, Wall | InFlight, Wall | Partial})
+        for (const int flags : {0, +Declared})
+            addFrames({static_cast<std::uint8_t>(flags), static_cast<std::uint8_t>(rest)});
+    add("partial_without_what_the_other_has", {0, Partial}, inputs({}) + end);
+    add("wall_twice", {0, Wall}, partsOf({{8, 0, 10, 8}, {8, 1, 10, 2}}) + frameOf({0, Wall}));
+    add("wall_part_beyond", {0, Wall}, partsOf({{8, 0, 11, 8}}) + frameOf({0, Wall}));
+    add("wall_vote_broken", {0, Wall},
+        of(MessageKind::ReduceUp, reductionOf(OwnScope, {}), ToAnother) + frameOf({0, Wall}));
+    add("to_nobody", {}, of(MessageKind::Fragment, "lost", ToAnother) + frameOf({}));
     const auto jobs = [](std::int64_t from, std::int64_t to) {
-        return of(MessageKind::Jobs, Output().put(from).put(to).bytes());
+        return of(MessageKind::Jobs, Output().put(from).put(to).bytes(), Awaited);
     };
-    add("jobs", NextJobs, jobs(4, 6) + inputs(0, 1, 9));
-    add("jobs_that_are_not", NextJobs, jobs(4, 60) + jobs(-4, -3));
-    add("jobs_asked_for", NextJobs | DisplayElsewhere,
+    add("jobs", {NextJobs}, jobs(4, 6) + jobs(6, 9) + jobs(9, 9) + frameOf({}));
+    add("jobs_that_are_not", {NextJobs}, jobs(4, 60) + jobs(-4, -3));
+    add("jobs_asked_for", {NextJobs | DisplayElsewhere},
         of(MessageKind::JobRequest, Output().put(std::int64_t{jobCount}).put(1).put(0).bytes())
             + of(MessageKind::JobRequest, Output().put(std::int64_t{4}).put(1).put(0).bytes()));
-    add("manifest_late", Declared,
-        of(MessageKind::ManifestAck, "") + of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}))
+    add("manifest_late", {Declared},
+        of(MessageKind::ManifestAck, "", Awaited) + of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}))
             + of(MessageKind::Manifest, Output().put(2).put(9u).put(std::uint16_t{0}).bytes()));
-    add("credit", 0,
+    add("credit", {},
         of(MessageKind::CreditRequest, Output().put(std::uint64_t{1000}).put(std::uint64_t{2000}).bytes())
             + of(MessageKind::Credit, Output().put(std::uint64_t{1000}).put(std::uint64_t{500}).bytes()));
-    add("credit_without_end", 0,
+    add("credit_without_end", {},
         of(MessageKind::CreditRequest, Output().put(~std::uint64_t{0}).put(~std::uint64_t{0}).bytes()));
     dfb::ErrorInfo info;
     info.kind = dfb::ErrorKind::UserCode;
     info.message = "the renderer broke";
     d::ByteWriter reason;
     put(reason, info);
-    add("abort", 0, of(MessageKind::Abort, textOf(reason.bytes())) + end + inputs(0, 1, 9));
-    add("failure", 0, of(MessageKind::Failure, textOf(reason.bytes())));
-    add("vote_that_is_none", 0, of(MessageKind::ReduceUp, Output().put(+FrameVerdict).text("no vote").bytes()));
-    add("reduction_that_is_none", 0, of(MessageKind::ReduceUp, Output().put(9u).bytes()));
-    add("result_from_below", 0, of(MessageKind::ReduceDown, vote(0)));
+    add("abort", {}, of(MessageKind::Abort, textOf(reason.bytes())) + end + inputs({}));
+    add("failure", {}, of(MessageKind::Failure, textOf(reason.bytes())));
+    add("vote_that_is_none", {}, of(MessageKind::ReduceUp, Output().put(+FrameVerdict).text("no vote").bytes()));
+    add("reduction_that_is_none", {}, of(MessageKind::ReduceUp, Output().put(9u).bytes()));
+    add("result_from_below", {}, of(MessageKind::ReduceDown, vote({})));
     d::Verdict verdict;
-    verdict.paramsHash = d::fingerprintOf(paramsFor(0));
+    verdict.paramsHash = d::fingerprintOf(paramsFor({}));
     verdict.tileErrors = {{99, 1.0}};
-    add("vote_on_no_tile", 0, of(MessageKind::ReduceUp, reductionOf(FrameVerdict, verdict.bytes())));
+    add("vote_on_no_tile", {}, of(MessageKind::ReduceUp, reductionOf(FrameVerdict, verdict.bytes())));
     for (const int tile : {2, -2})
-        add("hidden" + std::to_string(tile), 0,
-            of(MessageKind::Hidden, Output().put(tile).put(1).bytes()) + inputs(0, 1, 9));
-    add("image_place", 0, of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));
-    add("image_place_of_the_display", DisplayElsewhere,
+        add("hidden" + std::to_string(tile), {0, Ordered},
+            of(MessageKind::Hidden, Output().put(tile).put(1).bytes()) + frameOf({0, Ordered}));
+    add("image_place", {}, of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));
+    add("image_place_of_the_display", {DisplayElsewhere},
         of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));
-    add("next_frame_first", 0,
-        of(static_cast<int>(MessageKind::Fragment) | NextFrame,
-           inputOf<dfb::BasicAlphaBlend<side>>(0, 0, 1, 9, 0, true))
-            + inputs(0, 1, 9) + end);
-    add("of_the_last_frame", 0, end + of(static_cast<int>(MessageKind::Fragment) | LastFrame, "late"));
+    add("next_frame_first", {}, of(MessageKind::Fragment, inputOf({}, 0, true), NextFrame) + inputs({}) + end);
+    add("of_the_last_frame", {}, end + of(MessageKind::Fragment, "late", LastFrame));
     d::MessageHeader header;
     header.number = 1000;
-    add("far_frame", 0, of(OtherHeader, Output().put(header).bytes()));
+    add("far_frame", {}, of(MessageKind::Fragment, Output().put(header).bytes(), OtherHeader));
     header.number = 1;
     header.receiver = 5000;
-    add("far_object", 0, of(OtherHeader, Output().put(header).bytes()));
+    add("far_object", {}, of(MessageKind::Fragment, Output().put(header).bytes(), OtherHeader));
     header.receiver = 0;
     header.version = 3;
-    add("other_version", 0, of(OtherHeader, Output().put(header).bytes()));
+    add("other_version", {}, of(MessageKind::Fragment, Output().put(header).bytes(), OtherHeader));
     header.version = d::MessageHeader::formatVersion;
     header.magic = d::MessageHeader::magicSwapped;
-    add("other_byte_order", 0, of(OtherHeader, Output().put(header).bytes()));
-    add("other_channels", 0, of(MessageKind::Fragment, inputOf<dfb::BasicDeepBlend<side>>(Deep, 0, 1, 9, 0, true)));
-    add("configuration", NoConfiguration,
+    add("other_byte_order", {}, of(MessageKind::Fragment, Output().put(header).bytes(), OtherHeader));
+    add("other_channels", {}, of(MessageKind::Fragment, inputOf({Deep}, 0, true)));
+    add("configuration", {NoConfiguration},
         of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "size 4x4", 1}.bytes())) + end);
-    add("configuration_broken", NoConfiguration, of(MessageKind::ReduceUp, std::string("\0\0\0\0no", 6)) + end);
+    add("configuration_broken", {NoConfiguration}, of(MessageKind::ReduceUp, std::string("\0\0\0\0no", 6)) + end);
     const auto gathered = [](std::int32_t rank, std::uint64_t count, const std::string& bytes) {
         return of(MessageKind::ReduceUp, Output().put(+OwnScope).put(rank).put(count).text(bytes).bytes());
     };
-    add("gathered", Gathers, gathered(1, 2, "ab"));
-    add("gathered_too_much", Gathers, gathered(1, ~std::uint64_t{0}, "ab"));
-    add("gathered_of_another", Gathers, gathered(0, 2, "ab"));
-    add("gathered_of_no_rank", Gathers, gathered(7, 2, "ab"));
+    add("gathered", {Gathers}, gathered(1, 2, "ab"));
+    add("gathered_too_much", {Gathers}, gathered(1, ~std::uint64_t{0}, "ab"));
+    add("gathered_of_another", {Gathers}, gathered(0, 2, "ab"));
+    add("gathered_of_no_rank", {Gathers}, gathered(7, 2, "ab"));
     return all;
 }
