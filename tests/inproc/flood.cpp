@@ -459,8 +459,8 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
 
 TEST_CASE("What an owner keeps of inputs is their active bytes, once for each frame in flight", "[messaging][flood]")
 {
-    // 16 tiles with 8 full inputs and one that comes when all others have; ranks in one process, so that all inputs
-    // lie in the memory of their sender.
+    // 16 tiles with 8 full inputs and one that comes when all others have. The owner gets copies in memory of its own,
+    // as it does from another node.
     using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, BoardTransport>;
     constexpr int tiles = 16, parts = 8, side = dfb::AlphaBlend::tileSize, width = 4 * side;
     constexpr std::size_t active = std::size_t{20} * side * side;
@@ -468,6 +468,15 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
         const auto board = std::make_shared<Board>();
         std::atomic<int> arrived{0};
         std::promise<void> all;
+        std::shared_ptr<dfb::MemoryPool> ownersPool;
+        board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+            if (header.kind == MessageKind::Fragment) {
+                dfb::Buffer copy = ownersPool->acquire(message.size());
+                std::memcpy(copy.data(), message.data(), message.size());
+                message = std::move(copy);
+            }
+            return Board::What::Pass;
+        };
         board->passed = [&](int, int, const MessageHeader& header) {
             if (header.kind == MessageKind::Fragment && ++arrived == frames * tiles * parts)
                 all.set_value();
@@ -480,7 +489,10 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
             config.executor = std::make_shared<dfb::ThreadExecutor>(1);
             config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             config.messagePoolBytes = std::size_t{1} << 30; // not what limits it here
-            Fb fb(communicator, config);
+            const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
+            if (messenger->rank() == 0)
+                ownersPool = messenger->pool();
+            Fb fb(messenger, config);
             std::vector<typename Fb::Frame> open;
             const auto tile = std::make_unique<Fb::Tile>();
             const auto send = [&](auto& frame, int index, int generation, int children) {
