@@ -40,13 +40,18 @@ bool refused(const Call& call)
     }
 }
 
-void verdicts(const std::string& bytes)
+// Two of something: in front of them, how many bytes the first has.
+std::pair<Bytes, Bytes> two(fuzz::Input in)
 {
-    // Two of them: where the first ends says a byte.
-    if (bytes.empty())
-        return;
-    const std::size_t cut = std::min<std::size_t>(bytes.size(), 1 + static_cast<unsigned char>(bytes[0]));
-    const Bytes a = bytesFrom(bytes.substr(1, cut - 1)), b = bytesFrom(bytes.substr(cut));
+    const Bytes first = bytesFrom(in.text(in.take<std::uint16_t>() % 4096));
+    return {first, bytesFrom(in.rest())};
+}
+
+// Returns whether they are two.
+bool verdicts(const fuzz::Input& in)
+{
+    const auto parts = two(in);
+    const Bytes &a = parts.first, &b = parts.second;
     const auto isOne = [](const Bytes& one) {
         return !refused([&] {
             const d::Verdict v = d::Verdict::from(one);
@@ -65,16 +70,16 @@ void verdicts(const std::string& bytes)
         const bool failed = d::Verdict::from(a).error || d::Verdict::from(b).error;
         fuzz::require(!failed || v.error, "an error is not lost");
     }
+    return both;
 }
 
-void agreements(const std::string& bytes)
+// Returns whether they are two.
+bool agreements(const fuzz::Input& in)
 {
-    if (bytes.empty())
-        return;
-    const std::size_t cut = std::min<std::size_t>(bytes.size(), 1 + static_cast<unsigned char>(bytes[0]));
-    const Bytes a = bytesFrom(bytes.substr(1, cut - 1)), b = bytesFrom(bytes.substr(cut));
+    const auto parts = two(in);
+    const Bytes &a = parts.first, &b = parts.second;
     refused([&] { fuzz::require(d::Agreement::from(a).bytes() == a, "an agreement comes back"); });
-    refused([&] {
+    return !refused([&] {
         const auto all = d::Agreement::from(d::Agreement::combine(a, b));
         const auto first = d::Agreement::from(a), second = d::Agreement::from(b);
         fuzz::require(all.fine == (first.fine && second.fine && first.text == second.text),
@@ -308,8 +313,8 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
 {
     fuzz::Input in(data, size);
     switch (in.take<std::uint8_t>() % whiches) {
-    case Verdict: verdicts(in.rest()); break;
-    case Agreement: agreements(in.rest()); break;
+    case Verdict: verdicts(in); break;
+    case Agreement: agreements(in); break;
     case Manifest: manifests(in.rest()); break;
     case Reduction: reductions(in); break;
     case Lender: lender(in); break;
@@ -328,7 +333,13 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         all.emplace_back(name, Output().put(which).text(bytes).bytes());
     };
     const auto both = [](const Bytes& a, const Bytes& b) {
-        return Output().put(static_cast<std::uint8_t>(a.size())).text(textOf(a)).text(textOf(b)).bytes();
+        return Output().put(static_cast<std::uint16_t>(a.size())).text(textOf(a)).text(textOf(b)).bytes();
+    };
+    const auto addTwo = [&](const std::string& name, Which which, const auto& a, const auto& b) {
+        const std::string bytes = both(a.bytes(), b.bytes());
+        const Input in(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size());
+        require(which == Verdict ? verdicts(in) : agreements(in), "what is good is taken");
+        add(name, which, bytes);
     };
     d::Verdict good, bad;
     good.paramsHash = bad.paramsHash = 77;
@@ -338,16 +349,16 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     bad.error->tile = 4;
     bad.error->message = "tile 4";
     bad.figures = {{3, 0.5}};
-    add("verdicts", Verdict, both(good.bytes(), bad.bytes()));
-    add("verdicts_failed", Verdict, both(bad.bytes(), bad.bytes()));
+    addTwo("verdicts", Verdict, good, bad);
+    addTwo("verdicts_failed", Verdict, bad, bad);
     bad.error->rank = 3;
     bad.mergeErrors = {{3, 0.5}, {4, 1}};
-    add("verdicts_lists", Verdict, both(bad.bytes(), bad.bytes()));
+    addTwo("verdicts_lists", Verdict, bad, bad);
     const d::Agreement a{true, "size 4, tiles of 8", 0}, b{true, "size 4, tiles of 16", 1}, c{false, "no", 2};
-    add("agreement", Agreement, both(a.bytes(), a.bytes()));
-    add("agreement_differs", Agreement, both(a.bytes(), b.bytes()));
-    add("agreement_other_items", Agreement, both(a.bytes(), d::Agreement{true, "size 4", 1}.bytes()));
-    add("agreement_wrong", Agreement, both(a.bytes(), c.bytes()));
+    addTwo("agreement", Agreement, a, a);
+    addTwo("agreement_differs", Agreement, a, b);
+    addTwo("agreement_other_items", Agreement, a, d::Agreement{true, "size 4", 1});
+    addTwo("agreement_wrong", Agreement, a, c);
     const auto input = [](std::int32_t tile, std::uint32_t source, std::uint16_t part) {
         return Output().put(tile).put(source).put(part).bytes();
     };

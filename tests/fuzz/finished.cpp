@@ -20,7 +20,7 @@ using d::FinishedRecord;
 
 constexpr int side = 8, width = 20, height = 13;
 constexpr std::size_t mostBytes = 4096;
-enum Flags : std::uint8_t { HasCodec = 1, MakeHeader = 2, Record = 4, Splits = 8 };
+enum Flags : std::uint8_t { HasCodec = 1, MakeHeader = 2, Record = 4, Splits = 8, Shared = 16 };
 
 struct BatchHeader { // as in FinalGather
     std::uint64_t rawBytes = 0;
@@ -88,7 +88,8 @@ std::string recordOf(const FinishedRecord& record, int tile, const d::FinishedPl
     return fuzz::textOf(bytes.data(), bytes.size());
 }
 
-void readOne(const FinishedRecord& record, const std::string& bytes, bool splits)
+// Returns whether it is a record.
+bool readOne(const FinishedRecord& record, const std::string& bytes, bool splits)
 {
     const auto read = [&](const std::string& from, int& tile, std::unique_ptr<Pixels>& pixels) {
         const dfb::Buffer block = fuzz::ExactBlocks::copyOf(from);
@@ -106,14 +107,16 @@ void readOne(const FinishedRecord& record, const std::string& bytes, bool splits
         fuzz::require(read(bytes, tile, first) <= bytes.size(), "it does not read behind its end");
     } catch (const dfb::Error& e) {
         fuzz::require(e.info().kind == dfb::ErrorKind::MalformedMessage, "it is refused as malformed");
-        return;
+        return false;
     }
     const std::string again = recordOf(record, tile, first->planes, splits);
     fuzz::require(read(again, sameTile, second) == again.size() && sameTile == tile && *first == *second,
                   "a record comes back");
+    return true;
 }
 
-void gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t flags, const std::string& batch,
+// Returns whether the image was complete after it.
+bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t flags, const std::string& batch,
             const std::string& done)
 {
     const auto pool = dfb::MemoryPool::create(false);
@@ -122,6 +125,8 @@ void gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     settings.channels = channels;
     settings.codec = flags & HasCodec ? codec() : nullptr;
     d::FinalGather display(pool, layout(), settings, true, 0, {false, true}, ownerOf, [](dfb::Buffer&&) {});
+    if (flags & Shared) // other ranks put tiles into it
+        display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});
     auto& image = const_cast<dfb::Image&>(display.image());
     const std::size_t pixelBytes = dfb::bytesPerPixel(format);
@@ -155,7 +160,8 @@ void gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     };
     give([&] { display.receiveTiles(1, messageOf(body)); });
     const bool counted = give([&] { display.receiveDone(1, messageOf(done)); });
-    fuzz::require(!display.complete() || counted, "nothing is complete before the count has come");
+    const bool isComplete = display.complete();
+    fuzz::require(!isComplete || counted, "nothing is complete before the count has come");
     fuzz::require(!give([&] { display.receiveDone(1, messageOf(done)); }), "a second count is refused");
     give([&] { display.receiveTiles(1, messageOf(body)); });
     for (int tile = 0; tile < layout().tileCount(); tile += 2) { // those of rank 0
@@ -167,20 +173,25 @@ void gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
                           "nothing else of the image is touched");
         }
     }
+    return isComplete;
+}
+
+// Returns whether it was good.
+bool take(fuzz::Input in)
+{
+    const auto what = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();
+    const auto length = in.take<std::uint16_t>();
+    const std::string batch = in.text(std::min<std::size_t>(length, mostBytes));
+    if (flags & Record)
+        return readOne(FinishedRecord(formatOf(what), channelsOf(what)), batch, flags & Splits);
+    return gather(formatOf(what), channelsOf(what), flags, batch, in.rest());
 }
 
 } // namespace
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
 {
-    fuzz::Input in(data, size);
-    const auto what = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();
-    const auto length = in.take<std::uint16_t>();
-    const std::string batch = in.text(std::min<std::size_t>(length, mostBytes));
-    if (flags & Record)
-        readOne(FinishedRecord(formatOf(what), channelsOf(what)), batch, flags & Splits);
-    else
-        gather(formatOf(what), channelsOf(what), flags, batch, in.rest());
+    take(fuzz::Input(data, size));
     return 0;
 }
 
@@ -200,7 +211,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         return recordOf(record, tile, pixels.planes, splits);
     };
     const auto add = [&](const std::string& name, std::uint8_t what, std::uint8_t flags, const std::string& batch,
-                         std::int64_t count, const std::string& placed = "") {
+                         std::int64_t count, const std::string& placed = "", bool isGood = true) {
         all.emplace_back(name, Output()
                                    .put(what)
                                    .put(flags)
@@ -209,6 +220,9 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
                                    .put(count)
                                    .text(placed)
                                    .bytes());
+        const std::string& bytes = all.back().second;
+        require(take(Input(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size())) == isGood,
+                "what is good is taken, and nothing else");
     };
     const auto none = [](int, int) { return false; };
     const auto some = [](int x, int y) { return x < 3 || y % 3 == 1; };
@@ -226,11 +240,15 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     const std::string three = make(0, 1, false, most) + make(0, 3, false, some) + make(0, 5, false, none);
     add("batch", 0, MakeHeader, three, 3);
     add("batch_compressed", 0, MakeHeader | HasCodec, make(0, 1, true, some) + make(0, 5, true, most), 2);
-    add("batch_of_another_owner", 0, MakeHeader, make(0, 1, false, most) + make(0, 2, false, most), 2);
-    add("batch_twice_the_same", 0, MakeHeader, make(0, 1, false, most) + make(0, 1, false, most), 2);
+    add("batch_of_another_owner", 0, MakeHeader, make(0, 1, false, most) + make(0, 2, false, most), 2, "", false);
+    add("batch_twice_the_same", 0, MakeHeader, make(0, 1, false, most) + make(0, 1, false, most), 2, "", false);
     BatchHeader h;
     h.rawBytes = three.size();
     add("batch_with_header", 0, 0, Output().put(h).text(three).bytes(), 3);
-    add("count_of_placed", 0, MakeHeader, "", 2, Output().put(std::int32_t{1}).put(std::int32_t{3}).bytes());
+    const std::string placed = Output().put(std::int32_t{1}).put(std::int32_t{3}).bytes();
+    add("count_of_placed", 0, MakeHeader | Shared, make(0, 5, false, some), 3, placed);
+    add("count_of_placed_only", 0, MakeHeader | Shared, "", 2, placed);
+    add("count_of_placed_too_low", 0, MakeHeader | Shared, "", 1, placed, false);
+    add("count_of_placed_where_none_can_be", 0, MakeHeader, "", 2, placed, false);
     return all;
 }

@@ -130,12 +130,10 @@ bool isSame(const dfb::TileHeader& a, const dfb::TileHeader& b)
            && a.generation == b.generation && a.children == b.children && a.source == b.source && a.part == b.part;
 }
 
-} // namespace
-
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
+// Returns whether it is an input of a tile.
+bool take(fuzz::Input in)
 {
     static const auto pool = dfb::MemoryPool::create(false);
-    fuzz::Input in(data, size);
     const auto depthFormat = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();
     const d::WireCoder coder = coderFor(depthFormat, flags);
     const dfb::Codec* with = flags & HasCodec ? codec() : nullptr;
@@ -158,7 +156,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
         fragment = decode(*pool, fuzz::ExactBlocks::copyOf(message), with, coder);
     } catch (const dfb::Error& e) {
         fuzz::require(e.info().kind == dfb::ErrorKind::MalformedMessage, "it is refused as malformed");
-        return 0;
+        return false;
     }
     const dfb::TileHeader& header = fragment.header();
     fuzz::require(header.tile >= 0 && header.tile < layout().tileCount() && header.tile != 2
@@ -179,6 +177,14 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     fuzz::require(isSame(header, second.header()), "the header comes back");
     fuzz::require(fragment.channels() == second.channels(), "the channels come back");
     fuzz::require(areAlike(*tile, *tileOf(second), fragment.channels()), "the pixels come back");
+    return true;
+}
+
+} // namespace
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
+{
+    take(fuzz::Input(data, size));
     return 0;
 }
 
@@ -196,6 +202,9 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         const std::size_t prefix = sizeof(d::MessageHeader);
         std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
         all.emplace_back(name, fuzz::Output().put(depthFormat).put(flags).text(body).bytes());
+        const std::string& bytes = all.back().second;
+        fuzz::require(take(fuzz::Input(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size())),
+                      "what is good is taken");
     };
     const dfb::ChannelMask colorAndDepth = dfb::colorChannel | dfb::depthChannel;
     const auto tileWith = [](int index, const auto& isThere) {
