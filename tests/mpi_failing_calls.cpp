@@ -9,10 +9,13 @@
 #include <cstdlib>
 #include <future>
 #include <memory>
+#include <mutex>
 #include <new>
+#include <set>
 #include <string>
 #include <thread>
 #include <utility>
+#include <vector>
 
 namespace {
 
@@ -59,12 +62,14 @@ std::string transportErrorOf(const std::string& what, const Action& action)
     return text;
 }
 
-std::string expected(const std::string& call)
+// `peer`: whom the call was to reach, if the error says so.
+std::string expected(const std::string& call, int peer = -1)
 {
     char text[MPI_MAX_ERROR_STRING];
     int length = 0;
     PMPI_Error_string(code, text, &length);
-    return call + ": " + std::string(text, static_cast<std::size_t>(length));
+    return call + (peer < 0 ? "" : " with rank " + std::to_string(peer)) + ": "
+           + std::string(text, static_cast<std::size_t>(length));
 }
 
 bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
@@ -103,9 +108,37 @@ DFB_FAILING(MPI_Iallreduce, (const void* a, void* b, int c, MPI_Datatype d, MPI_
             (a, b, c, d, e, f, g))
 DFB_FAILING(MPI_Irecv, (void* a, int b, MPI_Datatype c, int d, int e, MPI_Comm f, MPI_Request* g),
             (a, b, c, d, e, f, g))
-DFB_FAILING(MPI_Isend, (const void* a, int b, MPI_Datatype c, int d, int e, MPI_Comm f, MPI_Request* g),
-            (a, b, c, d, e, f, g))
-DFB_FAILING(MPI_Testsome, (int a, MPI_Request* b, int* c, int* d, MPI_Status* e), (a, b, c, d, e))
+
+std::mutex mutex;
+std::set<MPI_Request> sends; // that are under way
+
+extern "C" int MPI_Isend(const void* a, int b, MPI_Datatype c, int d, int e, MPI_Comm f, MPI_Request* request)
+{
+    if (fails("MPI_Isend"))
+        return code;
+    const std::lock_guard<std::mutex> lock(mutex);
+    const int result = PMPI_Isend(a, b, c, d, e, f, request);
+    sends.insert(*request);
+    return result;
+}
+
+// "a send": of one that was under way its status says so.
+extern "C" int MPI_Testsome(int count, MPI_Request* requests, int* outCount, int* indices, MPI_Status* statuses)
+{
+    if (fails("MPI_Testsome"))
+        return code;
+    const std::lock_guard<std::mutex> lock(mutex);
+    const std::vector<MPI_Request> before(requests, requests + count);
+    int result = PMPI_Testsome(count, requests, outCount, indices, statuses);
+    for (int i = 0; result == MPI_SUCCESS && i < *outCount; ++i)
+        if (sends.erase(before[static_cast<std::size_t>(indices[i])]) > 0 && fails("a send")) {
+            for (int k = 0; k < *outCount; ++k)
+                statuses[k].MPI_ERROR = k == i ? code : MPI_SUCCESS;
+            result = MPI_ERR_IN_STATUS;
+        }
+    return result;
+}
+
 DFB_FAILING(MPI_Get_count, (const MPI_Status* a, MPI_Datatype b, int* c), (a, b, c))
 
 int main(int argc, char** argv)
@@ -140,7 +173,7 @@ int main(int argc, char** argv)
         const auto [what, text] = make("memory", everywhere, false);
         check(has(text, who + "std::bad_alloc"), what, text);
     }
-    for (const char* call : {"MPI_Isend", "MPI_Irecv", "MPI_Testsome", "MPI_Get_count"}) {
+    for (const char* call : {"MPI_Irecv", "MPI_Testsome", "MPI_Get_count", "MPI_Isend", "a send"}) {
         const std::string what = std::string("a frame with a failing ") + call;
         const std::string text = transportErrorOf(what, [&] {
             FrameBuffer fb(mpi.communicator(), config);
@@ -154,8 +187,12 @@ int main(int argc, char** argv)
                 frame.end();
             }
         });
-        check(has(text, "transport failure: rank 0") && has(text, expected(call)), what, text);
         failing = nullptr;
+        const bool isSend = has(call, "send") || has(call, "Isend"); // then it says to whom
+        bool says = !isSend && has(text, expected(call));
+        for (int peer = 1; isSend && peer < mpi.size(); ++peer)
+            says = says || has(text, expected(has(call, "MPI") ? call : "MPI_Testsome", peer));
+        check(has(text, "transport failure: rank 0") && says, what, text);
     }
     return failures;
 }

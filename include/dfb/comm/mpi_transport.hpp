@@ -50,7 +50,9 @@ inline const char* mpiLevelName(int level)
                                             : "MPI_THREAD_MULTIPLE";
 }
 
-inline void checkMpi(int code, const char* call, int rank)
+// Throws TransportError unless the call was successful. `rank`: this one; `peer`: whom it was about, or -1. That one
+// may be the cause: over a network MPI can find that a rank is gone before the library does.
+inline void checkMpi(int code, const char* call, int rank, int peer = -1)
 {
     if (code == MPI_SUCCESS)
         return;
@@ -58,7 +60,9 @@ inline void checkMpi(int code, const char* call, int rank)
     int length = 0;
     if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
         length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
-    throw TransportError(std::string(call) + ": " + std::string(text, static_cast<std::size_t>(length)), rank);
+    throw TransportError(call + (peer < 0 ? "" : " with rank " + std::to_string(peer)) + ": "
+                             + std::string(text, static_cast<std::size_t>(length)),
+                         rank);
 }
 
 // For waiting without spinning and without a blocking call.
@@ -428,7 +432,7 @@ private:
     static constexpr std::size_t smallestLent = 2048; // to copy less is quicker
     static constexpr std::size_t bodiesAtOnce = 64;
 
-    void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
+    void check(int code, const char* call, int peer = -1) const { detail::checkMpi(code, call, rank_, peer); }
 
     [[noreturn]] void failAsTold(std::string text, int source)
     {
@@ -613,7 +617,7 @@ private:
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Isend(transfer.data.data() + transfer.offset, transfer.count(), MPI_BYTE, transfer.peer, transfer.tag,
                         comm_, &request),
-              "MPI_Isend");
+              "MPI_Isend", transfer.peer);
         return request;
     }
 
@@ -711,7 +715,7 @@ private:
     {
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Irecv(body.data.data() + body.offset, body.count(), MPI_BYTE, body.peer, body.tag, comm_, &request),
-              "MPI_Irecv");
+              "MPI_Irecv", body.peer);
         return request;
     }
 
@@ -730,9 +734,10 @@ private:
 
     // --- completion
 
-    // How many have completed; indices_ and statuses_ say which and how.
-    // MPI_Testsome reports errors to the handler of MPI_COMM_SELF or MPI_COMM_WORLD, which by default ends the job.
-    int testSome(std::vector<MPI_Request>& requests)
+    // How many have completed; indices_ and statuses_ say which and how. `items`: what they move, if they are of one
+    // rank each. MPI_Testsome reports errors to the handler of MPI_COMM_SELF or MPI_COMM_WORLD, which by default ends
+    // the job.
+    int testSome(std::vector<MPI_Request>& requests, const std::vector<Transfer>* items = nullptr)
     {
         if (indices_.size() < requests.size()) {
             indices_.resize(requests.size());
@@ -743,7 +748,8 @@ private:
             MPI_Testsome(static_cast<int>(requests.size()), requests.data(), &count, indices_.data(), statuses_.data());
         if (code != MPI_SUCCESS && MPI_Error_class(code, &kind) == MPI_SUCCESS && kind == MPI_ERR_IN_STATUS)
             for (int i = 0; i < count; ++i)
-                check(statuses_[static_cast<std::size_t>(i)].MPI_ERROR, "MPI_Testsome");
+                check(statuses_[static_cast<std::size_t>(i)].MPI_ERROR, "MPI_Testsome",
+                      items ? (*items)[static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)])].peer : -1);
         check(code, "MPI_Testsome");
         return count == MPI_UNDEFINED ? 0 : count;
     }
@@ -756,7 +762,7 @@ private:
         auto& [requests, items] = transfers;
         if (requests.empty())
             return false;
-        const int count = testSome(requests);
+        const int count = testSome(requests, &items);
         if (count == 0)
             return false;
         for (int i = 0; i < count; ++i) {

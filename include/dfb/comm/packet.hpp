@@ -69,8 +69,8 @@ private:
     std::size_t used_ = 0;
 };
 
-// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the bytes,
-// which need not be trusted, are no packet: then what came before has been visited. An empty packet is one.
+// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the
+// bytes, which need not be trusted, are no packet: then what came before has been visited. An empty packet is one.
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
 {
