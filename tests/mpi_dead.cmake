@@ -1,7 +1,7 @@
-# cmake -DRANKS=<n> -DVICTIM=<rank> -DREACTION=<abort|handler> -DWHERE=<where> -DBACK=<ON|OFF> -DTIMEOUT_MS=<ms>
-#   -DFOLDER=<folder> -P mpi_dead.cmake -- <mpiexec> <argument>... <program> <argument>...
+# cmake -DRANKS=<n> -DVICTIM=<rank> -DREACTION=<abort|handler> -DWHERE=<where> -DBACK=<ON|OFF> -DNETWORK=<ON|OFF>
+#   -DTIMEOUT_MS=<ms> -DFOLDER=<folder> -P mpi_dead.cmake -- <mpiexec> <argument>... <program> <argument>...
 # Starts mpi_dead and looks at what it says: who was told of which rank, and when; or that the job was aborted in time.
-# BACK: the lost rank comes back, and is told, too. Ranks that are in a destructor can not be told, but for those whose
+# BACK: the lost rank comes back, and is told, too. NETWORK: MPI may find out first, when it sends something there. Ranks that are in a destructor can not be told, but for those whose
 # handler is called; they are gone in time.
 cmake_policy(VERSION 3.16)
 file(REMOVE_RECURSE ${FOLDER})
@@ -33,6 +33,9 @@ else()
       continue()
     endif()
     set(pattern "told of rank ${VICTIM} after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank ${VICTIM}: this rank is lost")
+    if(NETWORK)
+      set(pattern "told of rank [0-9]+ after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: (rank ${VICTIM}: this rank is lost|rank [0-9]+: MPI_[A-Za-z]+ with rank ${VICTIM}: )")
+    endif()
     if(WHERE STREQUAL "end")
       if(NOT "${out}" MATCHES "mpi_dead: rank [0-9]+ ${pattern}")
         message(SEND_ERROR "nobody has noticed that rank ${VICTIM} is lost")
