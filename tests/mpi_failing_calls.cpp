@@ -173,8 +173,17 @@ int main(int argc, char** argv)
         const auto [what, text] = make("memory", everywhere, false);
         check(has(text, who + "std::bad_alloc"), what, text);
     }
-    for (const char* call : {"MPI_Irecv", "MPI_Testsome", "MPI_Get_count", "MPI_Isend", "a send"}) {
-        const std::string what = std::string("a frame with a failing ") + call;
+    struct Failing {
+        const char* what;
+        const char* call;
+        bool namesPeer;
+    };
+    for (const Failing& f : {Failing{"MPI_Irecv", "MPI_Irecv", false},
+                             {"MPI_Testsome", "MPI_Testsome", false},
+                             {"MPI_Get_count", "MPI_Get_count", false},
+                             {"MPI_Isend", "MPI_Isend", true},
+                             {"a send", "MPI_Testsome", true}}) {
+        const std::string what = std::string("a frame with a failing ") + f.what;
         const std::string text = transportErrorOf(what, [&] {
             FrameBuffer fb(mpi.communicator(), config);
             for (int i = 0; i < 2; ++i) {
@@ -183,15 +192,14 @@ int main(int argc, char** argv)
                 auto frame = fb.begin(params);
                 frame.declare({});
                 if (mpi.rank() == 0)
-                    failing = call; // the other rank is told
+                    failing = f.what; // the other rank is told
                 frame.end();
             }
         });
         failing = nullptr;
-        const bool isSend = has(call, "send") || has(call, "Isend"); // then it says to whom
-        bool says = !isSend && has(text, expected(call));
-        for (int peer = 1; isSend && peer < mpi.size(); ++peer)
-            says = says || has(text, expected(has(call, "MPI") ? call : "MPI_Testsome", peer));
+        bool says = !f.namesPeer && has(text, expected(f.call));
+        for (int peer = 1; f.namesPeer && peer < mpi.size(); ++peer)
+            says = says || has(text, expected(f.call, peer));
         check(has(text, "transport failure: rank 0") && says, what, text);
     }
     return failures;

@@ -337,7 +337,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     };
     const auto addTwo = [&](const std::string& name, Which which, const auto& a, const auto& b) {
         const std::string bytes = both(a.bytes(), b.bytes());
-        const Input in(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size());
+        const Input in(bytes);
         require(which == Verdict ? verdicts(in) : agreements(in), "what is good is taken");
         add(name, which, bytes);
     };

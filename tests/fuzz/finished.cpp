@@ -220,9 +220,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
                                    .put(count)
                                    .text(placed)
                                    .bytes());
-        const std::string& bytes = all.back().second;
-        require(take(Input(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size())) == isGood,
-                "what is good is taken, and nothing else");
+        require(take(Input(all.back().second)) == isGood, "what is good is taken, and nothing else");
     };
     const auto none = [](int, int) { return false; };
     const auto some = [](int x, int y) { return x < 3 || y % 3 == 1; };

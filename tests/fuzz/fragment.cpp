@@ -202,9 +202,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         const std::size_t prefix = sizeof(d::MessageHeader);
         std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
         all.emplace_back(name, fuzz::Output().put(depthFormat).put(flags).text(body).bytes());
-        const std::string& bytes = all.back().second;
-        fuzz::require(take(fuzz::Input(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size())),
-                      "what is good is taken");
+        fuzz::require(take(fuzz::Input(all.back().second)), "what is good is taken");
     };
     const dfb::ChannelMask colorAndDepth = dfb::colorChannel | dfb::depthChannel;
     const auto tileWith = [](int index, const auto& isThere) {

@@ -40,6 +40,9 @@ inline void require(bool holds, const char* what)
 class Input {
 public:
     Input(const std::uint8_t* data, std::size_t size) : next_(data), left_(size) {}
+    explicit Input(const std::string& bytes) : Input(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size())
+    {
+    }
 
     template <class T>
     T take()

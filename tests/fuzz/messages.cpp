@@ -2,8 +2,7 @@
 // nothing else gets out.
 //
 // An input: two bytes that say how the framebuffer is made, then messages: the kind, how it is sent, a length, the
-// body. The other rank is played: when the input has nothing more it gives the frame up, as a
-// rank does that works.
+// body. The other rank is played: when the input has nothing more it gives the frame up, as a rank does that works.
 #include "fuzz.hpp"
 
 #include <dfb/dfb.hpp>
@@ -87,7 +86,6 @@ private:
 // The other rank, and what it sends.
 struct Peer {
     std::shared_ptr<TaskList> tasks = std::make_shared<TaskList>();
-    std::shared_ptr<dfb::MemoryPool> pool = dfb::MemoryPool::create(false);
     dfb::TransportHandler* handler = nullptr;
     struct Message {
         std::string bytes; // with its header
@@ -437,9 +435,8 @@ int play(Way way, fuzz::Input& in)
 }
 
 // Returns how many frames ended well.
-int play(const std::uint8_t* data, std::size_t size)
+int play(fuzz::Input in)
 {
-    fuzz::Input in(data, size);
     Way way;
     way.flags = in.take<std::uint8_t>();
     way.rest = in.take<std::uint8_t>() & more;
@@ -452,7 +449,7 @@ int play(const std::uint8_t* data, std::size_t size)
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
 {
-    play(data, size);
+    play(fuzz::Input(data, size));
     return 0;
 }
 
@@ -578,8 +575,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     const auto addFrames = [&](Way way) {
         add("frame_" + std::to_string(way.flags) + (way.rest ? "_" + std::to_string(way.rest) : ""), way,
             frameOf(way) + frameOf(way));
-        const std::string& bytes = all.back().second;
-        require(play(reinterpret_cast<const std::uint8_t*>(bytes.data()), bytes.size()) == 2, "both frames end well");
+        require(play(Input(all.back().second)) == 2, "both frames end well");
     };
     for (const int flags :
          {0, +DisplayElsewhere, +Declared, +HasCodec, +Rounded, +Deep, Declared | HasCodec, Rounded | HasCodec})
