@@ -22,6 +22,8 @@
 #include <utility>
 #include <vector>
 
+namespace errors_cases {
+
 namespace {
 
 using scene::has;
@@ -1289,3 +1291,5 @@ TEST_CASE("An operation that takes longer than a frame may fails the frame, not 
     CHECK(has(texts[0], "are still being finished"));
     CHECK(after == std::vector<std::string>(2, "fine"));
 }
+
+} // namespace errors_cases

@@ -23,6 +23,8 @@
 #include <utility>
 #include <vector>
 
+namespace flood_cases {
+
 namespace {
 
 using board::Board;
@@ -539,3 +541,5 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
         CHECK(reports[0].peakMemoryBytes <= static_cast<std::int64_t>(limit));
     }
 }
+
+} // namespace flood_cases

@@ -12,6 +12,8 @@
 #include <string>
 #include <vector>
 
+namespace images_cases {
+
 namespace {
 
 using scene::Loop;
@@ -423,3 +425,5 @@ TEST_CASE("allReduce outside frames", "[images]")
     CHECK(maxima == std::vector<std::vector<std::int64_t>>(5, {4, std::numeric_limits<std::int64_t>::min()}));
     CHECK(refused == 5);
 }
+
+} // namespace images_cases

@@ -15,6 +15,8 @@
 #include <thread>
 #include <vector>
 
+namespace lost_peers_cases {
+
 namespace {
 
 using board::Board;
@@ -437,3 +439,5 @@ TEST_CASE("A time-out for peers that can not be is refused on all ranks", "[lost
             CHECK((has(text, "InvalidArgument") && has(text, std::to_string(wrong) + " ms")));
     }
 }
+
+} // namespace lost_peers_cases

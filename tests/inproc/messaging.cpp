@@ -25,6 +25,8 @@
 #include <utility>
 #include <vector>
 
+namespace messaging_cases {
+
 namespace {
 
 using board::Board;
@@ -1047,3 +1049,5 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
     CHECK(reports[0].tilesIncomplete <= 2);
     CHECK(reports[0].compositingOverheadMs < params.timeoutMs / 2);
 }
+
+} // namespace messaging_cases

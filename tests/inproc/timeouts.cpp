@@ -21,6 +21,8 @@
 #include <utility>
 #include <vector>
 
+namespace timeouts_cases {
+
 namespace {
 
 using board::Board;
@@ -740,3 +742,5 @@ TEST_CASE("Progress by the caller: an absent rank that does not poll is a Transp
     CHECK(endings[0].ms >= 2 * limitMs);
     CHECK(endings[0].ms < 2 * limitMs + marginMs);
 }
+
+} // namespace timeouts_cases

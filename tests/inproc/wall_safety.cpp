@@ -12,6 +12,8 @@
 #include <string>
 #include <vector>
 
+namespace wall_safety_cases {
+
 namespace {
 
 using board::Board;
@@ -189,3 +191,5 @@ TEST_CASE("A part of a display that is lost is named with its display, one that 
     CHECK(twice.after == fine);
     CHECK(twice.wrong == 0);
 }
+
+} // namespace wall_safety_cases

@@ -13,6 +13,8 @@
 #include <thread>
 #include <vector>
 
+namespace caller_cases {
+
 namespace {
 
 using Op = dfb::BasicOrderedBlend<64>;
@@ -85,3 +87,5 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
         CHECK(passesBarrier(fb));
     }
 }
+
+} // namespace caller_cases

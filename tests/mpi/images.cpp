@@ -10,6 +10,8 @@
 #include <string>
 #include <vector>
 
+namespace images_cases {
+
 namespace {
 
 using scene::Loop;
@@ -198,3 +200,5 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
     }
     CHECK(MPI_Comm_free(&half) == MPI_SUCCESS); // it is still the caller's
 }
+
+} // namespace images_cases

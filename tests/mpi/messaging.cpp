@@ -19,6 +19,8 @@
 #include <utility>
 #include <vector>
 
+namespace messaging_cases {
+
 namespace {
 
 using dfb::detail::MessageHeader;
@@ -480,3 +482,5 @@ TEST_CASE("A message of more than 2 GiB comes whole", "[messaging][.stress]")
     CHECK(inbox.byteCount == (rank == last ? byteCount : 0));
     CHECK(inbox.checksum == (rank == last ? checksum : 0));
 }
+
+} // namespace messaging_cases

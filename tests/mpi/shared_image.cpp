@@ -16,6 +16,8 @@
 #include <string>
 #include <thread>
 
+namespace shared_image_cases {
+
 namespace {
 
 using scene::Picture;
@@ -162,3 +164,5 @@ TEST_CASE("A float image of 2.25 GiB gets to the display rank, lent and through 
         CHECK(largeImage<dfb::MpiTransport>(MPI_COMM_WORLD, shared) == "");
     }
 }
+
+} // namespace shared_image_cases

@@ -12,6 +12,8 @@
 #include <string>
 #include <vector>
 
+namespace soak_cases {
+
 // Sanitizers keep memory that was freed, to find who uses it.
 #if defined(__SANITIZE_ADDRESS__)
 #define SOAK_WITHOUT_MEMORY
@@ -180,3 +182,5 @@ void soak(int frames)
 TEST_CASE("Framebuffers come and go on parts of the ranks, and leave nothing behind", "[soak]") { soak(800); }
 
 TEST_CASE("20,000 frames leave nothing behind", "[soak][.stress]") { soak(20000); }
+
+} // namespace soak_cases

@@ -38,11 +38,11 @@ function(_add_cli_case case)
     add_test(NAME render.cli.${case}.${start}
       COMMAND ${CMAKE_COMMAND} -DSETTINGS=${_settings} -DCASE=${case} -DSTART=${start}
         -P ${CMAKE_CURRENT_SOURCE_DIR}/render/cli_cases.cmake)
-    set(processors 2)
+    set(slots ${_busy_ranks})
     if(start STREQUAL "one" OR start STREQUAL "np1")
-      set(processors 1)
+      set(slots ${_busy})
     endif()
-    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180 PROCESSORS ${processors})
+    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180 PROCESSORS ${slots})
   endforeach()
 endfunction()
 

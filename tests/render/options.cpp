@@ -6,6 +6,8 @@
 #include <string>
 #include <vector>
 
+namespace options_cases {
+
 using namespace example;
 
 namespace {
@@ -237,3 +239,5 @@ TEST_CASE("The help says it all", "[options]")
     }
     CHECK(parse({"demo", "--size", "9x9", "--help"}).exitCode == 0);
 }
+
+} // namespace options_cases

@@ -17,6 +17,8 @@
 #include <string>
 #include <vector>
 
+namespace readers_cases {
+
 using namespace example;
 using test::errorOf;
 using test::isLineWith;
@@ -545,3 +547,5 @@ TEST_CASE("What is too small beside its place is left where it is", "[readers]")
                 CHECK((std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z)));
         }
 }
+
+} // namespace readers_cases

@@ -13,6 +13,8 @@
 #include <random>
 #include <vector>
 
+namespace active_pixels_cases {
+
 namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
@@ -154,3 +156,5 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
         CHECK(std::equal(colors.begin(), colors.begin() + 4 * narrow.pixels, expectedColors.begin()));
     }
 }
+
+} // namespace active_pixels_cases

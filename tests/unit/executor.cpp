@@ -17,6 +17,8 @@
 #include <thread>
 #include <vector>
 
+namespace executor_cases {
+
 namespace {
 
 template <class Executor, class... Arguments>
@@ -199,3 +201,5 @@ TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
     dfb::CallerExecutor caller;
     check(caller);
 }
+
+} // namespace executor_cases

@@ -18,6 +18,8 @@
 #include <utility>
 #include <vector>
 
+namespace tile_ops_cases {
+
 namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
@@ -418,3 +420,5 @@ TEST_CASE("What a single layer covers comes out the same whether it is taken as 
         }
     }
 }
+
+} // namespace tile_ops_cases

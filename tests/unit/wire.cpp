@@ -17,6 +17,8 @@
 #include <utility>
 #include <vector>
 
+namespace wire_cases {
+
 namespace {
 
 using dfb::detail::fragmentPrefix;
@@ -453,3 +455,5 @@ TEST_CASE("Compressed bytes that are no message are refused or decode to somethi
     prefixesAndFlips(&codec);
 }
 #endif
+
+} // namespace wire_cases

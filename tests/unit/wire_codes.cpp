@@ -12,6 +12,8 @@
 #include <random>
 #include <vector>
 
+namespace wire_codes_cases {
+
 namespace {
 
 using namespace dfb::detail; // NOLINT: all of it is looked at
@@ -293,3 +295,5 @@ TEST_CASE("A pixel out of range is seen wherever it is", "[wire_codes]")
             }
     CHECK(wrong == 0);
 }
+
+} // namespace wire_codes_cases

@@ -18,6 +18,8 @@
 #include <string>
 #include <vector>
 
+namespace wire_format_cases {
+
 namespace {
 
 using dfb::WireFormat;
@@ -382,3 +384,5 @@ TEST_CASE("Compression changes nothing, in any format", "[wire_format]")
             }
 }
 #endif
+
+} // namespace wire_format_cases
