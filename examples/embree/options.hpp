@@ -37,7 +37,7 @@ struct Options {
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
     int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
-    dfb::WireFormat wire = dfb::WireFormat::Float32, wireDepth = dfb::WireFormat::Float32;
+    dfb::WireFormat wire = dfb::WireFormat::Float32;
     double errorBudget = 0;     // 0: `wire`
     float minTransmittance = 0; // 0: off
     bool verify = false;
@@ -259,19 +259,15 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(how);
     app.add_option("--wire", options.wire,
                    "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
-                   "tiles stay float32; default float32")
+                   "tiles stay float32, as do depth and what --aux writes; default float32")
         ->transform(detail::choice({"float32", "float16", "unorm16", "unorm8"}))
         ->option_text("float32|float16|unorm16|unorm8")
         ->group(how);
     app.add_option("--error-budget", options.errorBudget,
-                   "Take the cheapest of these formats that is sure to change no pixel by more than this, before it is "
-                   "converted for output; default 0: --wire says")
+                   "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
+                   "this, before it is converted for output; default 0: --wire says")
         ->check(detail::number(0, 1))
         ->option_text("E")
-        ->group(how);
-    app.add_option("--wire-depth", options.wireDepth, "Format of the depth of tiles on their way; default float32")
-        ->transform(detail::choice({"float32", "float16"}))
-        ->option_text("float32|float16")
         ->group(how);
     app.add_option("--min-transmittance", options.minTransmittance,
                    "Leave out what is behind bricks that let less than this part of the light through; default 0")

@@ -67,7 +67,6 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.dither = o.dither;
     config.depth = !o.depth.empty();
     config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
-    config.wire.depth = o.wireDepth;
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
     config.sharedMemory = o.sharedMemory;
@@ -482,7 +481,7 @@ private:
                         stats.frames.back().mergeErrorBound);
         const FrameStats& last = stats.frames.back();
         if (last.wireErrorBound > 0)
-            std::printf("tiles travelled as %s: no pixel is off by more than %.3g\n", last.wireColor.c_str(),
+            std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n", last.wireColor.c_str(),
                         last.wireErrorBound);
         for (const std::string& path : files())
             std::printf("wrote %s\n", path.c_str());

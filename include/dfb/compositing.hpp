@@ -59,7 +59,6 @@ struct CompositeRow {
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
-    bool countTies = false;                // equal depths make a pixel undefined
     double minTransmittance = 0;           // what lets less through counts as opaque
     bool wantsDepth = true;                // else `depth` is empty
     bool wantsGaps = true;                 // else what no layer covers need not be cleared
@@ -77,7 +76,7 @@ struct CompositeRow {
         depth.resize(wantsDepth ? pixels : 0);
         aux.reset(pixels, wanted);
         reach.assign(wanted & farChannel ? pixels : 0, -std::numeric_limits<float>::infinity());
-        isUndefined.assign(wanted & farChannel || countTies ? pixels : 0, 0);
+        isUndefined.assign(wanted & farChannel ? pixels : 0, 0);
     }
 
     // Pixels [x, x + count): nothing yet.
@@ -343,19 +342,6 @@ inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vec
         order[k] = static_cast<int>(orders[k][3]);
 }
 
-// Marks pixels [begin, end), in which the layers have this order, where some have equal depths.
-inline void countTies(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                      const std::vector<int>& order)
-{
-    for (std::size_t i = 1; i < order.size(); ++i)
-        for (int p = begin; p < end; ++p) {
-            const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
-            if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
-                && depth < std::numeric_limits<float>::infinity())
-                row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
-        }
-}
-
 // Layers 0, 1, 2 and so on.
 inline void resetOrder(std::vector<int>& order, std::size_t count)
 {
@@ -380,7 +366,7 @@ inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vec
                              std::vector<int>& order)
 {
     const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(SortNetwork::mostLayers)
-                         && !layers.front().aux && row.rgbaLow.empty() && !row.countTies;
+                         && !layers.front().aux && row.rgbaLow.empty();
     // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
     for (int begin = 0; begin < count;) {
         int end = firstOutOfOrder(layers, order, begin, count);
@@ -394,8 +380,6 @@ inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vec
             sortAt(begin, layers, order);
             end = firstOutOfOrder(layers, order, begin + 1, count);
         }
-        if (row.countTies)
-            countTies(row, x, begin, end, layers, order);
         blend(row, x, begin, end, layers, order);
         begin = end;
     }
@@ -427,17 +411,9 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
     row.clear(x, count);
     for (int i = 0; i < count; ++i) {
         const Layer* nearest = nullptr;
-        bool isTie = false;
-        for (const Layer& layer : layers) {
-            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i])) {
+        for (const Layer& layer : layers)
+            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i]))
                 nearest = &layer;
-                isTie = false;
-            } else {
-                isTie = isTie || (layer.depth && layer.depth[i] == nearest->depth[i]);
-            }
-        }
-        if (row.countTies && isTie)
-            row.isUndefined[static_cast<std::size_t>(x + i)] = 1;
         const Layer l = nearest->from(i);
         if (l.aux)
             overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)));

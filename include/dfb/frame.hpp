@@ -47,7 +47,8 @@ struct FrameBufferConfig {
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
     CompressionMode compression = CompressionMode::Always;
-    // How exactly inputs travel: a WireFormat, an ErrorBudget, or all of it. Finished tiles travel in `format`.
+    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or all of it; what else they have travels as
+    // it is. Finished tiles travel in `format`.
     WirePrecision wire{};
     // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
     // left out. That changes it by no more than this times the largest colour.
@@ -141,7 +142,9 @@ struct FrameReport {
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained
-    double wireErrorBound = 0; // all: how far a pixel may be off for WirePrecision and minTransmittance, from what came
+    // All: how far colour and alpha of a pixel may be off for WirePrecision and minTransmittance, from what came. Neither
+    // changes depth, positions and ids.
+    double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key

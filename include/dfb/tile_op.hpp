@@ -49,7 +49,6 @@ struct TileInfo {
     int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
     std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
     float minTransmittance = 0;                  // what lets less through counts as opaque
-    bool depthIsRounded = false;                 // equal depths need not have been equal
     ChannelMask wanted = 0;                      // what the image has beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
 };
@@ -205,9 +204,7 @@ private:
 // What a TileOp says of a tile that it has finished, if it has a member report().
 struct TileReport {
     double error = -1; // how far the tile's pixels may be off, in units of colour; < 0: not known
-    // Whose inputs overlap in depth, so that no order of them is right, or have equal depths that were rounded, so that
-    // it is not known.
-    std::int64_t orderUndefinedPixels = 0;
+    std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
 };
 
 struct NoFrameData {};

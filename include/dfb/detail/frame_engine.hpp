@@ -927,11 +927,9 @@ private:
     void checkWire() const
     {
         const WirePrecision& w = config_.wire;
-        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f) || !(w.depthFar > w.depthNear)
-            || !(w.depthFar - w.depthNear < std::numeric_limits<float>::infinity()))
+        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
             throw InvalidArgument("an error budget of " + std::to_string(w.budget) + ", colours up to "
-                                  + std::to_string(w.maxColor) + ", depths from " + std::to_string(w.depthNear) + " to "
-                                  + std::to_string(w.depthFar));
+                                  + std::to_string(w.maxColor));
         if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
             throw InvalidArgument("a least transmittance of " + std::to_string(config_.minTransmittance));
     }

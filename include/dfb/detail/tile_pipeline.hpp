@@ -84,7 +84,6 @@ public:
         reports_ = {};
         gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
-        info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
         background_ = info.background;
         backgroundIsFine_ = true;
         table_.newFrame(info, plan);

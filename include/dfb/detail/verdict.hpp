@@ -304,8 +304,7 @@ struct Agreement {
                     + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
                     + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
                     + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
-                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", wire depth "
-                    + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar)
+                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor)
                     + ", least transmittance " + text(c.minTransmittance) + ", checksums " + text(c.checksums)
                     + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
                     + text(c.dither) + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation

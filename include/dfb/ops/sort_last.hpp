@@ -138,12 +138,12 @@ public:
         Scratch& scratch = start();
         const std::size_t passes = static_cast<std::size_t>(info_.passes);
         const int width = info_.region.width();
-        const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
+        const bool tracksOrder = (tracked_ & farChannel) != 0;
         scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
         for (int y = 0; y < info_.region.height(); ++y) {
             std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
             for (std::size_t pass = 0; pass < passes; ++pass) {
-                if (tracked_ != 0 || scratch.row.countTies) // of colour and depth nothing stays from the last row
+                if (tracked_ != 0) // of colour and depth nothing stays from the last row
                     scratch.row.resize(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
                 overBackground(scratch.row, 0, width, info_.background.data());
@@ -161,7 +161,7 @@ public:
     {
         static thread_local PixelSums sums;
         const int last = info_.passes - 1;
-        if (last == 0 && tracked_ == 0 && !out.isDithered() && !(info_.depthIsRounded && Rule != BlendRule::InOrder)) {
+        if (last == 0 && tracked_ == 0 && !out.isDithered()) {
             finishRuns(out);
             return;
         }
@@ -221,7 +221,6 @@ private:
         }
         scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
         scratch.row.wantsGaps = scratch.row.wantsSingles = true;
-        scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
         scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
         scratch.row.resize(info_.region.width(), tracked_);
         return scratch;
