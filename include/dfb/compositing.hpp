@@ -154,9 +154,11 @@ inline bool closeOpaque(CompositeRow& row, int x, int count)
 }
 
 // The same for the auxiliary channels that `row` has; to be called before over(), of which it needs what was there
-// before. `aux`: of the first pixel.
-inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux)
+// before. `aux`: of the first pixel. `anyAlpha`: pixels with alpha 0 have position and ids as well.
+inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux,
+                    bool anyAlpha = false)
 {
+    const auto counts = [&](int i) { return anyAlpha || layer.color[4 * i + 3] > 0.0f; };
     const auto first = static_cast<std::size_t>(x);
     const auto blend = [&](std::vector<double>& to, const std::byte* plane) {
         if (to.empty() || !plane)
@@ -168,9 +170,8 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     };
     blend(row.aux.normal, aux.at[detail::Normal]);
     blend(row.aux.albedo, aux.at[detail::Albedo]);
-    const auto isNearest = [&](int i) { // of those whose alpha counts
-        return layer.color[4 * i + 3] > 0.0f && layer.depth
-               && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
+    const auto isNearest = [&](int i) {
+        return counts(i) && layer.depth && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
     };
     if (!row.aux.position.empty() && aux.at[detail::Position]) {
         const float* from = detail::floatsOf(aux.at[detail::Position]);
@@ -184,7 +185,7 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
         const std::uint32_t* from = detail::idsOf(plane);
         for (int i = 0; i < count; ++i) {
             NearestId& id = to[first + static_cast<std::size_t>(i)];
-            if (id.id == noId && from[i] != noId && layer.color[4 * i + 3] > 0.0f)
+            if (id.id == noId && from[i] != noId && counts(i))
                 id = {from[i], layer.depth ? layer.depth[i] : 0.0f};
         }
     };
@@ -405,7 +406,8 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
 }
 
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there.
+// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids: something is
+// there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     row.clear(x, count);
@@ -416,8 +418,10 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
                 nearest = &layer;
         const Layer l = nearest->from(i);
         if (l.aux)
-            overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)));
+            overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)), true);
         over(row, x + i, 1, l);
+        if (row.wantsDepth && l.depth)
+            row.depth[static_cast<std::size_t>(x + i)] = *l.depth;
     }
 }
 

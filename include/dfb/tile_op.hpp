@@ -14,6 +14,10 @@
 //   static constexpr ChannelMask neededChannels; what must travel even if the output does not have it;
 //                                                default: all of `channels`
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
+//   static constexpr bool activeByDepth = true;  a pixel of an input is there if it has a depth below +infinity,
+//                                                whatever its colour; depth must be among neededChannels. Else it is
+//                                                there if one of its four colour channels is not 0, whatever its
+//                                                depth. Only what is there travels and comes to add()
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
 //   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
@@ -203,7 +207,7 @@ private:
 
 // What a TileOp says of a tile that it has finished, if it has a member report().
 struct TileReport {
-    double error = -1; // how far the tile's pixels may be off, in units of colour; < 0: not known
+    double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
     std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
 };
 
@@ -276,6 +280,13 @@ struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<
 };
 
 template <class T, class = void>
+struct ActiveByDepth : std::false_type {
+};
+template <class T>
+struct ActiveByDepth<T, std::void_t<decltype(T::activeByDepth)>> : std::bool_constant<T::activeByDepth> {
+};
+
+template <class T, class = void>
 struct EmptyIsBackground : std::false_type {
 };
 template <class T>
@@ -333,6 +344,9 @@ constexpr bool checkTileOp()
                   "or void newFrame(const TileInfo&, const FrameData&)");
     static_assert(HasAdd<T>::value, "dfb: TileOp must provide void add(Fragment&&)");
     static_assert(HasFinish<T>::value, "dfb: TileOp must provide void finish(FinishedTile&)");
+    if constexpr (ActiveByDepth<T>::value)
+        static_assert((T::channels & NeededChannelsOf<T>::value & depthChannel) != 0,
+                      "dfb: a TileOp with activeByDepth must have depthChannel in channels and neededChannels");
     return is_tile_op_v<T>;
 }
 

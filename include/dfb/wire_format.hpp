@@ -2,9 +2,9 @@
 // that keeps an error budget.
 //
 // Which channels are rounded: colour and alpha, and the bound is for these. All others travel as they are. Depth,
-// positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0 counts
-// for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with their
-// rounded alphas, so that the mean is off by what the weights are off.
+// positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0
+// counts for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with
+// their rounded alphas, so that the mean is off by what the weights are off.
 //
 // The bound. A pixel is C = sum_j T_j c_j, with T_j the product of 1 - a_i over the layers i in front of j, the last
 // layer being the background. Rounded, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones one
@@ -60,7 +60,7 @@ struct WirePrecision {
     }
 
     WireFormat color = WireFormat::Float32; // and alpha
-    double budget = 0; // above 0: in place of `color`
+    double budget = 0;                      // above 0: in place of `color`
     // Colours that occur, as a renderer would give them before it multiplies by alpha: each channel is within
     // [0, maxColor * alpha]. A tile of which that is not true, such as emission or HDR, travels as Float32.
     float maxColor = 1;
@@ -73,14 +73,18 @@ inline std::size_t bytesOf(WireFormat format) noexcept
     return format == WireFormat::Float32 ? 4 : format == WireFormat::Unorm8 ? 1 : 2;
 }
 
-// Converts the colours of one framebuffer's fragments.
+// What all fragments of a framebuffer have in common: which pixels they have, and how their colours are converted.
 class WireCoder {
 public:
     WireCoder() = default;
-    explicit WireCoder(const WirePrecision& precision)
-        : maxColor_(precision.maxColor), scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
+    // `activeByDepth`: of the tile operation.
+    explicit WireCoder(const WirePrecision& precision, bool activeByDepth = false)
+        : activeByDepth_(activeByDepth), maxColor_(precision.maxColor),
+          scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
     {
     }
+
+    bool activeByDepth() const noexcept { return activeByDepth_; }
 
     // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept
@@ -103,14 +107,15 @@ public:
         case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
         }
     }
-    // An alpha of 0 becomes leastAlpha: it was above 0, as pixels of alpha 0 that are in range have no colour, and those
-    // do not travel. False if there is a code that encodeColor() does not make.
+    // An alpha of 0 becomes leastAlpha: it was above 0, as pixels of alpha 0 that are in range have no colour, and
+    // those do not travel; by depth they do, and stay as they are. False if there is a code that encodeColor() does not
+    // make.
     bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
     {
         const auto decode = [&](auto code, float colorScale, float alphaScale) {
             using Code = decltype(code);
             const auto pixels = static_cast<int>(count);
-            const WireScales by{colorScale, alphaScale, leastAlpha};
+            const WireScales by{colorScale, alphaScale, activeByDepth_ ? 0.0f : leastAlpha};
             return cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba)
                                 : decodePixels<Code>(in, pixels, by, rgba);
         };
@@ -127,6 +132,7 @@ public:
     static constexpr float leastAlpha = 0x1p-100f;
 
 private:
+    bool activeByDepth_ = false;
     float maxColor_ = 1;
     float scale_ = 0x1p14f; // Float16: a power of two that brings maxColor to [2^14, 2^15]
 };

@@ -147,7 +147,8 @@ inline std::uint64_t hashAux(const dfb::Image& image)
     const std::size_t n = image.pixelCount();
     return dfb::testing::hashOf(image.rgba32f(), 16 * n) ^ 3 * dfb::testing::hashOf(image.normal(), 12 * n)
            ^ 5 * dfb::testing::hashOf(image.albedo(), 12 * n) ^ 7 * dfb::testing::hashOf(image.position(), 12 * n)
-           ^ 9 * dfb::testing::hashOf(image.primitiveId(), 4 * n) ^ 11 * dfb::testing::hashOf(image.instanceId(), 4 * n);
+           ^ 9 * dfb::testing::hashOf(image.primitiveId(), 4 * n)
+           ^ 11 * dfb::testing::hashOf(image.instanceId(), 4 * n);
 }
 
 struct AuxChannels {
@@ -237,15 +238,11 @@ struct Nearest {
             for (int x = 0; x < s.width; ++x) {
                 std::vector<dfb::testing::Pixel> passes;
                 for (int pass = 0; pass < s.passes; ++pass) {
-                    std::vector<dfb::testing::Sample> nearest;
+                    std::vector<dfb::testing::Sample> samples;
                     for (const dfb::Brick& brick : s.bricks)
-                        if (const auto sample = sampleOf(s, brick, pass, x, y)) {
-                            const bool seen = std::any_of(sample->rgba.begin(), sample->rgba.end(),
-                                                          [](float v) { return v != 0.0f; });
-                            if (seen && (nearest.empty() || sample->depth < nearest[0].depth))
-                                nearest = {*sample};
-                        }
-                    passes.push_back(dfb::testing::composite(nearest, s.background));
+                        if (const auto sample = sampleOf(s, brick, pass, x, y))
+                            samples.push_back(*sample);
+                    passes.push_back(dfb::testing::nearest(samples, s.background));
                 }
                 expected.push_back(dfb::testing::mean(passes));
             }
@@ -257,10 +254,150 @@ struct Nearest {
     }
 };
 
+// ---- what has a depth is there, whatever its colour -------------------------------------------------------------
+
+// A surface of black pixels, some of alpha 0, with the ids 0 and none, before a white one. It covers all of some tiles,
+// all alike or not, and spans or single pixels of others; where it is not, it has the colour of a cleared image.
+struct BlackInFront {
+    static constexpr int width = 90, height = 40;
+    static constexpr std::uint32_t front = 20, back = 30;
+    using Op = dfb::BasicDepthComposite<16, dfb::allChannels & ~dfb::farChannel>;
+
+    struct Pixel {
+        std::array<float, 4> rgba{};
+        float depth = std::numeric_limits<float>::infinity();
+        std::array<float, 3> normal{}, position{};
+        std::uint32_t primitive = dfb::noId, instance = dfb::noId;
+    };
+
+    static Pixel pixelOf(std::uint32_t brick, int x, int y)
+    {
+        Pixel p;
+        const bool alike = y / 16 % 2 == 0;
+        if (brick == back) {
+            if (x % 5 != 4)
+                p = {{1, 1, 1, 1}, 2, {0, 0, 1}, {2, 0, 0}, 7, 8};
+            return p;
+        }
+        const bool covers[] = {false, true, x % 7 < 3, (x + y) % 2 == 0, true, x % 16 > 1};
+        if (!covers[x / 16]) {
+            p.rgba = {0.5f, 0.5f, 0.5f, 1};
+            return p;
+        }
+        p.rgba[3] = alike || y % 3 == 0 ? 0.0f : 1.0f;
+        p.depth = 1;
+        p.normal[0] = p.rgba[3];
+        p.position = {1, alike ? 0.0f : static_cast<float>(x), 0};
+        p.primitive = 0;
+        return p;
+    }
+
+    // Of a brick, each as large as the image.
+    struct Planes {
+        std::vector<float> color, depth, normal, albedo, position;
+        std::vector<std::uint32_t> primitive, instance;
+
+        explicit Planes(std::uint32_t brick)
+        {
+            for (int y = 0; y < height; ++y)
+                for (int x = 0; x < width; ++x) {
+                    const Pixel p = pixelOf(brick, x, y);
+                    color.insert(color.end(), p.rgba.begin(), p.rgba.end());
+                    depth.push_back(p.depth);
+                    normal.insert(normal.end(), p.normal.begin(), p.normal.end());
+                    position.insert(position.end(), p.position.begin(), p.position.end());
+                    primitive.push_back(p.primitive);
+                    instance.push_back(p.instance);
+                }
+            albedo.resize(normal.size());
+        }
+    };
+
+    static std::size_t wrongValues(const dfb::Image& image, const std::array<float, 4>& background)
+    {
+        std::size_t wrong = 0;
+        for (int y = 0; y < height; ++y)
+            for (int x = 0; x < width; ++x) {
+                Pixel p = pixelOf(front, x, y);
+                if (!std::isfinite(p.depth))
+                    p = pixelOf(back, x, y);
+                const auto i = static_cast<std::size_t>(y * width + x);
+                for (std::size_t c = 0; c < 4; ++c)
+                    wrong += image.rgba32f()[4 * i + c] != p.rgba[c] + (1 - p.rgba[3]) * background[c];
+                wrong += image.depth()[i] != p.depth;
+                for (std::size_t c = 0; c < 3; ++c) {
+                    wrong += image.normal()[3 * i + c] != p.normal[c];
+                    wrong += image.position()[3 * i + c] != p.position[c];
+                }
+                wrong += image.primitiveId()[i] != p.primitive;
+                wrong += image.instanceId()[i] != p.instance;
+            }
+        return wrong;
+    }
+
+    template <class TileOp, class Transport, class RenderBrick>
+    static void frame(const std::shared_ptr<dfb::Messenger<Transport>>& messenger, dfb::WireFormat format,
+                      const RenderBrick& renderBrick, Result& result)
+    {
+        scene::Scene s;
+        s.width = width, s.height = height;
+        for (const std::uint32_t id : {front, back})
+            s.bricks.push_back({id, {{0, 0, 0}, {width, height, 1}}});
+        auto config = configOf(s, 1);
+        config.wire = format;
+        config.aux = dfb::imageAuxChannels;
+        dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(messenger, config);
+        dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(), renderBrick,
+                                paramsOf(s));
+        if (!fb.isDisplayRank())
+            return;
+        const std::size_t wrong = wrongValues(fb.image(), s.background);
+        result.expect(wrong == 0, std::string(nameOf(format)) + ": " + std::to_string(wrong) + " values");
+        result.hash = result.hash * 31 + hashAux(fb.image());
+    }
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto render = [](const dfb::Brick& b, auto& tile) {
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                const Pixel p = pixelOf(b.id, x, y);
+                const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
+                std::copy(p.rgba.begin(), p.rgba.end(), rgba);
+                depth = p.depth;
+                std::copy(p.normal.begin(), p.normal.end(), tile.normal + 3 * i);
+                std::copy(p.position.begin(), p.position.end(), tile.position + 3 * i);
+                tile.primitiveId[i] = p.primitive;
+                tile.instanceId[i] = p.instance;
+            });
+        };
+        const Planes planes[] = {Planes(front), Planes(back)};
+        const auto find = dfb::inPlace([&](const dfb::Brick& b, auto& view) {
+            const Planes& from = planes[b.id == back];
+            const auto at = static_cast<std::size_t>(view.region.y0 * width + view.region.x0);
+            view.stride = width;
+            view.color = &from.color[4 * at], view.depth = &from.depth[at];
+            view.normal = &from.normal[3 * at], view.albedo = &from.albedo[3 * at];
+            view.position = &from.position[3 * at];
+            view.primitiveId = &from.primitive[at], view.instanceId = &from.instance[at];
+        });
+        for (const auto format :
+             {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
+            frame<Op>(messenger, format, render, result);
+            frame<Op>(messenger, format, find, result);
+            frame<dfb::Progressive<Op>>(messenger, format, render, result);
+        }
+        return result;
+    }
+};
+
 // In compositing.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<AuxChannels>(int);
 extern template Result inProcess<AuxImageParallel>(int);
 extern template Result inProcess<Nearest>(int);
+extern template Result inProcess<BlackInFront>(int);
 
 } // namespace algorithms
 
@@ -278,5 +415,10 @@ TEST_CASE("Auxiliary channels come out by their rules, image-parallel, and pixel
 TEST_CASE("DepthComposite keeps the nearest input of each pixel", "[compositing]")
 {
     everywhere<algorithms::Nearest>();
+}
+
+TEST_CASE("DepthComposite takes what has a depth, black or without an id as well", "[compositing]")
+{
+    everywhere<algorithms::BlackInFront>();
 }
 #endif

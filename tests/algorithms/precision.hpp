@@ -111,8 +111,8 @@ struct OtherChannels {
         const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
         std::vector<float> depth, position;
         std::vector<std::uint32_t> ids;
-        for (const auto format : {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16,
-                                  dfb::WireFormat::Unorm8}) {
+        for (const auto format :
+             {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
             auto config = configOf(s, 1);
             config.wire = format;
             config.aux = dfb::imageAuxChannels;

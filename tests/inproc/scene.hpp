@@ -228,9 +228,9 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             std::vector<dfb::testing::Pixel> passes;
             for (int pass = 0; pass < s.passes; ++pass) {
                 std::vector<dfb::testing::Sample> samples;
-                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing
+                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing, unless it has a depth
                     if (const auto sample = sampleOf(s, brick, pass, x, y);
-                        sample && sample->rgba != std::array<float, 4>{})
+                        sample && (s.rule == dfb::BlendRule::Nearest || sample->rgba != std::array<float, 4>{}))
                         samples.push_back(*sample);
                 passes.push_back(
                     s.rule == dfb::BlendRule::SortByDepth ? dfb::testing::composite(std::move(samples), s.background)

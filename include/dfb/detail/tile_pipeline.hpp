@@ -46,7 +46,7 @@ public:
                config.dither},
               rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
-          coder_(config.wire)
+          coder_(config.wire, ActiveByDepth<TileOp>::value)
     {
     }
 

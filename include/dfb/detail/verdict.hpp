@@ -304,11 +304,10 @@ struct Agreement {
                     + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
                     + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
                     + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
-                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor)
-                    + ", least transmittance " + text(c.minTransmittance) + ", checksums " + text(c.checksums)
-                    + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
-                    + text(c.dither) + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation
-                    + typeid(PixelOp).name(),
+                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", least transmittance "
+                    + text(c.minTransmittance) + ", checksums " + text(c.checksums) + ", message pool "
+                    + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither " + text(c.dither)
+                    + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation + typeid(PixelOp).name(),
                 rank};
     }
 

@@ -153,7 +153,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         pool.acquire(color == WireFormat::Float32 ? largestFragment(width, height, channels) : fragmentPrefix);
     wide.resize(std::max(wide.size(), color == WireFormat::Float32 ? 0 : 4 * pixelCount));
     float* rgba = color == WireFormat::Float32 ? floatsOf(message.data() + fragmentPrefix) : wide.data();
-    active.gather(tile, channels, rgba);
+    active.gather(tile, channels, coder.activeByDepth(), rgba);
     const auto planeOf = [&](std::size_t c) {
         return c == Color ? reinterpret_cast<const std::byte*>(rgba) : active.plane(c);
     };
@@ -189,6 +189,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     h.colorFormat = color != WireFormat::Float32 && coder.inRange(rgba, count) ? color : WireFormat::Float32;
     const std::size_t payload = tableBytes + planesBytes(h, stored);
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
+    faults.nonFinite += active.nanDepths();
     if (active.mayBeFaulty())
         active.forEachSpan(tile, [&](std::size_t first, int spanPixels) {
             const ConstPlanes planes = tile.planes();

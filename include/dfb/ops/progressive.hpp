@@ -29,6 +29,7 @@ public:
     static constexpr int tileSize = detail::TileSizeOf<Base>::value;
     static constexpr ChannelMask channels = Base::channels;
     static constexpr ChannelMask neededChannels = detail::NeededChannelsOf<Base>::value;
+    static constexpr bool activeByDepth = detail::ActiveByDepth<Base>::value;
     static constexpr bool keepsState = true;
 
     void newFrame(const TileInfo& info)

@@ -312,6 +312,7 @@ public:
     static constexpr ChannelMask channels = Channels;
     static constexpr BlendRule rule = Rule;
     static constexpr bool emptyIsBackground = true;
+    static constexpr bool activeByDepth = Rule == BlendRule::Nearest;
 
     void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
     void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
@@ -402,8 +403,10 @@ private:
     int opaque_ = none;            // the first that is
 };
 
-// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry; what is behind it is not
-// blended, whatever its alpha. Accepts any tree.
+// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry: what has a depth below
+// +infinity is there, also if it is black or its alpha 0, and what has not is not, whatever its colour. Inputs behind
+// the nearest are not blended, whatever its alpha; it is laid over the background by that. Depth, position and ids are
+// those of the nearest. Accepts any tree.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");

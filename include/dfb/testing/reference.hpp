@@ -32,7 +32,7 @@ struct Sample {
 
 struct Pixel {
     std::array<Exact, 4> rgba{};
-    float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0
+    float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0, or of nearest()
 };
 
 using Color = std::array<float, 4>;
@@ -70,12 +70,15 @@ inline Pixel composite(std::vector<Sample> samples, const Color& background)
     return compositeInOrder(samples, background);
 }
 
-// DepthComposite: the first of these alone.
+// DepthComposite: the first of these alone, if it has a depth, whatever its alpha.
 inline Pixel nearest(const std::vector<Sample>& samples, const Color& background)
 {
-    if (samples.empty())
+    const auto first = std::min_element(samples.begin(), samples.end(), isInFront);
+    if (first == samples.end() || comparable(first->depth) == std::numeric_limits<float>::infinity())
         return compositeInOrder({}, background);
-    return compositeInOrder({*std::min_element(samples.begin(), samples.end(), isInFront)}, background);
+    Pixel result = compositeInOrder({*first}, background);
+    result.depth = first->depth;
+    return result;
 }
 
 // The mean of passes that were composited each by itself; the nearest of their depths.

@@ -47,6 +47,7 @@ public:
     static constexpr int tileSize = Base::tileSize;
     static constexpr ChannelMask channels = Base::channels;
     static constexpr ChannelMask neededChannels = Base::neededChannels;
+    static constexpr bool activeByDepth = Base::activeByDepth;
     using FrameData = Verification*; // null: nothing is checked
 
     void newFrame(const TileInfo& info, Verification* verification)
