@@ -275,7 +275,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("T")
         ->group(how);
     app.add_flag("--verify", options.verify,
-                 "Check each finished tile against an exact reference of what it was made of; slow")
+                 "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
+                 "was made of; slow")
         ->group(how);
     app.add_option("--owner-map", options.ownerMap, "Which rank owns which tile; default lattice")
         ->transform(detail::choice({"lattice", "linear", "hash"}))

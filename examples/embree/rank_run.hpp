@@ -397,8 +397,10 @@ private:
         totalNs = fb_->allReduce(totalNs, Reduce::Max);
         const auto rendered = renderedByAll();
         const dfb::testing::ErrorReport checked = verification_.report();
-        const auto verified = fb_->allReduce(
-            {checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes}, Reduce::Sum);
+        const auto verified =
+            fb_->allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
+                            checked.others, checked.wrongOthers},
+                           Reduce::Sum);
         if (hasWall && !o_.output.empty() && !onAllRanks([&] { writeDisplays(); }))
             return false;
         return onAllRanks([&] {
@@ -410,6 +412,9 @@ private:
             if (o_.verify)
                 std::printf("%lld of %lld values are not the exact result rounded\n",
                             static_cast<long long>(verified[0] - verified[1]), static_cast<long long>(verified[0]));
+            if (o_.verify && verified[2] > 0)
+                std::printf("%lld of %lld values of depth and auxiliary channels are wrong\n",
+                            static_cast<long long>(verified[3]), static_cast<long long>(verified[2]));
         });
     }
 

@@ -21,11 +21,17 @@ inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 f
 inline constexpr ChannelMask depthChannel = 2;
 // Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they
 // come out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
+//
+// Position and ids are those of the front input: of the inputs with alpha > 0 the first in the order in which they are
+// blended, be that by (depth, source, part) or the order that OrderedBlend is told; an id is that of the first that has
+// one. Of several passes the one counts where that input is nearest, of equally near ones, or where inputs have no
+// depth, the first. For that depth travels if the image has one of these channels, even if it has no depth; with a
+// single pass, and an operation that needs none for itself, it does not.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
-inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the input that gives the depth
-inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the nearest input with alpha > 0 that has one
+inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the front input; else 0
+inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the front input that has one; else noId
 inline constexpr ChannelMask instanceIdChannel = 64;  // the same
 // How far back the input reaches, 1 float in the units of depth: the interval [depth, far] holds all that was blended
 // into the pixel. It is compared, never blended and no part of an image.
@@ -43,6 +49,8 @@ namespace detail {
 
 inline constexpr int channelCount = 8;
 inline constexpr int channelWords[channelCount] = {4, 1, 3, 3, 3, 1, 1, 1}; // of 4 bytes
+inline constexpr const char* channelNames[channelCount] = {"colour",   "depth",        "normal",      "albedo",
+                                                           "position", "primitive id", "instance id", "far depth"};
 enum Channel : std::size_t { Color, Depth, Normal, Albedo, Position, PrimitiveId, InstanceId, Far };
 
 constexpr bool hasChannel(ChannelMask channels, std::size_t channel) noexcept { return (channels >> channel) & 1; }

@@ -23,18 +23,28 @@
 
 namespace dfb {
 
-// An id, and the depth of the layer that it comes from.
-struct NearestId {
+// An id, and the depth of the layer that it comes from; 0 where layers have none.
+struct FrontId {
     std::uint32_t id = noId;
-    float depth = std::numeric_limits<float>::infinity();
+    float depth = 0;
+
+    bool isThere() const noexcept { return id != noId; }
+};
+
+// The same for a position. No depth of a layer is NaN.
+struct FrontPosition {
+    float at[3] = {0, 0, 0};
+    float depth = std::numeric_limits<float>::quiet_NaN();
+
+    bool isThere() const noexcept { return depth == depth; }
 };
 
 // The auxiliary channels of a row of pixels, or of a tile's pixels; of each only if it is wanted. See channels.hpp.
 struct AuxPixels {
     std::vector<double> normal, albedo; // 3 a pixel, premultiplied
     std::vector<double> weight;         // of those two: the alpha without the background
-    std::vector<float> position;        // 3 a pixel
-    std::vector<NearestId> primitiveId, instanceId;
+    std::vector<FrontPosition> position;
+    std::vector<FrontId> primitiveId, instanceId;
 
     void reset(std::size_t pixels, ChannelMask wanted)
     {
@@ -42,7 +52,7 @@ struct AuxPixels {
         normal.assign(count(normalChannel, 3), 0.0);
         albedo.assign(count(albedoChannel, 3), 0.0);
         weight.assign(count(normalChannel | albedoChannel, 1), 0.0);
-        position.assign(count(positionChannel, 3), 0.0f);
+        position.assign(count(positionChannel, 1), {});
         primitiveId.assign(count(primitiveIdChannel, 1), {});
         instanceId.assign(count(instanceIdChannel, 1), {});
     }
@@ -170,27 +180,25 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     };
     blend(row.aux.normal, aux.at[detail::Normal]);
     blend(row.aux.albedo, aux.at[detail::Albedo]);
-    const auto isNearest = [&](int i) {
-        return counts(i) && layer.depth && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
-    };
+    const auto depthOf = [&](int i) { return layer.depth ? layer.depth[i] : 0.0f; };
     if (!row.aux.position.empty() && aux.at[detail::Position]) {
         const float* from = detail::floatsOf(aux.at[detail::Position]);
+        FrontPosition* to = row.aux.position.data() + first;
         for (int i = 0; i < count; ++i)
-            if (isNearest(i))
-                std::copy_n(from + 3 * i, 3, row.aux.position.data() + 3 * (first + static_cast<std::size_t>(i)));
+            if (!to[i].isThere() && counts(i))
+                to[i] = {{from[3 * i], from[3 * i + 1], from[3 * i + 2]}, depthOf(i)};
     }
-    const auto takeId = [&](std::vector<NearestId>& to, const std::byte* plane) {
-        if (to.empty() || !plane)
+    const auto takeIds = [&](std::vector<FrontId>& ids, const std::byte* plane) {
+        if (ids.empty() || !plane)
             return;
         const std::uint32_t* from = detail::idsOf(plane);
-        for (int i = 0; i < count; ++i) {
-            NearestId& id = to[first + static_cast<std::size_t>(i)];
-            if (id.id == noId && from[i] != noId && counts(i))
-                id = {from[i], layer.depth ? layer.depth[i] : 0.0f};
-        }
+        FrontId* to = ids.data() + first;
+        for (int i = 0; i < count; ++i)
+            if (!to[i].isThere() && from[i] != noId && counts(i))
+                to[i] = {from[i], depthOf(i)};
     };
-    takeId(row.aux.primitiveId, aux.at[detail::PrimitiveId]);
-    takeId(row.aux.instanceId, aux.at[detail::InstanceId]);
+    takeIds(row.aux.primitiveId, aux.at[detail::PrimitiveId]);
+    takeIds(row.aux.instanceId, aux.at[detail::InstanceId]);
     if (row.reach.empty() || !aux.at[detail::Far] || !layer.depth)
         return;
     const float* farDepth = detail::floatsOf(aux.at[detail::Far]);

@@ -12,7 +12,8 @@
 // Optional:
 //   static constexpr int tileSize;               pixels a side, 8 to 256; default 64
 //   static constexpr ChannelMask neededChannels; what must travel even if the output does not have it;
-//                                                default: all of `channels`
+//                                                default: all of `channels`. Depth travels as well where positions
+//                                                or ids of several passes are compared, see channels.hpp
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
 //   static constexpr bool activeByDepth = true;  a pixel of an input is there if it has a depth below +infinity,
 //                                                whatever its colour; depth must be among neededChannels. Else it is
@@ -156,10 +157,14 @@ public:
     std::int64_t writtenPixels() const noexcept { return writtenPixels_; }
 
     // What setRow() has made of a row; null if the colour is not wanted.
-    const std::byte* colorRow(int y) const noexcept
+    const std::byte* colorRow(int y) const noexcept { return rowOf(detail::Color, bytesPerPixel(format_), y); }
+    // The same of depth, and of the auxiliary channels.
+    const float* depthRow(int y) const noexcept { return detail::floatsOf(rowOf(detail::Depth, y)); }
+    AuxRow auxRow(int y) const noexcept
     {
-        const std::byte* first = to_.at[detail::Color];
-        return first ? first + static_cast<std::size_t>(y) * stride_ * bytesPerPixel(format_) : nullptr;
+        return {detail::floatsOf(rowOf(detail::Normal, y)), detail::floatsOf(rowOf(detail::Albedo, y)),
+                detail::floatsOf(rowOf(detail::Position, y)), detail::idsOf(rowOf(detail::PrimitiveId, y)),
+                detail::idsOf(rowOf(detail::InstanceId, y))};
     }
 
     // For 8-bit formats, after setRow(): another level for value i in [0, 4 * width()) of row y.
@@ -170,6 +175,16 @@ public:
     }
 
 private:
+    const std::byte* rowOf(std::size_t channel, std::size_t pixelBytes, int y) const noexcept
+    {
+        const std::byte* first = to_.at[channel];
+        return first ? first + static_cast<std::size_t>(y) * stride_ * pixelBytes : nullptr;
+    }
+    const std::byte* rowOf(std::size_t channel, int y) const noexcept
+    {
+        return rowOf(channel, 4 * static_cast<std::size_t>(detail::channelWords[channel]), y);
+    }
+
     std::size_t pixelAt(int x, int y) const
     {
         return static_cast<std::size_t>(y) * stride_ + static_cast<std::size_t>(x);

@@ -17,18 +17,13 @@ using dfb::testing::Exact;
 
 // ---- auxiliary channels ----------------------------------------------------------------------------------------
 
-struct AuxSample {
-    std::array<float, 3> normal{}, albedo{}, position{};
-    std::uint32_t primitive = dfb::noId, instance = dfb::noId;
-};
-
 // What a sample of the scene has beside colour and depth.
-inline AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
+inline dfb::testing::AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
 {
     const std::uint64_t h = scene::mix(scene::mix(s.seed * 77 + sample.source) + static_cast<std::uint64_t>(pass) * 7919
                                        + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
     const auto part = [h](int shift) { return static_cast<float>((h >> shift) & 0xff) / 128.0f - 1.0f; };
-    AuxSample a;
+    dfb::testing::AuxSample a;
     for (std::size_t c = 0; c < 3; ++c) {
         const int shift = static_cast<int>(8 * c);
         a.normal[c] = sample.rgba[3] * part(shift);
@@ -36,66 +31,9 @@ inline AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample
         a.position[c] = 10.0f * part(shift + 8);
     }
     if (h % 3 != 0) // a volume has none
-        a.primitive = static_cast<std::uint32_t>(h >> 40);
-    a.instance = sample.source;
+        a.primitiveId = static_cast<std::uint32_t>(h >> 40);
+    a.instanceId = sample.source;
     return a;
-}
-
-struct AuxPixel {
-    std::array<Exact, 3> normal{}, albedo{};
-    Exact weight = 0;
-    float depth = std::numeric_limits<float>::infinity();
-    std::array<float, 3> position{};
-    std::uint32_t primitive = dfb::noId, instance = dfb::noId;
-};
-
-// Pixel by pixel, by the rules of channels.hpp.
-inline AuxPixel auxReference(const scene::Scene& s, int x, int y)
-{
-    AuxPixel p;
-    float primitiveDepth = 0, instanceDepth = 0;
-    for (int pass = 0; pass < s.passes; ++pass) {
-        std::vector<dfb::testing::Sample> samples;
-        for (const dfb::Brick& brick : s.bricks)
-            if (const auto sample = sampleOf(s, brick, pass, x, y))
-                samples.push_back(*sample);
-        std::sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
-            return std::tie(a.depth, a.source) < std::tie(b.depth, b.source);
-        });
-        Exact through = 1;
-        bool hasPrimitive = false, hasInstance = false;
-        for (const auto& sample : samples) {
-            const AuxSample a = auxOf(s, sample, pass, x, y);
-            const float alpha = sample.rgba[3];
-            for (std::size_t c = 0; c < 3; ++c) {
-                p.normal[c] += through * static_cast<Exact>(a.normal[c]);
-                p.albedo[c] += through * static_cast<Exact>(a.albedo[c]);
-            }
-            p.weight += through * static_cast<Exact>(alpha);
-            through *= 1 - static_cast<Exact>(alpha);
-            if (!(alpha > 0))
-                continue;
-            if (sample.depth < p.depth) {
-                p.depth = sample.depth;
-                p.position = a.position;
-            }
-            if (a.primitive != dfb::noId && !hasPrimitive) {
-                hasPrimitive = true;
-                if (p.primitive == dfb::noId || sample.depth < primitiveDepth) {
-                    p.primitive = a.primitive;
-                    primitiveDepth = sample.depth;
-                }
-            }
-            if (!hasInstance) {
-                hasInstance = true;
-                if (p.instance == dfb::noId || sample.depth < instanceDepth) {
-                    p.instance = a.instance;
-                    instanceDepth = sample.depth;
-                }
-            }
-        }
-    }
-    return p;
 }
 
 template <class Tile>
@@ -105,40 +43,32 @@ void renderWithAux(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
     for (int y = tile.region.y0; y < tile.region.y1; ++y)
         for (int x = tile.region.x0; x < tile.region.x1; ++x)
             if (const auto sample = sampleOf(s, brick, tile.pass, x, y)) {
-                const AuxSample a = auxOf(s, *sample, tile.pass, x, y);
+                const dfb::testing::AuxSample a = auxOf(s, *sample, tile.pass, x, y);
                 const int i = (y - tile.region.y0) * Tile::size + x - tile.region.x0;
                 std::copy(a.normal.begin(), a.normal.end(), tile.normal + 3 * i);
                 std::copy(a.albedo.begin(), a.albedo.end(), tile.albedo + 3 * i);
                 std::copy(a.position.begin(), a.position.end(), tile.position + 3 * i);
-                tile.primitiveId[i] = a.primitive;
-                tile.instanceId[i] = a.instance;
+                tile.primitiveId[i] = a.primitiveId;
+                tile.instanceId[i] = a.instanceId;
             }
 }
 
-// Values of the image that are off.
+// Values of the auxiliary channels of an image that are off.
 inline std::size_t wrongAux(const scene::Scene& s, const dfb::Image& image)
 {
+    const auto expected =
+        referenceOf(s, [&](auto& sample, int pass, int x, int y) { sample.aux = auxOf(s, sample, pass, x, y); });
     std::size_t wrong = 0;
-    for (int y = 0; y < s.height; ++y)
-        for (int x = 0; x < s.width; ++x) {
-            const auto i =
-                static_cast<std::size_t>(y) * static_cast<std::size_t>(s.width) + static_cast<std::size_t>(x);
-            const AuxPixel p = auxReference(s, x, y);
-            for (std::size_t c = 0; c < 3; ++c) {
-                // Normals have either sign: what cancels is off by the rounding of what was summed.
-                const auto expected = [&](Exact sum) {
-                    return p.weight > 0 ? static_cast<double>(sum / p.weight) : 0.0;
-                };
-                const auto off = [](float got, double want) {
-                    return !(std::fabs(static_cast<double>(got) - want) <= 1e-12 + 0x1p-24 * std::fabs(want));
-                };
-                wrong += off(image.normal()[3 * i + c], expected(p.normal[c]));
-                wrong += off(image.albedo()[3 * i + c], expected(p.albedo[c]));
-                wrong += image.position()[3 * i + c] != p.position[c];
-            }
-            wrong += image.primitiveId()[i] != p.primitive;
-            wrong += image.instanceId()[i] != p.instance;
+    for (std::size_t i = 0; i < expected.size(); ++i) {
+        const dfb::testing::Pixel& p = expected[i];
+        for (std::size_t c = 0; c < 3; ++c) {
+            wrong += dfb::testing::isWrongMean(image.normal()[3 * i + c], p.normal[c], p);
+            wrong += dfb::testing::isWrongMean(image.albedo()[3 * i + c], p.albedo[c], p);
+            wrong += image.position()[3 * i + c] != p.position.value[c];
         }
+        wrong += image.primitiveId()[i] != p.primitiveId.value;
+        wrong += image.instanceId()[i] != p.instanceId.value;
+    }
     return wrong;
 }
 

@@ -321,7 +321,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     CHECK(has(texts[0], "frame 2"));
     CHECK(has(texts[10], "-1 children"));
     CHECK(has(texts[10], "tile 3"));
-    CHECK(has(texts[16], "without channel 1"));
+    CHECK(has(texts[16], "without its depth"));
     CHECK(has(texts[17], "rows of"));
     CHECK(sentMeanwhile == 0);
     CHECK(wrong == 0);

@@ -220,7 +220,9 @@ struct Picture {
     }
 };
 
-inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
+// `more(sample, pass, x, y)` gives a sample what it has beside colour and depth.
+template <class More>
+std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const More& more)
 {
     std::vector<dfb::testing::Pixel> result;
     for (int y = 0; y < s.height; ++y)
@@ -229,9 +231,11 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             for (int pass = 0; pass < s.passes; ++pass) {
                 std::vector<dfb::testing::Sample> samples;
                 for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing, unless it has a depth
-                    if (const auto sample = sampleOf(s, brick, pass, x, y);
-                        sample && (s.rule == dfb::BlendRule::Nearest || sample->rgba != std::array<float, 4>{}))
+                    if (auto sample = sampleOf(s, brick, pass, x, y);
+                        sample && (s.rule == dfb::BlendRule::Nearest || sample->rgba != std::array<float, 4>{})) {
+                        more(*sample, pass, x, y);
                         samples.push_back(*sample);
+                    }
                 passes.push_back(
                     s.rule == dfb::BlendRule::SortByDepth ? dfb::testing::composite(std::move(samples), s.background)
                     : s.rule == dfb::BlendRule::InOrder   ? dfb::testing::compositeInOrder(samples, s.background)
@@ -240,6 +244,11 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             result.push_back(dfb::testing::mean(passes));
         }
     return result;
+}
+
+inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
+{
+    return referenceOf(s, [](const dfb::testing::Sample&, int, int, int) {});
 }
 
 // The same where some tiles are not complete.

@@ -42,16 +42,14 @@ public:
         sum(aux_.normal, row.aux.normal, 3 * first);
         sum(aux_.albedo, row.aux.albedo, 3 * first);
         sum(aux_.weight, row.aux.weight, first);
-        for (std::size_t i = 0; i < row.depth.size(); ++i) {
-            if (row.depth[i] < depth_[first + i] && !aux_.position.empty())
-                std::copy_n(row.aux.position.data() + 3 * i, 3, aux_.position.data() + 3 * (first + i));
+        for (std::size_t i = 0; i < row.depth.size(); ++i)
             depth_[first + i] = std::min(depth_[first + i], row.depth[i]);
-        }
-        const auto nearest = [first](std::vector<NearestId>& to, const std::vector<NearestId>& from) {
+        const auto nearest = [first](auto& to, const auto& from) { // of equal ones the first
             for (std::size_t i = 0; !to.empty() && i < from.size(); ++i)
-                if (from[i].id != noId && (to[first + i].id == noId || from[i].depth < to[first + i].depth))
+                if (from[i].isThere() && (!to[first + i].isThere() || from[i].depth < to[first + i].depth))
                     to[first + i] = from[i];
         };
+        nearest(aux_.position, row.aux.position);
         nearest(aux_.primitiveId, row.aux.primitiveId);
         nearest(aux_.instanceId, row.aux.instanceId);
     }
@@ -76,8 +74,7 @@ public:
             }
             return to.data();
         };
-        const auto ids = [&](std::vector<std::uint32_t>& to,
-                             const std::vector<NearestId>& from) -> const std::uint32_t* {
+        const auto ids = [&](std::vector<std::uint32_t>& to, const std::vector<FrontId>& from) -> const std::uint32_t* {
             if (from.empty())
                 return nullptr;
             to.resize(width);
@@ -87,7 +84,12 @@ public:
         };
         aux.normal = weighted(normal_, aux_.normal);
         aux.albedo = weighted(albedo_, aux_.albedo);
-        aux.position = aux_.position.empty() ? nullptr : aux_.position.data() + 3 * first;
+        if (!aux_.position.empty()) {
+            position_.resize(3 * width);
+            for (std::size_t i = 0; i < width; ++i)
+                std::copy_n(aux_.position[first + i].at, 3, position_.data() + 3 * i);
+            aux.position = position_.data();
+        }
         aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
         aux.instanceId = ids(instanceId_, aux_.instanceId);
         return out.setRow(y, row_.data(), depth_.data() + first, aux);
@@ -98,7 +100,7 @@ private:
     std::vector<float> depth_; // the nearest
     AuxPixels aux_;
     std::vector<double> row_; // the rest: scratch of write()
-    std::vector<float> normal_, albedo_;
+    std::vector<float> normal_, albedo_, position_;
     std::vector<std::uint32_t> primitiveId_, instanceId_;
 };
 
@@ -219,7 +221,7 @@ private:
                 scratch.pointers.push_back(&fragments_[next]);
             scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
         }
-        scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
+        scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
         scratch.row.wantsGaps = scratch.row.wantsSingles = true;
         scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
         scratch.row.resize(info_.region.width(), tracked_);
