@@ -123,6 +123,7 @@ public:
     // allReduce() does. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
+        messaging_->requireProgress();
         messaging_->messenger().expectMessages(true);
         bool complete = true;
         std::string missing;

@@ -134,9 +134,11 @@ public:
         // Collective; for several framebuffers, in the same order on all ranks. Waits until all tiles of all ranks are
         // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
         // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
-        // begin the next.
+        // begin the next. Throws InvalidArgument on a thread that may not call MPI (see Progress): the frame is still
+        // open then.
         FrameReport end()
         {
+            engine_->requireProgress();
             isOpen_ = false;
             const FrameReport report = engine_->end();
             fb_->lastEnded_ = engine_;

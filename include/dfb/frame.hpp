@@ -60,7 +60,7 @@ struct FrameBufferConfig {
     // Null: a ThreadExecutor with one thread per core. A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
     // Of the messenger; a framebuffer that is given one goes by that one's.
-    Progress progress = Progress::Thread;
+    Progress progress = Progress::Auto;
     bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
     // 0, or 100 and more: a rank of which nothing has been heard for so long, in a frame or a call that waits for all
@@ -130,6 +130,9 @@ struct FrameReport {
     double renderMs = 0;              // begin() to the call of end(), this rank
     double compositingOverheadMs = 0; // the call of end() to its return, this rank
     double renderMsMax = 0;           // all: the longest renderMs
+    // This rank: who moved its messages. Caller: the calls of its user. Thread: a thread of the library's own, or,
+    // where ranks are threads, whoever sent them.
+    Progress progress = Progress::Thread;
     // All: message bytes to other ranks, without the transport's own, and what owners have put into the image of the
     // display rank themselves.
     std::int64_t bytesSent = 0;

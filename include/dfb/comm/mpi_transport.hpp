@@ -91,10 +91,10 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // at a lower thread level than `progress` needs; and on all ranks if they were built with different packet formats,
-    // or if one of them can not make its transport, with its rank and what has failed there. The others can not be
-    // told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result. At
-    // MPI_THREAD_FUNNELED to be called by the thread that initialised MPI.
+    // below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all ranks if they were built with different packet
+    // formats, or if one of them can not make its transport, with its rank and what has failed there. The others can
+    // not be told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result.
+    // Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
@@ -132,6 +132,17 @@ public:
             release();
     }
 
+    // Only where any thread may call MPI while others do. False, too, if MPI is not there: the constructor says why.
+    static bool mayHaveThread(const Communicator&) noexcept
+    {
+        int initialized = 0, finalized = 0, level = MPI_THREAD_SINGLE;
+        MPI_Initialized(&initialized);
+        MPI_Finalized(&finalized);
+        if (initialized && !finalized)
+            MPI_Query_thread(&level);
+        return level == MPI_THREAD_MULTIPLE;
+    }
+
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     // Whether messages to that rank stay where they are, in memory that it sees.
@@ -148,7 +159,7 @@ public:
         return memory ? memory->at(place, byteCount) : nullptr;
     }
     bool needsPolling() const noexcept { return true; }
-    // At MPI_THREAD_FUNNELED only the thread that initialised MPI, above that any.
+    // Below MPI_THREAD_SERIALIZED only the thread that initialised MPI.
     bool mayPoll() const noexcept
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
@@ -222,20 +233,19 @@ private:
         MPI_Finalized(&finalized);
         if (!initialized || finalized)
             throw TransportError(finalized ? "MPI has been finalised"
-                                           : "MPI is not initialised: call MPI_Init_thread first");
+                                           : "MPI is not initialised: call MPI_Init or MPI_Init_thread first");
         int level = MPI_THREAD_SINGLE;
         MPI_Query_thread(&level);
-        const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
-        if (level < needed)
+        if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
             throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
-                                 + ", " + detail::mpiLevelName(needed) + " is needed: call MPI_Init_thread with it"
-                                 + (progress == Progress::Thread ? ", or configure Progress::Caller" : ""));
-        if (level == MPI_THREAD_FUNNELED) {
+                                 + ", Progress::Thread needs MPI_THREAD_MULTIPLE: call MPI_Init_thread with it, or "
+                                   "leave Progress::Auto");
+        if (level < MPI_THREAD_SERIALIZED) {
             int isMain = 0;
             MPI_Is_thread_main(&isMain);
             if (!isMain)
-                throw TransportError("MPI was initialised at thread level MPI_THREAD_FUNNELED by another thread: only "
-                                     "that one may call MPI");
+                throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
+                                     + " by another thread: only that one may call MPI");
             onlyThread_ = std::this_thread::get_id();
         }
     }

@@ -125,8 +125,7 @@ public:
         if (params.timeoutMs < 0 || (params.timeoutMs == 0 && params.allowPartial))
             throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms"
                                   + (params.allowPartial ? " for a frame that may be partial" : ""));
-        if (messaging_->messenger().needsCaller() && !messaging_->messenger().mayPoll())
-            throw InvalidArgument("at this thread level of MPI frames belong to the thread that initialised it");
+        messaging_->requireProgress();
         messaging_->messenger().throwIfFailed();
         const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
         params_ = params;
@@ -328,6 +327,8 @@ public:
         poll();
     }
 
+    void requireProgress() const { messaging_->requireProgress(); }
+
     FrameReport end()
     {
         if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
@@ -356,6 +357,7 @@ public:
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
         report.compressed = compressed;
+        report.progress = messaging_->messenger().needsCaller() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         return report;
     }

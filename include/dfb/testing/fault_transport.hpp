@@ -108,6 +108,11 @@ public:
     {
     }
 
+    static bool mayHaveThread(const Communicator& communicator)
+    {
+        return dfb::detail::resolved<Base>(Progress::Auto, communicator.communicator) == Progress::Thread;
+    }
+
     int rank() const { return base_.rank(); }
     int size() const { return base_.size(); }
     bool needsPolling() const
