@@ -151,9 +151,9 @@ int main(int argc, char** argv)
         if (everywhere || mpi.rank() == last)
             failing = call;
         const std::string text = transportErrorOf(what, [&] {
-            auto its = config;
-            its.sharedMemory = shared;
-            FrameBuffer fb(mpi.communicator(), its);
+            dfb::MessengerOptions options;
+            options.sharedMemory = shared;
+            FrameBuffer fb(mpi.communicator(), config, options);
         });
         failing = nullptr;
         return std::make_pair(what, text);

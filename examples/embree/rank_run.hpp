@@ -69,8 +69,6 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
-    config.sharedMemory = o.sharedMemory;
-    config.peerTimeoutMs = 1000 * o.peerTimeout;
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
@@ -90,6 +88,14 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
 #endif
     return config;
+}
+
+inline dfb::MessengerOptions messengerOptionsOf(const Options& o)
+{
+    dfb::MessengerOptions options;
+    options.sharedMemory = o.sharedMemory;
+    options.peerTimeoutMs = 1000 * o.peerTimeout;
+    return options;
 }
 
 inline dfb::World worldOf(const RankScene& scene, const RenderSettings& settings)
@@ -179,7 +185,7 @@ class RankRun {
 
 public:
     RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
-        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator))
+        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o)))
     {
         dfb::FrameBufferConfig config = configOf(o, threads);
         PixelOp pixelOp{};

@@ -157,11 +157,15 @@ public:
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
-        : DistributedFrameBuffer(
-            std::make_shared<Messenger<Transport>>(
-                communicator, MessengerOptions{config.progress, config.checksums, config.sharedMemory,
-                                               config.peerTimeoutMs, config.onPeerLost}),
-            config, std::move(pixelOp)) // not moved: the options may be made of it afterwards
+        : DistributedFrameBuffer(communicator, std::move(config), MessengerOptions(), std::move(pixelOp))
+    {
+    }
+
+    // The same with a messenger made with these options, for this framebuffer alone.
+    DistributedFrameBuffer(const Communicator& communicator, Config config, MessengerOptions options,
+                           PixelOp pixelOp = {})
+        : DistributedFrameBuffer(std::make_shared<Messenger<Transport>>(communicator, std::move(options)),
+                                 std::move(config), std::move(pixelOp))
     {
     }
 

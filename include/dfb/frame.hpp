@@ -3,7 +3,6 @@
 
 #include <dfb/channels.hpp>
 #include <dfb/comm/compression.hpp>
-#include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
@@ -13,7 +12,6 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -34,8 +32,8 @@ enum class CompressionMode : std::uint8_t {
          // messages become smaller by it, as each rank finds out by itself
 };
 
-// What a framebuffer is made with. Everything but executor, progress, sharedMemory, peerTimeoutMs and onPeerLost must
-// be the same on all ranks, as must the types of its operations, which is checked when it is made.
+// What a framebuffer is made with; how its messages travel is said by the MessengerOptions. Everything but the executor
+// must be the same on all ranks, as must the types of its operations, which is checked when it is made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
@@ -59,16 +57,6 @@ struct FrameBufferConfig {
     std::size_t messagePoolBytes = std::size_t{64} << 20;
     // Null: a ThreadExecutor with one thread per core. A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
-    // Of the messenger; a framebuffer that is given one goes by that one's.
-    Progress progress = Progress::Auto;
-    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
-    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
-    // 0, or 100 and more: a rank of which nothing has been heard for so long, in a frame or a call that waits for all
-    // ranks, is lost, and the job ends with an error that names it, or onPeerLost says what else; see MessengerOptions.
-    // And what is waited for, at most, that a message which could not be read may have been; in a frame without a
-    // time-out 0 is no limit.
-    int peerTimeoutMs = defaultPeerTimeoutMs;
-    std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.

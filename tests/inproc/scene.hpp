@@ -310,7 +310,7 @@ std::string outcomeOf(const Call& call)
 
 inline bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// With one worker, tasks run in the order of arrival. With none, the threads of the ranks do all, also what MPI wants.
+// With one worker, tasks run in the order of arrival. With none, the threads of the ranks run them.
 inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config;
@@ -318,12 +318,10 @@ inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
     config.height = s.height;
     config.format = dfb::OutputFormat::RGBA32F;
     config.depth = true;
-    if (threads > 0) {
+    if (threads > 0)
         config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
-    } else {
+    else
         config.executor = std::make_shared<dfb::CallerExecutor>();
-        config.progress = dfb::Progress::Caller;
-    }
     return config;
 }
 

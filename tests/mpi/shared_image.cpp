@@ -74,9 +74,10 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
     std::int64_t messages[2] = {}, bytes[2] = {};
     for (const bool shared : {true, false}) {
         auto config = scene::configOf(s);
-        config.sharedMemory = shared;
         config.displayRank = sizeOf(MPI_COMM_WORLD) - 1;
-        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config);
+        dfb::MessengerOptions options;
+        options.sharedMemory = shared;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config, options);
         dfb::FrameReport report;
         for (int i = 0; i < 4; ++i)
             CHECK(goodFrame(fb, s, report));

@@ -9,6 +9,16 @@ set(DFB_TEST_DATA "${PROJECT_SOURCE_DIR}/../shared/data" CACHE PATH
 add_executable(dfb_compare_pfm render/tools/compare_pfm.cpp)
 target_link_libraries(dfb_compare_pfm PRIVATE dfb_developer)
 
+# The same program, but that rank 1 stops in the middle of its frames.
+if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
+  add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> render/tools/stop_rank.cpp)
+  target_link_libraries(dfb_render_stopped PRIVATE dfb_developer dfb_embree_example)
+  dfb_add_mpi_run(render.peer_timeout RANKS 2 TIMEOUT 20 LABELS example
+    COMMAND $<TARGET_FILE:dfb_render_stopped> demo --size 64x64 --frames 1000000 --peer-timeout 1)
+  set_tests_properties(render.peer_timeout.np2 PROPERTIES
+    PASS_REGULAR_EXPRESSION "dfb: transport failure: rank 1: this rank is lost")
+endif()
+
 set(_launch "")
 if(TARGET dfb::mpi)
   set(_launch ${MPIEXEC_EXECUTABLE} ${_mpiexec_flags} ${MPIEXEC_PREFLAGS} ${MPIEXEC_NUMPROC_FLAG})
@@ -63,6 +73,7 @@ _add_cli_case(png ranks2 np3)
 _add_cli_case(far ranks3 np3)
 _add_cli_case(hash ranks1 ranks2 ranks5 np1 np3 np4)
 _add_cli_case(modes ranks3 np3)
+_add_cli_case(shared_memory np2)
 if(EXISTS ${DFB_TEST_DATA}/boston_teapot_256x256x178_uint8.raw)
   _add_cli_case(teapot one)
 endif()

@@ -544,6 +544,17 @@ elseif(CASE STREQUAL "hash")
     expect_hash(${plain} ${START} ${scene} --compression auto)
   endif()
 
+elseif(CASE STREQUAL "shared_memory")
+  # Where ranks see each other's memory, an owner puts its tiles into the image, without a message.
+  set(scene demo --size 128x128 --frames 4 --output image.png)
+  succeed(${START} ${scene} --stats with.json)
+  succeed(${START} ${scene} --stats without.json --no-shared-memory)
+  field(with with.json messages_sent)
+  field(without without.json messages_sent)
+  if(NOT with LESS without)
+    wrong("${with} messages with shared memory, ${without} without")
+  endif()
+
 elseif(CASE STREQUAL "modes")
   foreach(scene "demo --bricks 7" "demo --bricks 5 --spp 2" "demo --bricks 7 --camera-distance 0.2 --fov 90"
       "synthetic --bricks 4")

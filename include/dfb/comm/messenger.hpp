@@ -29,14 +29,16 @@
 
 namespace dfb {
 
+// How messages travel: for all framebuffers and walls of a messenger. Only `checksums` must be the same on all ranks.
 struct MessengerOptions {
     Progress progress = Progress::Auto;
-    bool checksums = false; // each message carries a CRC-32C; must be the same on all ranks
-    // Ranks that see each other's memory hand messages over there.
-    bool sharedMemory = true;
+    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
+    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
     // On ranks with a progress thread: while messages are expected, in a frame or a call that waits for all ranks, a
     // rank of which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this
-    // rank looks for no other and is not looked for; what is less than 100 counts as that. May differ between ranks.
+    // rank looks for no other and is not looked for. Else 100 or more; framebuffers refuse what is less.
+    // And how long, at most, is waited for what a message that could not be read may have been; in a frame without a
+    // time-out 0 is no limit.
     int peerTimeoutMs = defaultPeerTimeoutMs;
     // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort of
     // MPI_COMM_WORLD, with the error on standard error), as MPI does not go on without a rank. Else all ranks get the

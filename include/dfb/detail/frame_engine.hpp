@@ -47,11 +47,6 @@ public:
                 int slot = 0)
         : pool_(messenger->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
-        config_.progress = messenger->options().progress;
-        config_.checksums = messenger->options().checksums;
-        config_.sharedMemory = messenger->options().sharedMemory;
-        config_.peerTimeoutMs = messenger->options().peerTimeoutMs;
-        config_.onPeerLost = messenger->options().onPeerLost;
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
         MessageHandler& self = *this;
         messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
@@ -70,15 +65,15 @@ public:
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
-            if (config_.peerTimeoutMs != 0 && config_.peerTimeoutMs < 100)
-                throw InvalidArgument("a time-out for peers of " + std::to_string(config_.peerTimeoutMs)
-                                      + " ms: 0, or 100 and more");
+            if (const int ms = messaging_->messenger().options().peerTimeoutMs; ms != 0 && ms < 100)
+                throw InvalidArgument("a time-out for peers of " + std::to_string(ms) + " ms: 0, or 100 and more");
             checkWire();
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of<TileOp, PixelOp>(config_, rank(), Tile::size, Pipeline::travelling(config_),
-                                                  layout().tileCount(), [this](int tile) { return tileOwner(tile); });
+            mine = Agreement::of<TileOp, PixelOp>(config_, messaging_->messenger().options().checksums, rank(),
+                                                  Tile::size, Pipeline::travelling(config_), layout().tileCount(),
+                                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
         } catch (const std::exception& e) {
@@ -1014,7 +1009,7 @@ private:
     // the verdict, is it waited for no longer than for a rank of which nothing is heard.
     Verdict waitWithoutLimit()
     {
-        const auto limit = std::chrono::milliseconds(config_.peerTimeoutMs);
+        const auto limit = std::chrono::milliseconds(messaging_->messenger().options().peerTimeoutMs);
         if (const Verdict* verdict = outcome_->wait(Clock::now() + untilCompared))
             return *verdict;
         compareParams();

@@ -280,11 +280,11 @@ struct Agreement {
     std::string text; // items parted by commas, or what is wrong
     int rank = 0;     // whose; the lowest of those that are alike
 
-    // `tileSize`: of the tile operation; `sent`: those of its channels that travel; `ownerOf(tile)`: the owner map's
-    // answers.
+    // `checksums`: see MessengerOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
+    // `ownerOf(tile)`: the owner map's answers.
     template <class TileOp, class PixelOp, class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, int rank, int tileSize, ChannelMask sent, int tileCount,
-                        const OwnerOf& ownerOf)
+    static Agreement of(const FrameBufferConfig& c, bool checksums, int rank, int tileSize, ChannelMask sent,
+                        int tileCount, const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
@@ -305,7 +305,7 @@ struct Agreement {
                     + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
                     + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
                     + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", least transmittance "
-                    + text(c.minTransmittance) + ", checksums " + text(c.checksums) + ", message pool "
+                    + text(c.minTransmittance) + ", checksums " + text(checksums) + ", message pool "
                     + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither " + text(c.dither)
                     + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation + typeid(PixelOp).name(),
                 rank};
