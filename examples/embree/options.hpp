@@ -42,7 +42,7 @@ struct Options {
     float minTransmittance = 0; // 0: off
     bool verify = false;
     int inFlight = 1; // frames that may be open at once
-    int threads = 0;  // per rank; 0: as many as the machine has
+    int threads = 0;  // per rank; 0: its part of the processors
     Compression compression = Compression::None;
     bool sharedMemory = true;
     int peerTimeout = dfb::defaultPeerTimeoutMs / 1000; // seconds; 0: off
@@ -238,7 +238,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("N")
         ->group(how);
     app.add_option("--threads", options.threads,
-                   "Threads per rank; default 0: the hardware threads of the machine, divided among its ranks")
+                   "Threads per rank; default 0: the processors that it may run on, divided among the ranks that may, too")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(how);

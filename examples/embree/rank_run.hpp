@@ -187,7 +187,7 @@ public:
     RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
         : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o)))
     {
-        dfb::FrameBufferConfig config = configOf(o, threads);
+        dfb::FrameBufferConfig config = configOf(o, threads > 0 ? threads : messenger_->threadShare());
         PixelOp pixelOp{};
         if constexpr (hasWall) {
             // Of what a wall shows no rank has the whole.

@@ -79,7 +79,7 @@ public:
         : layout_(layout), format_(format), pool_(messenger->pool())
     {
         if (!executor)
-            executor = std::make_shared<ThreadExecutor>();
+            executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
         const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
         detail::MessageHandler& self = *this;
         messaging_ = std::make_unique<detail::Messaging<Transport>>(std::move(messenger), std::move(executor),

@@ -173,7 +173,7 @@ public:
     DistributedFrameBuffer(std::shared_ptr<Messenger<Transport>> messenger, Config config, PixelOp pixelOp = {})
     {
         if (!config.executor)
-            config.executor = std::make_shared<ThreadExecutor>();
+            config.executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
         try {
             for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
                 engines_.push_back(std::make_unique<Engine>(messenger, config, pixelOp, slot));

@@ -55,7 +55,8 @@ struct FrameBufferConfig {
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
     std::size_t messagePoolBytes = std::size_t{64} << 20;
-    // Null: a ThreadExecutor with one thread per core. A CallerExecutor makes no threads.
+    // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see Messenger::threadShare().
+    // A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
 };
 
@@ -121,6 +122,7 @@ struct FrameReport {
     // This rank: who moved its messages. Caller: the calls of its user. Thread: a thread of the library's own, or,
     // where ranks are threads, whoever sent them.
     Progress progress = Progress::Thread;
+    int threads = 1; // this rank: workers of its executor
     // All: message bytes to other ranks, without the transport's own, and what owners have put into the image of the
     // display rank themselves.
     std::int64_t bytesSent = 0;

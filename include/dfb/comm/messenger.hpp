@@ -8,6 +8,7 @@
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/processors.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -138,6 +139,17 @@ public:
     // What it was made with, but for Progress::Auto, in place of which is what it has become.
     const MessengerOptions& options() const noexcept { return options_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
+
+    // How many threads this rank should render and composite with: the processors that the calling thread may run on,
+    // divided by the ranks that may run there, too, those of this messenger on this node; at least 1. What a
+    // framebuffer has that is given no executor.
+    int threadShare() const noexcept
+    {
+        int ranks = 1;
+        if constexpr (detail::KnowsSharing<Transport>::value)
+            ranks = transport_.sharingRanks();
+        return dfb::threadShare(Processors::ofThisThread().count(), ranks);
+    }
 
     // Moves messages; true if any moved. With a progress thread there is no need to call it, and on a thread that may
     // not be in MPI it does nothing. Never blocks.

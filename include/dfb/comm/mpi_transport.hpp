@@ -18,6 +18,7 @@
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/detail/fifo.hpp>
+#include <dfb/processors.hpp>
 
 #include <mpi.h>
 
@@ -145,6 +146,8 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
+    // Of this node, by the CPU masks of the threads that made their transports.
+    int sharingRanks() const noexcept { return sharingRanks_; }
     // Whether messages to that rank stay where they are, in memory that it sees.
     bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
     // Where a block of the pool lies for those ranks, -1: nowhere; and the block of another rank that lies there, null:
@@ -340,6 +343,7 @@ private:
     // What a rank tells all others then.
     struct Card {
         std::uint64_t host;
+        Processors processors;
         detail::NodeMemory::Address memory;
     };
 
@@ -354,7 +358,7 @@ private:
             check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
             memory = memoryToShare();
             mine = {std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
-                    memory ? memory->address() : detail::NodeMemory::Address()};
+                    Processors::ofThisThread(), memory ? memory->address() : detail::NodeMemory::Address()};
         });
         std::vector<Card> all(static_cast<std::size_t>(size_));
         MPI_Request request = MPI_REQUEST_NULL;
@@ -362,7 +366,10 @@ private:
               "MPI_Iallgather");
         wait(request);
         const auto isHere = [&](const Card& card) { return card.host == mine.host; };
-        findCrowding(std::count_if(all.begin(), all.end(), isHere));
+        sharingRanks_ = static_cast<int>(std::count_if(all.begin(), all.end(), [&](const Card& card) {
+            return isHere(card) && card.processors.meets(mine.processors);
+        }));
+        findCrowding(mine.processors.count());
 
         // Each tells the others whose memory it sees.
         std::vector<std::uint8_t> sees(all.size()), seen(all.size());
@@ -397,11 +404,10 @@ private:
 
     // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
     // each wakes up so often, and takes the core from all others that often.
-    void findCrowding(std::ptrdiff_t ranksHere)
+    void findCrowding(int cores)
     {
-        const auto cores = static_cast<std::ptrdiff_t>(std::max(1u, std::thread::hardware_concurrency()));
-        const std::ptrdiff_t ranksPerCore = 4 * ranksHere / cores; // in quarters
-        crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
+        const std::int64_t ranksPerCore = std::int64_t{4} * sharingRanks_ / std::max(1, cores); // in quarters
+        crowding_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
     using Record = detail::PacketRecord;
@@ -911,6 +917,7 @@ private:
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1, lastTag_ = 1;
     int crowding_ = 4;
+    int sharingRanks_ = 1;
     std::thread::id onlyThread_; // that may call MPI; none if all may
 
     NapSignal signal_;

@@ -39,6 +39,10 @@
 //                                                throws. Progress::Auto becomes Thread or Caller by it, so that the
 //                                                constructor gets no Auto
 //
+// And, if it knows (without this a rank has its processors for itself):
+//   int sharingRanks() const;                    how many ranks may run on processors that this one may run on, this one
+//                                                included
+//
 // And, if it can end the job of which the ranks are processes:
 //   void abort(const std::string& text);         between start() and stop(), or in waiting(), on the thread that polls;
 //                                                says why on standard error and ends all ranks; does not return
@@ -194,6 +198,14 @@ Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communic
     else
         return Progress::Thread;
 }
+
+// Optional.
+template <class T, class = void>
+struct KnowsSharing : std::false_type {
+};
+template <class T>
+struct KnowsSharing<T, std::void_t<decltype(std::declval<const T&>().sharingRanks())>> : std::true_type {
+};
 
 // Optional.
 template <class T, class = void>

@@ -352,6 +352,7 @@ public:
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
         report.compressed = compressed;
+        report.threads = messaging_->executor().concurrency();
         report.progress = messaging_->messenger().needsCaller() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         return report;

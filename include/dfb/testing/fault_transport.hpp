@@ -195,6 +195,11 @@ public:
         base_.abort(text);
     }
     template <class B = Base>
+    auto sharingRanks() const -> decltype(std::declval<const B&>().sharingRanks())
+    {
+        return base_.sharingRanks();
+    }
+    template <class B = Base>
     auto lendsTo(int other) const -> decltype(std::declval<const B&>().lendsTo(other))
     {
         return base_.lendsTo(other);
