@@ -96,7 +96,7 @@ public:
         }
         for (int d = 0; d < layout_.displayCount(); ++d)
             if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank())
-                shown_.emplace(d, Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0));
+                shown_.emplace(d, Image());
     }
 
     DisplayWall(const DisplayWall&) = delete;
@@ -144,6 +144,8 @@ public:
         if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
             for (auto& [display, picture] : *done->second)
                 std::swap(shown_.at(display), picture.image);
+        if (all.fine)
+            shownFrame_ = frame;
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
         last_ = frame;
         if (isMalformed(missing) && frame >= errorFrame_)
@@ -157,7 +159,9 @@ public:
         }
     }
 
-    // What this rank's display shows: the last finished frame. Throws InvalidArgument if another rank drives it.
+    // What this rank's display shows: the last frame that was finished well, which stays until the next one is. Empty
+    // before the first. Throws InvalidArgument if another rank drives it. By the thread that calls finish(), as the
+    // next.
     const Image& image(int display) const
     {
         const auto found = shown_.find(display);
@@ -165,6 +169,9 @@ public:
             throw InvalidArgument("display " + std::to_string(display) + " is not driven by this rank");
         return found->second;
     }
+
+    // Which frame all displays show, as in FrameReport::frame; the same on all ranks. -1 before the first.
+    std::int64_t imageFrame() const noexcept { return shownFrame_; }
 
     // Called by ToWall, from any thread.
     void put(const PixelTile& tile)
@@ -416,7 +423,8 @@ private:
     WallLayout layout_;
     OutputFormat format_;
     std::shared_ptr<MemoryPool> pool_;
-    std::map<int, Image> shown_; // of this rank's displays; made with the wall, changed in finish()
+    std::map<int, Image> shown_; // of this rank's displays; changed in finish(), as the next
+    std::int64_t shownFrame_ = -1;
 
     std::mutex mutex_;
     std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels

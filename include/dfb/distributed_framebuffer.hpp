@@ -201,11 +201,17 @@ public:
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be
-    // frames in flight. Empty elsewhere.
+    // On the display rank: the image of the last frame that ended well or partial. It is there until that frame's
+    // memory is needed again: until as many begin() after the frame's own as there may be frames in flight. After that,
+    // and before the first such frame, it is empty, as it always is elsewhere. By the thread that begins and ends
+    // frames, as the next two.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
-    // On the display rank: false if the last frame ended without that tile, see FrameParams::allowPartial.
+    // Which frame image() is of, as in FrameReport::frame; -1 if it is empty.
+    std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
+
+    // On the display rank: whether image() has that tile. It has all of a frame that ended well, see
+    // FrameParams::allowPartial.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // With Progress::Caller, moves messages, unless on a thread that may not be in MPI; with an executor that has no

@@ -90,6 +90,8 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
                     wrong += image.rgba32f()[4 * i] != shade;
             };
             result.texts[rank] = outcomeOf([&] { frame(0.5f); });
+            const bool isShown = result.texts[rank] == "fine";
+            wrong += wall.image(fb.rank()).empty() == isShown || wall.imageFrame() != (isShown ? 1 : -1);
             result.after[rank] = outcomeOf([&] { frame(0.25f); });
         },
         std::nullopt, std::chrono::seconds(20));

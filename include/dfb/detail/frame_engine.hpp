@@ -100,7 +100,8 @@ public:
     const TileLayout& layout() const noexcept { return pipeline_->table().layout(); }
     int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return pipeline_->table().owned(); }
-    const Image& image() const noexcept { return pipeline_->gather().image(); }
+    const Image& image() const noexcept { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
+    std::int64_t imageFrame() const noexcept { return pipeline_->gather().imageFrame(); }
     bool isComplete(int tile) const { return pipeline_->gather().isComplete(tile); }
     std::int64_t frame() const noexcept { return gate_.frame(); }
     bool wantsDeclaration() const noexcept { return wantsDeclaration_; }
@@ -328,7 +329,7 @@ public:
     {
         if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
             guarded([] { throw InvalidArgument("end() of a frame with declared inputs without declare()"); });
-        if (!image().empty())
+        if (pipeline_->gather().displays())
             guarded([this] { pipeline_->finishBackground(); });
         const Verdict verdict = conclude();
         if (verdict.error && (!params_.allowPartial || verdict.error->kind == ErrorKind::Disagreement))
@@ -1053,6 +1054,7 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
+    const Image noImage_;
     ManifestExchange manifests_;
     std::any declaredFrom_, loopMemory_; // see Frame
     JobShare jobs_;
