@@ -18,6 +18,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -73,7 +74,7 @@ template <class Transport = MpiTransport>
 class DisplayWall final : private detail::MessageHandler {
 public:
     // Collective, in the same order as the framebuffers of the messenger. `format`: of the displays' images. Throws
-    // InvalidArgument on all ranks if the layout is none, or is not the same on all.
+    // InvalidArgument on all ranks if the layout is none, is not the same on all, or some rank has no memory for it.
     DisplayWall(std::shared_ptr<Messenger<Transport>> messenger, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20)
         : layout_(layout), format_(format), pool_(messenger->pool())
@@ -88,15 +89,18 @@ public:
         detail::Agreement mine{true, describe(), messaging_->rank()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
             mine = {false, wrong};
+        else
+            try {
+                takeMemory();
+            } catch (const std::exception& e) { // the others must not wait for this rank
+                mine = {false, "rank " + std::to_string(messaging_->rank()) + ": " + e.what()};
+            }
         const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         if (!all.fine) {
             messaging_->stop();
             messaging_.reset();
             throw InvalidArgument(all.text);
         }
-        for (int d = 0; d < layout_.displayCount(); ++d)
-            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank())
-                shown_.emplace(d, Image());
     }
 
     DisplayWall(const DisplayWall&) = delete;
@@ -253,6 +257,19 @@ private:
         return "";
     }
 
+    // The displays of this rank, with nothing to show, and memory for the images that each of them will have, which it
+    // leaves in the pool.
+    void takeMemory()
+    {
+        std::vector<Image> images;
+        for (int d = 0; d < layout_.displayCount(); ++d)
+            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank()) {
+                shown_.emplace(d, Image());
+                for (int i = 0; i < 2; ++i)
+                    images.emplace_back(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0);
+            }
+    }
+
     void incoming(int source, const detail::MessageHeader& header, Buffer&& message) override
     {
         const std::size_t byteCount = message.size();
@@ -276,6 +293,11 @@ private:
                 refuse(source, e.info(), header.number);
             else // it may have been one that finish() waits for
                 messaging_->giveUp(source, e.info());
+        } catch (const std::bad_alloc& e) { // for more frames than one
+            ErrorInfo info;
+            info.kind = ErrorKind::Transport;
+            info.message = e.what();
+            messaging_->giveUp(source, info);
         }
     }
 

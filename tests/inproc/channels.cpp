@@ -11,6 +11,8 @@
 #include <utility>
 #include <vector>
 
+namespace channels_cases {
+
 namespace {
 
 using algorithms::renderWithAux;
@@ -242,3 +244,5 @@ TEST_CASE("Verified notices what is wrong in any channel", "[channels]")
     CHECK(wrongOthers<Damage::PrimitiveId>() == wrong);
     CHECK(wrongOthers<Damage::InstanceId>() == wrong);
 }
+
+} // namespace channels_cases

@@ -1,4 +1,5 @@
-// What a frame costs, in bytes, messages and allocations: counted, as a clock would have to be believed.
+// What a frame costs, in bytes, messages and allocations: counted, as a clock would have to be believed. And what is
+// said of an allocation that fails.
 #include "catch.hpp"
 
 #include <dfb/dfb.hpp>
@@ -15,6 +16,7 @@
 #include <mutex>
 #include <new>
 #include <numeric>
+#include <string>
 #include <thread>
 #include <vector>
 
@@ -30,6 +32,7 @@
 namespace {
 
 std::atomic<std::int64_t> allocations{0};
+std::atomic<std::size_t> largestAllocation{std::numeric_limits<std::size_t>::max()}; // a larger one fails
 
 } // namespace
 
@@ -39,6 +42,8 @@ namespace {
 void* allocate(std::size_t bytes, std::size_t alignment)
 {
     ++allocations;
+    if (bytes > largestAllocation)
+        throw std::bad_alloc();
     void* block = alignment > alignof(std::max_align_t)
                       ? std::aligned_alloc(alignment, (bytes + alignment - 1) / alignment * alignment)
                       : std::malloc(bytes > 0 ? bytes : 1);
@@ -473,5 +478,95 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
         CHECK(counts[0] > 0);
         CHECK(std::vector<std::int64_t>(counts.begin() + 2, counts.end()) == std::vector<std::int64_t>(8));
     });
+}
+
+namespace {
+
+// What each of 2 ranks gets where no allocation larger than that succeeds.
+template <class Make>
+std::vector<std::string> outcomes(std::size_t largest, const Make& make)
+{
+    std::vector<std::string> texts(2);
+    largestAllocation = largest;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        std::string& text = texts[static_cast<std::size_t>(communicator.rank())];
+        try {
+            make(communicator);
+        } catch (const dfb::InvalidArgument& e) {
+            text = e.what();
+        } catch (const std::exception& e) {
+            text = std::string("another exception: ") + e.what();
+        }
+    });
+    largestAllocation = std::numeric_limits<std::size_t>::max();
+    return texts;
+}
+
+} // namespace
+
+TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
+{
+    using dfb::OutputFormat;
+    struct Case {
+        OutputFormat format;
+        dfb::ChannelMask aux;
+        bool depth;
+        const char* text;
+    };
+    for (const Case& c : {Case{OutputFormat::RGBA32F, 0, false,
+                               "no memory for 68719476736 bytes: an image of 65536x65536 pixels of 16 bytes (RGBA32F)"},
+                          Case{OutputFormat::RGBA8, 0, false,
+                               "no memory for 17179869184 bytes: an image of 65536x65536 pixels of 4 bytes (RGBA8)"},
+                          Case{OutputFormat::SRGBA8, dfb::normalChannel, true,
+                               "no memory for 85899345920 bytes: an image of 65536x65536 pixels of 20 bytes (SRGBA8 "
+                               "and more channels)"}})
+        for (const int inFlight : {1, 3}) {
+            const auto texts = outcomes(std::size_t{1} << 30, [&](dfb::InprocCommunicator communicator) {
+                dfb::FrameBufferConfig config;
+                config.width = config.height = 65536;
+                config.format = c.format;
+                config.aux = c.aux;
+                config.depth = c.depth;
+                config.displayRank = 1;
+                config.framesInFlight = inFlight;
+                config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+                dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64, dfb::allChannels & ~dfb::farChannel>,
+                                            dfb::NoPixelOp, dfb::InprocTransport>
+                    fb(communicator, config);
+            });
+            CHECK(texts[0] == texts[1]);
+            CHECK(texts[0]
+                  == std::string("dfb: invalid argument: rank 1: ") + c.text
+                         + (inFlight > 1 ? "; there is one for each of 3 frames in flight" : ""));
+        }
+    const auto tables = outcomes(std::size_t{1} << 20, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config;
+        config.width = config.height = 65536;
+        config.format = OutputFormat::None;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator, config);
+    });
+    CHECK(tables[0] == tables[1]);
+    CHECK(tables[0].find("dfb: invalid argument: rank 0: no memory for ") == 0);
+    CHECK(tables[0].find(" bytes: tables of 1048576 tiles") != std::string::npos);
+    const auto pool = dfb::MemoryPool::create(false);
+    const std::uint64_t before = pool->peakBytes();
+    largestAllocation = 1 << 20;
+    CHECK_THROWS_WITH(pool->acquire(3 << 20), "no memory for 3145728 bytes: a block");
+    largestAllocation = std::numeric_limits<std::size_t>::max();
+    CHECK(pool->peakBytes() == before);
+    const auto wall = outcomes(std::size_t{1} << 30, [&](dfb::InprocCommunicator communicator) {
+        dfb::WallLayout layout;
+        layout.columns = 2;
+        layout.displayWidth = layout.displayHeight = 32000;
+        layout.ranks = {1, 1};
+        const auto messenger = std::make_shared<dfb::Messenger<dfb::InprocTransport>>(communicator);
+        const dfb::DisplayWall<dfb::InprocTransport> made(messenger, layout, OutputFormat::RGBA8,
+                                                          std::make_shared<dfb::ThreadExecutor>(1));
+    });
+    CHECK(wall[0] == wall[1]);
+    CHECK(wall[0]
+          == "dfb: invalid argument: rank 1: no memory for 4096000000 bytes: an image of 32000x32000 pixels of 4 bytes "
+             "(RGBA8)");
 }
 #endif

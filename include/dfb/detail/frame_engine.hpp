@@ -76,6 +76,12 @@ public:
                                                   [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
+        } catch (const OutOfMemory& e) {
+            const bool several = config_.framesInFlight > 1;
+            mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()
+                               + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
+                                                + " frames in flight"
+                                          : "")};
         } catch (const std::exception& e) {
             // No memory, or out of the owner map: the others must not wait for this rank.
             mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};

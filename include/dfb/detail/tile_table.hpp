@@ -17,6 +17,7 @@
 #include <exception>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <utility>
@@ -61,10 +62,10 @@ class TileTable {
 public:
     using FrameData = typename FrameDataOf<TileOp>::type;
 
+    // Throws InvalidArgument for owners that there are not, and OutOfMemory.
     TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount)
-        : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
-          slotOf_(static_cast<std::size_t>(layout.tileCount()), -1)
-    {
+    try : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
+        slotOf_(static_cast<std::size_t>(layout.tileCount()), -1) {
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const int owner = ownerMap(tile, layout, rankCount);
             if (owner < 0 || owner >= rankCount)
@@ -77,6 +78,10 @@ public:
             }
         }
         slots_.resize(owned_.size());
+    } catch (const std::bad_alloc&) {
+        constexpr std::size_t mostBytes = 2 * sizeof(std::int32_t) + sizeof(int) + sizeof(std::unique_ptr<Slot>);
+        const auto tiles = static_cast<std::size_t>(layout.tileCount());
+        throw OutOfMemory(mostBytes * tiles, ("tables of " + std::to_string(tiles) + " tiles").c_str());
     }
 
     const TileLayout& layout() const noexcept { return layout_; }
