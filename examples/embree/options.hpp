@@ -395,8 +395,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("A")
         ->group(picture);
     app.add_option("--early-termination", options.earlyTermination,
-                   "End a ray within a brick when less than this part of the light gets through, 0 to 1; default 0: "
-                   "never. The image then depends on the bricks")
+                   "End a ray within a brick when less than this part of the light gets through, 0 to 1. The image then "
+                   "depends on the bricks, and no pixel is off by more than this part of the brightest colour; default "
+                   "0: when nothing does")
         ->check(detail::number(0, 1))
         ->option_text("T")
         ->group(picture);
