@@ -246,14 +246,17 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--no-shared-memory", noSharedMemory,
                  "Send all messages through MPI, also those between ranks of one node")
         ->group(how);
-    app.add_option("--peer-timeout", options.peerTimeout,
-                   "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, "
-                   "as for a debugger; default 300")
+    app.add_option(
+           "--peer-timeout", options.peerTimeout,
+           "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, "
+           "as for a debugger; default 300")
         ->check(detail::number(0, most))
         ->option_text("SECONDS")
         ->group(how);
-    app.add_option("--compression", options.compression, "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
-                   "faster; default none")
+    app.add_option(
+           "--compression", options.compression,
+           "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
+           "faster; default none")
         ->transform(detail::choice({"none", "snappy", "auto"}))
         ->option_text("none|snappy|auto")
         ->group(how);
@@ -386,7 +389,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("DEG")
         ->group(picture);
     app.add_option("--camera-distance", options.view.distance,
-                   "From the centre of what there is to see, in units of its largest extent; default 2.3")
+                   "From the centre of what there is to see, in units of its largest extent; default: so far that all "
+                   "of it is in the image, from every side")
         ->check(detail::number(0, 1000))
         ->option_text("D")
         ->group(picture);
@@ -394,10 +398,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1))
         ->option_text("A")
         ->group(picture);
-    app.add_option("--early-termination", options.earlyTermination,
-                   "End a ray within a brick when less than this part of the light gets through, 0 to 1. The image then "
-                   "depends on the bricks, and no pixel is off by more than this part of the brightest colour; default "
-                   "0: when nothing does")
+    app.add_option(
+           "--early-termination", options.earlyTermination,
+           "End a ray within a brick when less than this part of the light gets through, 0 to 1. The image then "
+           "depends on the bricks, and no pixel is off by more than this part of the brightest colour; default "
+           "0: when nothing does")
         ->check(detail::number(0, 1))
         ->option_text("T")
         ->group(picture);

@@ -37,11 +37,11 @@ struct RenderSettings {
 // What a renderer needs to know of the whole scene.
 struct SceneInfo {
     Box bounds;
-    Box focus;      // where the camera looks
+    Focus focus;    // where the camera looks
     float step = 0; // between the samples of a ray, in world space: half a voxel of the finest volume
 
     explicit SceneInfo(const Scene& scene)
-        : bounds(scene.bounds), focus(scene.focus), step(scene.bounds.largestExtent())
+        : bounds(scene.bounds), focus(scene.focus()), step(scene.bounds.largestExtent())
     {
         for (const VolumeObject& volume : scene.volumes)
             step = std::min(step, 0.5f * volume.placement.size());

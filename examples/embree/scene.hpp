@@ -86,16 +86,18 @@ struct Scene {
     std::vector<MeshObject> meshes;
     std::vector<SphereObject> spheres;
     Box bounds;
-    Box focus;            // of what there is to see, for the camera
     Index3 grid{0, 0, 0}; // of the cells, x fastest; zero: by bisection
 
     void add(VolumeSource source, bool fit)
     {
         VolumeObject object(std::move(source), fit);
         grow(object.bounds());
-        const Box visible = visibleBounds(object.source);
-        focus.grow(object.placement.toWorld(visible.lo));
-        focus.grow(object.placement.toWorld(visible.hi));
+        const VisibleVoxels visible = visibleVoxels(object.source);
+        const float slack = static_cast<float>(visible.slack) * object.placement.size();
+        lookAt([&](const auto& take) {
+            for (const Vec3& p : visible.points)
+                take(object.placement.toWorld(p), slack);
+        });
         volumes.push_back(std::move(object));
     }
     void add(Mesh mesh, bool fit)
@@ -111,12 +113,11 @@ struct Scene {
             {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
         MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
         object.normals = vertexNormals(object.mesh);
-        box = Box();
-        for (const Triangle& triangle : object.mesh.triangles)
-            for (const std::uint32_t index : triangle)
-                box.grow(object.mesh.positions[index]);
-        focus.grow(box);
-        grow(box);
+        grow(lookAt([&](const auto& take) {
+            for (const Triangle& triangle : object.mesh.triangles)
+                for (const std::uint32_t index : triangle)
+                    take(object.mesh.positions[index], 0);
+        }));
         meshes.push_back(std::move(object));
     }
     void add(std::vector<Sphere> set, bool fit)
@@ -129,15 +130,39 @@ struct Scene {
             sphere.center = placement.toWorld(sphere.center);
             sphere.radius *= placement.size();
         }
-        box = Box();
-        for (const Sphere& sphere : set)
-            box.grow(sphere.center, sphere.radius);
-        focus.grow(box);
-        grow(box);
+        grow(lookAt([&](const auto& take) {
+            for (const Sphere& sphere : set)
+                take(sphere.center, sphere.radius);
+        }));
         spheres.push_back({nextGeometry_++, std::move(set)});
     }
 
+    // What there is to see, for the camera.
+    Focus focus() const
+    {
+        Focus all{seen_, 0};
+        for (const auto& [center, radius] : balls_)
+            all.radius = std::max(all.radius, length(center - seen_.center()) + radius);
+        return all;
+    }
+
 private:
+    // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
+    template <class ForEach>
+    Box lookAt(const ForEach& forEach)
+    {
+        Box box;
+        forEach([&](const Vec3& center, float radius) { box.grow(center, radius); });
+        const Vec3 middle = box.center();
+        float reach = 0;
+        forEach([&](const Vec3& center, float radius) { reach = std::max(reach, length(center - middle) + radius); });
+        if (!box.empty()) {
+            seen_.grow(box);
+            balls_.emplace_back(middle, reach);
+        }
+        return box;
+    }
+
     // The bounds are a little larger than what they hold, so that nothing lies on the outer faces, of which the
     // upper ones belong to no cell.
     void grow(const Box& box)
@@ -148,7 +173,8 @@ private:
         bounds = tight_.padded(1e-5f * std::max({tight_.largestExtent(), far, 1e-6f}));
     }
 
-    Box tight_;
+    Box tight_, seen_;
+    std::vector<std::pair<Vec3, float>> balls_; // of each object, around all there is to see of it
     std::uint32_t nextGeometry_ = 0;
 };
 

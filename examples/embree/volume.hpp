@@ -197,12 +197,16 @@ inline VolumeSource openVolume(const std::string& path)
     return source;
 }
 
-// The box, in voxels, of what stands out from the background, as far as a lattice of about 64^3 of its voxels shows
-// it: to point a camera. The whole domain if nothing does.
-inline Box visibleBounds(const VolumeSource& source)
+// Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
+struct VisibleVoxels {
+    std::vector<Vec3> points; // the ends of rows, in voxels; the corners of the whole domain if there is nothing
+    int slack = 0;            // how many voxels beyond these the lattice leaves out
+};
+
+inline VisibleVoxels visibleVoxels(const VolumeSource& source)
 {
     const VolumeInfo& info = source.info;
-    const float threshold = 0.1f;
+    const float threshold = info.minimum + 0.1f * (info.maximum - info.minimum);
     const RowReader read = source.open();
     std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
     const auto value = [&](int x) {
@@ -214,21 +218,30 @@ inline Box visibleBounds(const VolumeSource& source)
                : info.type == VoxelType::UInt16 ? as(std::uint16_t{})
                                                 : as(float{});
     };
-    Box box;
     const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
+    VisibleVoxels visible;
+    visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
     for (int z = 0; z < info.dims[2]; z += stride(2))
         for (int y = 0; y < info.dims[1]; y += stride(1)) {
             read(0, info.dims[0], y, z, row.data());
+            int first = -1, last = -1;
             for (int x = 0; x < info.dims[0]; x += stride(0))
-                if ((value(x) - info.minimum) > threshold * (info.maximum - info.minimum))
-                    box.grow({static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)});
+                if (value(x) > threshold) {
+                    first = first < 0 ? x : first;
+                    last = x;
+                }
+            for (const int x : {first, last})
+                if (x >= 0)
+                    visible.points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
         }
-    if (box.empty()) {
-        box.grow({0, 0, 0});
-        box.grow({static_cast<float>(info.dims[0] - 1), static_cast<float>(info.dims[1] - 1),
-                  static_cast<float>(info.dims[2] - 1)});
+    if (visible.points.empty()) {
+        visible.slack = 0;
+        for (int i = 0; i < 8; ++i)
+            visible.points.emplace_back(static_cast<float>(i & 1 ? info.dims[0] - 1 : 0),
+                                        static_cast<float>(i & 2 ? info.dims[1] - 1 : 0),
+                                        static_cast<float>(i & 4 ? info.dims[2] - 1 : 0));
     }
-    return box;
+    return visible;
 }
 
 // ---- the part in memory ----------------------------------------------------------------------------------------

@@ -52,7 +52,9 @@ Scene sceneWith(const Object& object)
     Scene scene;
     scene.add(object, true);
     fuzz::require(isFinite(scene.bounds.lo) && isFinite(scene.bounds.hi), "the bounds of the scene are finite");
-    fuzz::require(isFinite(scene.focus.lo) && isFinite(scene.focus.hi), "what there is to see is finite");
+    const Focus focus = scene.focus();
+    fuzz::require(isFinite(focus.box.lo) && isFinite(focus.box.hi) && std::isfinite(focus.radius),
+                  "what there is to see is finite");
     return scene;
 }
 
