@@ -28,6 +28,7 @@ enum class OwnerMap { Lattice, Linear, Hash };
 struct Options {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files
     bool fit = true;
+    int xyzFrame = 0; // of .xyz files; 0: the first
     Mode mode = Mode::Data;
     int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;    // 0: one per rank
@@ -187,6 +188,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     bool noFit = false;
     app.add_flag("--no-fit", noFit,
                  "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
+
+    app.add_option("--xyz-frame", options.xyzFrame, "Which frame of an .xyz file that has several, from 1; default 1")
+        ->check(detail::number(1, 2147483647))
+        ->option_text("N");
 
     const char* how = "Distribution";
     app.add_option("--mode", options.mode,

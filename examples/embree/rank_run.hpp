@@ -218,6 +218,9 @@ public:
                 scene_ = std::make_unique<RankScene>(loadRankScene(o_, fb_->rank(), fb_->size()));
             }))
             return 1;
+        for (const std::string& note : scene_->notes)
+            if (fb_->isDisplayRank())
+                std::fprintf(stderr, "dfb_render: %s\n", note.c_str());
         settings_ = renderSettings(o_);
         params_.passes = o_.spp;
         params_.maxLayers = static_cast<int>(scene_->bounds.size()) * std::max(1, o_.deep);

@@ -8,10 +8,12 @@
 
 #include "obj.hpp"
 #include "ply.hpp"
+#include "shading.hpp"
 #include "spheres.hpp"
 #include "volume.hpp"
 
 #include <cstdint>
+#include <cstdio>
 #include <string>
 #include <utility>
 #include <vector>
@@ -73,7 +75,7 @@ struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
     std::vector<Vec3> normals;
-    Vec3 color;
+    Vec3 color; // where vertices have none of their own
 };
 
 struct SphereObject {
@@ -87,6 +89,7 @@ struct Scene {
     std::vector<SphereObject> spheres;
     Box bounds;
     Index3 grid{0, 0, 0}; // of the cells, x fastest; zero: by bisection
+    Notes notes;          // for the user
 
     void add(VolumeSource source, bool fit)
     {
@@ -97,7 +100,14 @@ struct Scene {
         lookAt([&](const auto& take) {
             for (const Vec3& p : visible.points)
                 take(object.placement.toWorld(p), slack);
+            if (visible.points.empty()) // the whole
+                for (int i = 0; i < 8; ++i)
+                    take({i & 1 ? object.bounds().hi.x : object.bounds().lo.x,
+                          i & 2 ? object.bounds().hi.y : object.bounds().lo.y,
+                          i & 4 ? object.bounds().hi.z : object.bounds().lo.z},
+                         0);
         });
+        noteOn(object.source, visible.points.empty());
         volumes.push_back(std::move(object));
     }
     void add(Mesh mesh, bool fit)
@@ -147,6 +157,30 @@ struct Scene {
     }
 
 private:
+    // `mayBeEmpty`: nothing was seen at a glance.
+    void noteOn(const VolumeSource& source, bool mayBeEmpty)
+    {
+        const VolumeInfo& info = source.info;
+        if (info.notFinite > 0)
+            notes.push_back(source.name + ": voxels that are not finite: " + std::to_string(info.notFinite)
+                            + "; they count as " + textOf(info.minimum));
+        if (!mayBeEmpty)
+            return;
+        const auto [lo, hi] = rangeOf(source);
+        const auto value = [&info](float v) { return (v - info.minimum) / (info.maximum - info.minimum); };
+        if (!TransferFunction(1).isTransparent(value(lo), value(hi)))
+            return;
+        notes.push_back(source.name + ": there is nothing to see: "
+                        + (lo == hi ? "all voxels are " + textOf(lo)
+                                    : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
+    }
+    static std::string textOf(float value)
+    {
+        char text[32];
+        std::snprintf(text, sizeof text, "%g", static_cast<double>(value));
+        return text;
+    }
+
     // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
     template <class ForEach>
     Box lookAt(const ForEach& forEach)
@@ -178,18 +212,18 @@ private:
     std::uint32_t nextGeometry_ = 0;
 };
 
-// Reads a file by its ending. Throws std::runtime_error that names the file.
-inline void addFile(Scene& scene, const std::string& path, bool fit)
+// Reads a file by its ending. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file.
+inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0)
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     if (ending == ".raw")
         scene.add(openVolume(path), fit);
     else if (ending == ".ply")
-        scene.add(parsePly(readFile(path), path), fit);
+        scene.add(parsePly(readFile(path), path, &scene.notes), fit);
     else if (ending == ".obj")
-        scene.add(parseObj(readFile(path), path), fit);
+        scene.add(parseObj(readFile(path), path, &scene.notes), fit);
     else if (ending == ".xyz")
-        scene.add(parseXyz(readFile(path), path), fit);
+        scene.add(parseXyz(readFile(path), path, xyzFrame, &scene.notes), fit);
     else
         throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
 }
@@ -336,6 +370,8 @@ inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
                 index = static_cast<std::uint32_t>(part.mesh.positions.size());
                 part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
                 part.normals.push_back(object.normals[triangle[k]]);
+                if (!object.mesh.colors.empty())
+                    part.mesh.colors.push_back(object.mesh.colors[triangle[k]]);
             }
             renamed[k] = index;
         }

@@ -242,6 +242,15 @@ private:
         return dot(a + ab * u + ac * v - o, d) / dot(d, d);
     }
 
+    static Vec3 colorAt(const BrickMesh& part, const Triangle& triangle, double u, double v)
+    {
+        const std::vector<Vec3>& colors = part.mesh.colors;
+        if (colors.empty())
+            return part.color;
+        return Vec3(Vec3d(colors[triangle[0]]) * (1 - u - v) + Vec3d(colors[triangle[1]]) * u
+                    + Vec3d(colors[triangle[2]]) * v);
+    }
+
     // Notes the hit and rejects it, so that Embree goes on to the next one.
     static void onTriangle(const RTCFilterFunctionNArguments* arguments)
     {
@@ -261,7 +270,7 @@ private:
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];
         hit.normal = Vec3(normalize(normal));
-        hit.color = part.color;
+        hit.color = colorAt(part, triangle, u, v);
         query.keep(distance, hit);
     }
 

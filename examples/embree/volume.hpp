@@ -41,6 +41,7 @@ struct VolumeInfo {
     Index3 dims{};
     VoxelType type = VoxelType::UInt8;
     float minimum = 0, maximum = 255; // mapped to 0 and 1
+    std::uint64_t notFinite = 0;      // voxels, which count as the minimum
 };
 
 // Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
@@ -49,6 +50,7 @@ using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* ou
 struct VolumeSource {
     VolumeInfo info;
     std::function<RowReader()> open; // each call gives a reader of its own
+    std::string name;                // of the file
 };
 
 // ---- files -----------------------------------------------------------------------------------------------------
@@ -97,10 +99,11 @@ inline VolumeInfo parseVolumeName(const std::string& path)
 
 namespace detail {
 
-// Widens [lo, hi] to the finite values of `count` voxels.
+// Widens [lo, hi] to the finite values of `count` voxels. Returns how many are not finite.
 template <class T>
-void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
+std::size_t growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
 {
+    std::size_t notFinite = 0;
     for (std::size_t i = 0; i < count; ++i) {
         T value;
         std::memcpy(&value, bytes + i * sizeof(T), sizeof(T));
@@ -108,8 +111,11 @@ void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
         if (std::isfinite(f)) {
             lo = std::min(lo, f);
             hi = std::max(hi, f);
+        } else {
+            ++notFinite;
         }
     }
+    return notFinite;
 }
 
 } // namespace detail
@@ -141,7 +147,7 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
         if (info.type == VoxelType::UInt16)
             detail::growRange<std::uint16_t>(chunk.data(), bytes / 2, lo, hi);
         else
-            detail::growRange<float>(chunk.data(), bytes / 4, lo, hi);
+            info.notFinite += detail::growRange<float>(chunk.data(), bytes / 4, lo, hi);
         done += bytes;
     }
     if (lo > hi)
@@ -192,6 +198,7 @@ inline VolumeSource openVolume(const std::string& path)
         return stream;
     };
     VolumeSource source;
+    source.name = path;
     source.info = describeVolume(*open(), path);
     source.open = [open, path, info = source.info] { return rowReader(open(), path, info); };
     return source;
@@ -199,7 +206,7 @@ inline VolumeSource openVolume(const std::string& path)
 
 // Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
 struct VisibleVoxels {
-    std::vector<Vec3> points; // the ends of rows, in voxels; the corners of the whole domain if there is nothing
+    std::vector<Vec3> points; // the ends of rows, in voxels
     int slack = 0;            // how many voxels beyond these the lattice leaves out
 };
 
@@ -234,14 +241,28 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source)
                 if (x >= 0)
                     visible.points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
         }
-    if (visible.points.empty()) {
-        visible.slack = 0;
-        for (int i = 0; i < 8; ++i)
-            visible.points.emplace_back(static_cast<float>(i & 1 ? info.dims[0] - 1 : 0),
-                                        static_cast<float>(i & 2 ? info.dims[1] - 1 : 0),
-                                        static_cast<float>(i & 4 ? info.dims[2] - 1 : 0));
-    }
     return visible;
+}
+
+// The least and the greatest of all voxels.
+inline std::array<float, 2> rangeOf(const VolumeSource& source)
+{
+    const VolumeInfo& info = source.info;
+    const RowReader read = source.open();
+    const std::size_t count = static_cast<std::size_t>(info.dims[0]);
+    std::vector<std::byte> row(count * voxelBytes(info.type));
+    float lo = std::numeric_limits<float>::infinity(), hi = -lo;
+    for (int z = 0; z < info.dims[2]; ++z)
+        for (int y = 0; y < info.dims[1]; ++y) {
+            read(0, info.dims[0], y, z, row.data());
+            if (info.type == VoxelType::UInt8)
+                detail::growRange<std::uint8_t>(row.data(), count, lo, hi);
+            else if (info.type == VoxelType::UInt16)
+                detail::growRange<std::uint16_t>(row.data(), count, lo, hi);
+            else
+                detail::growRange<float>(row.data(), count, lo, hi);
+        }
+    return {lo, hi};
 }
 
 // ---- the part in memory ----------------------------------------------------------------------------------------

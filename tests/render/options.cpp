@@ -60,6 +60,9 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.compression == Compression::None);
     CHECK(o.sharedMemory);
     CHECK(o.peerTimeout == 300);
+    CHECK(o.xyzFrame == 0);
+    CHECK(o.deep == 0);
+    CHECK_FALSE(o.view.distance);
     CHECK(o.ownerMap == OwnerMap::Lattice);
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
@@ -180,6 +183,8 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
             checkRefused({option, value});
     checkRefused({"--fov", "0"});
     checkRefused({"--camera-distance", "-1"});
+    for (const std::string value : {"0", "-1", "1.5", "last"})
+        checkRefused({"--xyz-frame", value});
     checkRefused({"--opacity", "1.01"});
     checkRefused({"--opacity", "-0.01"});
     checkRefused({"--background", "1,1"});
