@@ -224,13 +224,13 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(how);
     app.add_option(
            "--interleave", options.interleave,
-           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1. Pixels whose "
-           "order is undefined are counted, unless --deep has segments enough")
+           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1")
         ->check(detail::number(1, 4096))
         ->option_text("C")
         ->group(how);
     app.add_option("--deep", options.deep,
-                   "Deep fragments: the most segments per pixel and brick; default 0: a single fragment")
+                   "Deep fragments: the most segments per pixel and brick. With fewer than --interleave the order may "
+                   "be undefined at some pixels, which are counted; default: that many; 0 without: a single fragment")
         ->check(detail::number(0, 65535))
         ->option_text("K")
         ->group(how);
@@ -463,6 +463,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     try {
         app.parse(argc, argv);
         options.fit = !noFit;
+        if (options.interleave > 1 && app.count("--deep") == 0)
+            options.deep = options.interleave; // as many pieces as a brick can have on a ray
         options.sharedMemory = !noSharedMemory;
         if (app.count("--size") > 0)
             detail::parseSize("--size", size, 65536, options.width, options.height);

@@ -204,6 +204,15 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
     checkRefused({"-q"});
 }
 
+TEST_CASE("Bricks that lie in each other have as many segments as they have cells", "[options]")
+{
+    CHECK(options({"demo", "--interleave", "5"}).deep == 5);
+    CHECK(options({"demo", "--interleave", "1"}).deep == 0);
+    CHECK(options({"demo", "--interleave", "5", "--deep", "2"}).deep == 2);
+    CHECK(options({"demo", "--interleave", "5", "--deep", "0"}).deep == 0);
+    CHECK(options({"demo", "--deep", "3"}).deep == 3);
+}
+
 TEST_CASE("A scene must be named", "[options]")
 {
     for (const std::vector<std::string>& words : std::vector<std::vector<std::string>>{{},
