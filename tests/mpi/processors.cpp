@@ -14,6 +14,8 @@
 #if defined(__linux__)
 #include <sched.h>
 
+namespace processors_cases {
+
 namespace {
 
 std::vector<int> listOf(const cpu_set_t& mask)
@@ -89,4 +91,7 @@ TEST_CASE("Ranks whose CPU masks meet divide the processors; those with masks of
     CHECK(sharingRanks() == same);
     CHECK(sched_setaffinity(0, sizeof before, &before) == 0);
 }
+
+} // namespace processors_cases
+
 #endif

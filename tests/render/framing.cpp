@@ -11,6 +11,8 @@
 #include <utility>
 #include <vector>
 
+namespace framing_cases {
+
 namespace {
 
 using example::Box;
@@ -190,3 +192,5 @@ TEST_CASE("A very narrow image has a camera at a distance that can be reckoned w
     CHECK(distance > 100.0f);
     CHECK(distance < 1001.0f);
 }
+
+} // namespace framing_cases

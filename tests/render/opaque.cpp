@@ -13,6 +13,8 @@
 #include <memory>
 #include <vector>
 
+namespace opaque_cases {
+
 namespace {
 
 using example::Box;
@@ -214,3 +216,5 @@ TEST_CASE("The first hits of a ray are those of all", "[opaque]")
         CHECK(wrong == 0);
     }
 }
+
+} // namespace opaque_cases

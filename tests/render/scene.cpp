@@ -9,6 +9,8 @@
 #include <string>
 #include <vector>
 
+namespace scene_cases {
+
 using namespace example;
 
 namespace {
@@ -121,3 +123,5 @@ TEST_CASE("The colours of vertices are in the image, cut or whole", "[scene]")
     CHECK(before < 0.1f);
     CHECK(wrong == 0);
 }
+
+} // namespace scene_cases
