@@ -83,16 +83,14 @@ public:
         // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
 
-        // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
-        // children that these announce need no declaration; it may say so after it sent some. A rank without any calls
-        // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing.
-        // Throws InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
+        // Only with FrameParams::declared: each rank says once in each frame which inputs of generation 1 it will send,
+        // in each pass; children that these announce need no declaration; it may say so after it sent some. A rank
+        // without any calls it with none. An input that turns out empty must be sent all the same; it costs a header.
+        // A rank that declares what it declared last sends nothing for it, but for its part of a reduction; otherwise
+        // it tells the owners that it touches or touched, as far as it is news to them. Waits for nothing. Throws
+        // InvalidArgument, with nothing declared, for a tile outside the image, a second time in a frame, and in a
+        // frame that was not begun so; without it, the frame fails in end().
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
-        bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
-
-        // For a rendering loop to keep what it has declared its inputs from: it stays there as long as the declaration
-        // holds (see FrameParams::declarationKey) and is empty in the first frame of each.
-        std::any& declaredFrom() const noexcept { return engine_->declaredFrom(); }
 
         // For a rendering loop to keep memory in that it needs in each frame: what it leaves there, a later frame finds
         // there, unless another loop has come between.

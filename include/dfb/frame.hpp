@@ -78,12 +78,8 @@ struct FrameParams {
     int maxLayers = 0;
     std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
-    // True: each rank says with Frame::declare() what it will send, and owners count on that.
+    // True: each rank says with Frame::declare() what it will send, and owners count on that. Loops set it themselves.
     bool declared = false;
-    // Not 0 and the same as in the last frame, which succeeded: what was declared then still holds, and declare() must
-    // not be called, nor is it looked up again which tiles the bricks project to. Change it when bricks or camera
-    // change.
-    std::uint64_t declarationKey = 0;
     // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
     // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.

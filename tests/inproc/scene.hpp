@@ -166,7 +166,7 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
 }
 
 template <class FrameBuffer>
-dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal = 0, std::uint64_t declarationKey = 0)
+dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal = 0)
 {
     const auto mine = bricksOf(s, fb.rank(), fb.size(), deal);
     const auto render = [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); };
@@ -182,11 +182,9 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
     }
     case Loop::Declared: break;
     }
-    dfb::FrameParams params = paramsOf(s);
-    params.declarationKey = declarationKey;
     return dfb::renderDataParallel(
         fb, dfb::World(mine), FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); },
-        params);
+        paramsOf(s));
 }
 
 // What the display rank had after a frame.

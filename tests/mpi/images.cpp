@@ -154,7 +154,7 @@ TEST_CASE("Ordinary: an empty view, one pixel, a declaration that is kept", "[im
     dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s, 2));
     std::vector<std::int64_t> messages;
     for (int frame = 0; frame < 3; ++frame) {
-        const auto report = scene::renderLoop(fb, s, Loop::Declared, 0, 77);
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
         messages.push_back(report.messagesSent);
         if (fb.isDisplayRank())
             CHECK(scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0);

@@ -110,7 +110,6 @@ public:
     std::int64_t imageFrame() const noexcept { return pipeline_->gather().imageFrame(); }
     bool isComplete(int tile) const { return pipeline_->gather().isComplete(tile); }
     std::int64_t frame() const noexcept { return gate_.frame(); }
-    bool wantsDeclaration() const noexcept { return wantsDeclaration_; }
     bool failed() const noexcept { return outcome_->failed(); }
 
     void begin(const FrameParams& params, const TileFrameData& tileData, const PixelFrameData& pixelData)
@@ -122,21 +121,13 @@ public:
         if (params.maxLayers < 0)
             throw InvalidArgument("at most " + std::to_string(params.maxLayers) + " layers");
         checkSamples(params);
-        if (params.declarationKey != 0 && !params.declared)
-            throw InvalidArgument("a declarationKey without declared inputs");
         if (params.timeoutMs < 0 || (params.timeoutMs == 0 && params.allowPartial))
             throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms"
                                   + (params.allowPartial ? " for a frame that may be partial" : ""));
         messaging_->requireProgress();
         messaging_->messenger().throwIfFailed();
-        const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
         params_ = params;
-        lastKey_ = 0;
-        wantsDeclaration_ = params.declared && !reuse;
-        if (!reuse) {
-            manifests_.reset();
-            declaredFrom_.reset();
-        }
+        manifests_.newFrame(!lastFailed_); // if it did, some owners may have what was declared in it, and others not
 
         TileInfo info;
         info.rank = rank();
@@ -190,8 +181,6 @@ public:
             }
         if (!params.declared)
             tilesLess(countUnknown);
-        else if (reuse)
-            applyDeclarations();
     }
 
     template <class AnyTile>
@@ -280,25 +269,25 @@ public:
 
     void declare(const std::vector<TileInput>& inputs)
     {
-        if (!wantsDeclaration_ || manifests_.declared())
-            throw InvalidArgument(!params_.declared ? "declare() in a frame that was not begun with declared inputs"
-                                                    : "declare() a second time, or where the last frame's holds");
+        if (!params_.declared)
+            throw InvalidArgument("declare() in a frame that was not begun with declared inputs");
+        if (manifests_.declared())
+            throw InvalidArgument("declare() a second time in a frame");
         for (const TileInput& input : inputs)
             if (input.tile < 0 || input.tile >= layout().tileCount())
                 throw InvalidArgument("declare() of tile " + std::to_string(input.tile) + " of an image of "
                                       + std::to_string(layout().tileCount()) + " tiles");
         if (outcome_->failed())
             return;
-        const bool sent = manifests_.split(
+        const bool isWaiting = manifests_.declare(
             inputs, rank(), [this](int tile) { return tileOwner(tile); },
             [this](int owner, const Bytes& manifest) {
                 messaging_->send(owner, MessageKind::Manifest, gate_.frame(), manifest);
             });
-        if (!sent)
+        if (!isWaiting)
             enterAllDeclared();
     }
 
-    std::any& declaredFrom() noexcept { return declaredFrom_; }
     std::any& loopMemory() noexcept { return loopMemory_; }
 
     void abort(const std::exception_ptr& reason, int tile)
@@ -333,8 +322,12 @@ public:
 
     FrameReport end()
     {
-        if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
-            guarded([] { throw InvalidArgument("end() of a frame with declared inputs without declare()"); });
+        if (params_.declared && !manifests_.declared() && !outcome_->failed()) {
+            const auto reason = outcome_->reason(); // why declare() was not called, in a frame that may be partial
+            failWhole(reason ? std::make_exception_ptr(Error(*reason))
+                             : std::make_exception_ptr(
+                                 InvalidArgument("end() of a frame with declared inputs without declare()")));
+        }
         if (pipeline_->gather().displays())
             guarded([this] { pipeline_->finishBackground(); });
         const Verdict verdict = conclude();
@@ -346,7 +339,6 @@ public:
             if (config_.codec)
                 compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
             gains_->endFrame();
-            lastKey_ = params_.declarationKey;
             lastAccumulationId_ = params_.accumulationId;
         }
 
@@ -588,7 +580,7 @@ private:
         switch (kind) {
         case MessageKind::Fragment: arrive(std::move(message), source); break;
         case MessageKind::Manifest:
-            if (!wantsDeclaration_) {
+            if (!params_.declared) {
                 ErrorInfo info;
                 info.kind = ErrorKind::Disagreement;
                 info.message = "the sender declares its inputs, this rank expects no declaration";
@@ -665,7 +657,7 @@ private:
             } else if (scope == AllDeclared) {
                 if (!messaging_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
-                differs = isUp && !wantsDeclaration_;
+                differs = isUp && !params_.declared;
             } else if (scope == SameParams) {
                 const Bytes bytes = messaging_->bytesOf(message);
                 ByteReader in(bytes);
@@ -847,7 +839,7 @@ private:
     std::optional<ErrorInfo> missing()
     {
         std::optional<ErrorInfo> info;
-        if (!ownTilesDone_ && wantsDeclaration_ && tilesLeft_ >= countUnknown / 2) {
+        if (!ownTilesDone_ && params_.declared && tilesLeft_ >= countUnknown / 2) {
             info.emplace();
             info->message = "not all ranks have declared their inputs";
             info->expected = size();
@@ -1062,7 +1054,7 @@ private:
     std::unique_ptr<Pipeline> pipeline_;
     const Image noImage_;
     ManifestExchange manifests_;
-    std::any declaredFrom_, loopMemory_; // see Frame
+    std::any loopMemory_; // see Frame
     JobShare jobs_;
     HiddenTiles hidden_;
 
@@ -1070,13 +1062,11 @@ private:
     FrameGate gate_;
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
-    std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
     std::uint64_t lastAccumulationId_ = 0;
     bool frameOpen_ = false, lastFailed_ = false;
     FrameFigures figures_;
     CompressionTrial compressionTrial_;
     std::optional<CompressionGains> gains_; // per rank that this one sends to
-    std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};

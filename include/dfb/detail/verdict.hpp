@@ -78,7 +78,6 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
     f.add(static_cast<std::uint64_t>(p.maxLayers));
     f.add(p.accumulationId);
     f.add(p.declared);
-    f.add(p.declarationKey);
     f.add(static_cast<std::uint64_t>(p.timeoutMs));
     f.add(p.allowPartial);
     return f.value();
@@ -210,8 +209,7 @@ struct Verdict {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
         info.message = "the frame was begun with different parameters (background, passes, samples, maxLayers, "
-                       "accumulationId, declared, "
-                       "declarationKey, timeoutMs, allowPartial)";
+                       "accumulationId, declared, timeoutMs, allowPartial)";
         return info;
     }
 

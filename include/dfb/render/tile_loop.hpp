@@ -47,18 +47,12 @@ struct TileOf<FrameBuffer, InPlace<Find>> {
 };
 
 // What a loop has to do: a `Work`, a type of that loop alone, that it has again in the next frame, with its memory.
-// Calls find(work) for what holds as long as a declaration of inputs: not in the frames that go by the last one.
-template <class Work, class Frame, class Find>
-Work& workOf(const Frame& frame, const Find& find)
+template <class Work, class Frame>
+Work& workOf(const Frame& frame)
 {
     auto* work = std::any_cast<std::shared_ptr<Work>>(&frame.loopMemory());
     if (!work)
         work = &frame.loopMemory().template emplace<std::shared_ptr<Work>>(std::make_shared<Work>());
-    Work* const* found = std::any_cast<Work*>(&frame.declaredFrom());
-    if (!found || *found != work->get()) {
-        find(**work);
-        frame.declaredFrom() = work->get();
-    }
     return **work;
 }
 
