@@ -69,14 +69,20 @@ using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 // What a frame begins with; the same on all ranks, which is checked in the verdict.
 struct FrameParams {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
-    int passes = 1;                              // samples a pixel, each a pass
+    // Samples a pixel, each a pass. With a tile operation that keepsState they are those that follow the last frame's,
+    // see accumulationId; with any other, from 0 on.
+    int passes = 1;
     // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile
     // operation that keepsState may a tile have none or not begin with sample 0.
     SamplePlan samples;
     // For an ErrorBudget: no pixel has more inputs than this in a pass; 0: not known, taken for 65536. Loops that know
     // better say so themselves.
     int maxLayers = 0;
-    std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
+    // For tile operations that keepState (Progressive): frames with the same id accumulate, and the image is the mean
+    // of all their samples, whatever they show. Take another one when camera, scene or background change: then the
+    // samples of each tile begin with 0 again. They do so too after a frame that failed or was partial, and without
+    // `samples` after a frame with them.
+    std::uint64_t accumulationId = 0;
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
     // True: each rank says with Frame::declare() what it will send, and owners count on that. Loops set it themselves.
     bool declared = false;

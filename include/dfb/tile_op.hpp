@@ -24,7 +24,9 @@
 //   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
 //                                                isComplete() does not wait for them: nobody need render them
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
-//                                                in a frame, and the image keeps its pixels
+//                                                in a frame, and the image keeps its pixels. TileInfo says which
+//                                                samples come; those of a tile without inputs before, in frames that
+//                                                it was not asked in, are TileInfo::emptySamples
 //   static constexpr bool emptyIsBackground = true;   out of inputs without any pixel it makes the background: then it
 //                                                need not be asked, and nothing travels
 //   void report(TileReport&) const;              after finish(): figures of the tile
@@ -52,6 +54,7 @@ struct TileInfo {
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
+    int emptySamples = 0;                        // those before it, if there was nothing in any: they are background
     std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
     float minTransmittance = 0;                  // what lets less through counts as opaque
     ChannelMask wanted = 0;                      // what the image has beside the colour

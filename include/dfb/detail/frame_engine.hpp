@@ -133,6 +133,7 @@ public:
         info.rank = rank();
         info.frame = gate_.next();
         info.passes = params.passes;
+        info.firstSample = firstSampleOf(params);
         info.accumulationId = params.accumulationId;
         info.wanted = Pipeline::imageChannels(config_);
         info.background = params.background;
@@ -340,6 +341,7 @@ public:
                 compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
             gains_->endFrame();
             lastAccumulationId_ = params_.accumulationId;
+            nextSample_ = params_.samples ? 0 : pipeline_->table().frameInfo().firstSample + params_.passes;
         }
 
         const double nsPerMs = 1e6;
@@ -931,11 +933,27 @@ private:
             throw InvalidArgument("a least transmittance of " + std::to_string(config_.minTransmittance));
     }
 
-    // Throws InvalidArgument for a plan that this framebuffer can not follow.
+    // Whether what the last frame left behind is of use.
+    bool accumulates(const FrameParams& params) const
+    {
+        return KeepsState<TileOp>::value && !lastFailed_ && params.accumulationId == lastAccumulationId_;
+    }
+
+    // Without a plan: of each tile.
+    int firstSampleOf(const FrameParams& params) const
+    {
+        return !params.samples && accumulates(params) ? nextSample_ : 0;
+    }
+
+    // Throws InvalidArgument for samples that this framebuffer can not take.
     void checkSamples(const FrameParams& params) const
     {
-        if (!params.samples)
+        if (!params.samples) {
+            if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
+                throw InvalidArgument("a tile can not have " + std::to_string(params.passes) + " samples from "
+                                      + std::to_string(firstSampleOf(params)) + " on: take another accumulationId");
             return;
+        }
         if (params.samples->size() != static_cast<std::size_t>(layout().tileCount()))
             throw InvalidArgument("a plan of the samples of " + std::to_string(params.samples->size())
                                   + " tiles for an image of " + std::to_string(layout().tileCount()));
@@ -945,7 +963,7 @@ private:
                                       + std::to_string(t.first) + " on");
             if (!KeepsState<TileOp>::value && (t.count == 0 || t.first > 0))
                 throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
-            if ((t.first > 0 || t.count == 0) && (lastFailed_ || params.accumulationId != lastAccumulationId_))
+            if ((t.first > 0 || t.count == 0) && !accumulates(params))
                 throw InvalidArgument("what was accumulated is of no use, as the last frame failed or had another "
                                       "accumulationId: begin again with sample 0 of each tile");
         }
@@ -1063,6 +1081,7 @@ private:
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
     std::uint64_t lastAccumulationId_ = 0;
+    int nextSample_ = 0; // of each tile, if the next frame has no plan and accumulates
     bool frameOpen_ = false, lastFailed_ = false;
     FrameFigures figures_;
     CompressionTrial compressionTrial_;

@@ -54,6 +54,13 @@ public:
         nearest(aux_.instanceId, row.aux.instanceId);
     }
 
+    // Adds `count` rows of nothing to all pixels, as if one by one: sums of so many equal floats are exact.
+    void addBackground(std::int64_t count, const std::array<float, 4>& background)
+    {
+        for (std::size_t i = 0; count > 0 && i < rgba_.size(); ++i)
+            rgba_[i] += static_cast<double>(count) * static_cast<double>(background[i % 4]);
+    }
+
     const double* rgba(std::size_t pixel) const noexcept { return rgba_.data() + 4 * pixel; }
 
     // Writes pixels [first, first + out.width()), the mean of `count` passes, as row y. Returns what setRow() does.
