@@ -102,23 +102,25 @@ int main(int argc, char** argv)
     params.timeoutMs = 10000; // a patch that was announced and does not come is an error then
     auto frame = fb.begin(params);
     const auto tile = std::make_unique<FrameBuffer::Tile>();
-    for (int level = 0; level < levels; ++level)
-        for (int j = 0; j < height / patchSize[level]; ++j)
-            for (int i = 0; i < width / patchSize[level]; ++i) {
-                if ((3 * i + 5 * j + level) % fb.size() != fb.rank() || !exists(level, i, j))
-                    continue; // another rank has it
-                const int perTile = patchSize[0] / patchSize[level];
-                frame.start(*tile, j / perTile * (width / patchSize[0]) + i / perTile);
-                tile->generation = level;
-                tile->part = static_cast<std::uint16_t>(j % perTile * perTile + i % perTile);
-                for (int child = 0; child < 4 && level + 1 < levels; ++child)
-                    tile->children += exists(level + 1, 2 * i + child % 2, 2 * j + child / 2);
-                tile->forEachPixel([&](int x, int y, float* rgba) {
-                    if (x / patchSize[level] == i && y / patchSize[level] == j)
-                        colorOf(level, x, y, rgba);
-                });
-                frame.setTile(*tile);
-            }
+    frame.guard([&] { // an exception comes out of end(), on all ranks
+        for (int level = 0; level < levels; ++level)
+            for (int j = 0; j < height / patchSize[level]; ++j)
+                for (int i = 0; i < width / patchSize[level]; ++i) {
+                    if ((3 * i + 5 * j + level) % fb.size() != fb.rank() || !exists(level, i, j))
+                        continue; // another rank has it
+                    const int perTile = patchSize[0] / patchSize[level];
+                    frame.start(*tile, j / perTile * (width / patchSize[0]) + i / perTile);
+                    tile->generation = level;
+                    tile->part = static_cast<std::uint16_t>(j % perTile * perTile + i % perTile);
+                    for (int child = 0; child < 4 && level + 1 < levels; ++child)
+                        tile->children += exists(level + 1, 2 * i + child % 2, 2 * j + child / 2);
+                    tile->forEachPixel([&](int x, int y, float* rgba) {
+                        if (x / patchSize[level] == i && y / patchSize[level] == j)
+                            colorOf(level, x, y, rgba);
+                    });
+                    frame.setTile(*tile);
+                }
+    });
     frame.end();
     if (!fb.isDisplayRank())
         return 0;

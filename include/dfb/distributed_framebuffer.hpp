@@ -119,6 +119,24 @@ public:
         // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
         bool failed() const noexcept { return engine_->failed(); }
 
+        // Calls body(), as what a loop of your own does between begin() and end(), or one tile of it. An exception of
+        // it goes to abort() and no further, so that end() throws FrameError with its text on all ranks, this one
+        // included: whoever calls this calls end() as well, whatever becomes of it. False if there was one. From any
+        // thread, on one rank or all; waits for no other rank. Without it an exception that ends the frame's scope
+        // tells the other ranks only that the frame was left.
+        template <class Body>
+        bool guard(const Body& body)
+        {
+            return guardAbout(body, nullptr);
+        }
+        // The same for body() that renders `tile`: the error names it, and with FrameParams::allowPartial the frame
+        // goes on without it alone. Its number is looked at when there is an exception.
+        template <class Body>
+        bool guard(const Body& body, const TileHeader& tile)
+        {
+            return guardAbout(body, &tile);
+        }
+
         // Makes the frame fail on all ranks, with the text of this exception; with FrameParams::allowPartial it goes on
         // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
         // will name it. From any thread.
@@ -144,6 +162,18 @@ public:
         }
 
     private:
+        template <class Body>
+        bool guardAbout(const Body& body, const TileHeader* tile)
+        {
+            try {
+                body();
+                return true;
+            } catch (...) {
+                abort(std::current_exception(), tile ? tile->tile : -1);
+                return false;
+            }
+        }
+
         friend class DistributedFrameBuffer;
         Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
         DistributedFrameBuffer* fb_;

@@ -374,7 +374,9 @@ public:
             if (outcome_->failed())
                 dropRest();
             else
-                failWhole(std::make_exception_ptr(Error(cancelled("the frame was left without end()"))));
+                failWhole(std::make_exception_ptr(
+                    Error(cancelled("the frame was left without end(). If by an exception: Frame::guard() around what "
+                                    "throws tells all ranks its text"))));
             conclude();
         } catch (const TransportError&) {
             // begin() will say so.

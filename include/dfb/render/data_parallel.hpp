@@ -25,13 +25,13 @@ template <class FrameBuffer, class Camera, class RenderBrick>
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.guard([&] {
+    frame.guard([&] {
         auto& work = detail::workOf<detail::OwnBricks>(frame);
         work.find(world, camera, fb.layout());
         frame.declare(work.inputs);
         const std::vector<BrickInTile>& pairs = work.pairs;
         const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
+        detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
         loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
             const auto job = jobs.at(static_cast<std::int64_t>(i));
             const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];

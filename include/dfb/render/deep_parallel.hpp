@@ -38,8 +38,7 @@ template <class FrameBuffer, class Camera, class RenderBrick>
         throw InvalidArgument("a pixel has 1 to 65535 segments");
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer, void> loop(fb, frame);
-    loop.guard([&] {
+    frame.guard([&] {
         auto& work = detail::workOf<detail::OwnBricks>(frame);
         work.find(world, camera, fb.layout());
         frame.declare(work.inputs);
@@ -47,6 +46,7 @@ template <class FrameBuffer, class Camera, class RenderBrick>
         const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
         std::mutex mutex;
         std::vector<std::unique_ptr<DeepTile>> spare;
+        detail::TileLoop<FrameBuffer, void> loop(fb, frame);
         loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
             const auto job = jobs.at(static_cast<std::int64_t>(i));
             const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];

@@ -96,7 +96,7 @@ template <class FrameBuffer, class RenderTile>
                  [&](std::size_t i, auto& tile) { render(rank + static_cast<std::int64_t>(i) * size, tile); });
         break;
     case WorkDistribution::Dynamic:
-        loop.guard([&] {
+        frame.guard([&] {
             for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
                  range = frame.nextJobs(count))
                 renderRange(range.begin, range.end, detail::scatteringStride(count));

@@ -298,7 +298,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.guard([&] {
+    frame.guard([&] {
         auto& work = detail::workOf<detail::MixedWork>(frame);
         detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
         const std::vector<BrickInTile>& pairs = work.pairs;
@@ -350,7 +350,7 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     params.declared = false;
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.guard([&] {
+    frame.guard([&] {
         auto& work = detail::workOf<detail::OrderedWork>(frame);
         detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
         std::vector<BrickInTile>& pairs = work.pairs;

@@ -6,7 +6,6 @@
 #include <any>
 #include <cstddef>
 #include <cstdint>
-#include <exception>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -110,7 +109,7 @@ public:
     template <class Job>
     void run(std::size_t count, const Job& job)
     {
-        guard([&] {
+        frame_.guard([&] {
             fb_.executor().parallelFor(count, [&](std::size_t i) {
                 if (frame_.failed())
                     return;
@@ -121,21 +120,10 @@ public:
                 if (!tile)
                     tile.reset(new Tile); // start() clears it
                 tile->tile = -1;
-                guard([&] { job(i, *tile); }, &tile->tile); // the frame may do without that one
+                frame_.guard([&] { job(i, *tile); }, *tile); // the frame may do without that one
                 spare = std::move(tile);
             });
         });
-    }
-
-    // Calls body(); what it throws makes the frame fail. `tile`: which one it was about, once that is known.
-    template <class Body>
-    void guard(const Body& body, const int* tile = nullptr)
-    {
-        try {
-            body();
-        } catch (...) {
-            frame_.abort(std::current_exception(), tile ? *tile : -1);
-        }
     }
 
 private:
