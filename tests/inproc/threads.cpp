@@ -14,6 +14,8 @@
 #include <sched.h>
 #endif
 
+namespace threads_cases {
+
 namespace {
 
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>, dfb::NoPixelOp, dfb::InprocTransport>;
@@ -72,3 +74,5 @@ TEST_CASE("A process that may use one processor makes one thread", "[threads]")
     CHECK(inFrame == std::vector<std::vector<int>>{{1, 1}});
 }
 #endif
+
+} // namespace threads_cases
