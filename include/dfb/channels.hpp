@@ -13,8 +13,8 @@ namespace dfb {
 // A pixel of an input is there if its colour or alpha is not 0. Else nothing of it counts, whatever its other channels
 // hold. One with colour and alpha 0 is emission: the colour adds, hides nothing, and gives no depth, position or id.
 //
-// Other is DepthComposite, and any operation that says activeByDepth (tile_op.hpp): there a pixel is there if its depth
-// is below +infinity, and gives depth, position and ids whatever its colour and alpha.
+// With DepthComposite, and any operation that says activeByDepth (tile_op.hpp), a pixel is there if its depth is below
+// +infinity. With DepthComposite it then gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
 // Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
