@@ -6,3 +6,4 @@ template algorithms::Result algorithms::inProcess<algorithms::Mixed>(int);
 template algorithms::Result algorithms::inProcess<algorithms::OtherBounds>(int);
 template algorithms::Result algorithms::inProcess<algorithms::Unbalanced>(int);
 template algorithms::Result algorithms::inProcess<algorithms::Ordered>(int);
+template algorithms::Result algorithms::inProcess<algorithms::WrongOwner>(int);

@@ -9,8 +9,10 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <tuple>
 #include <utility>
+#include <vector>
 
 namespace algorithms {
 
@@ -286,11 +288,67 @@ struct Ordered {
     }
 };
 
+// An owner that names a rank without the brick, and an order that is none, are errors on all ranks; the next frame is
+// right.
+struct WrongOwner {
+    struct Owner {
+        int size = 1, shift = 0; // from one that has it; -1: nobody
+
+        int operator()(const dfb::SharedBrick& brick, int, int) const
+        {
+            return shift < 0 ? size : (brick.ranks.front() + shift) % size;
+        }
+    };
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        scene::Scene s = scene::makeScene(3, 6);
+        s.timeoutMs = 5000; // nothing waits for it
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport> inOrder(communicator,
+                                                                                                   configOf(s, 1));
+        const dfb::World mine(bricksOf(s, fb.rank(), fb.size()));
+        const dfb::SharedWorld world(fb, mine);
+        const auto render = [&](const dfb::Brick& b, auto& tile) {
+            if (std::none_of(mine.bricks().begin(), mine.bricks().end(), [&](auto& m) { return m.id == b.id; }))
+                result.expect(false, "a brick that this rank does not have is rendered");
+            renderBrick(s, b, tile);
+        };
+        const auto frame = [&](Owner owner, const std::vector<int>& order, bool isOrdered) {
+            return scene::outcomeOf([&] {
+                if (isOrdered)
+                    dfb::renderOrdered(inOrder, world, scene::FlatCamera(), order, owner, render, paramsOf(s));
+                else
+                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
+            });
+        };
+        for (const bool isOrdered : {false, true}) {
+            for (const int shift : {1, -1}) {
+                const std::string outcome = frame({fb.size(), shift}, {0, 1, 2}, isOrdered);
+                result.expect(shift == 1 && fb.size() == 1 ? outcome == "fine"
+                                                           : scene::has(outcome, "which does not hold it"),
+                              outcome);
+                const std::string after = frame({fb.size(), 0}, {0, 1, 2}, isOrdered);
+                result.expect(after == "fine", "the frame after: " + after);
+            }
+        }
+        for (const std::vector<int>& order :
+             std::vector<std::vector<int>>{{0, 1}, {0, 1, 1}, {0, 1, 3}, {-1, 1, 2}, {0, 1, 2, 0}, {}}) {
+            const std::string outcome = frame({fb.size(), 0}, order, true);
+            result.expect(scene::has(outcome, "the order does not have each brick once"), outcome);
+        }
+        return result;
+    }
+};
+
 // In distribution.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<Mixed>(int);
 extern template Result inProcess<OtherBounds>(int);
 extern template Result inProcess<Unbalanced>(int);
 extern template Result inProcess<Ordered>(int);
+extern template Result inProcess<WrongOwner>(int);
 
 } // namespace algorithms
 
@@ -313,5 +371,10 @@ TEST_CASE("Two ranks per brick take a third and more of the slowest rank's work,
 TEST_CASE("Bricks in a known order blend to the image of sorted ones, without depth", "[distribution]")
 {
     everywhere<algorithms::Ordered>();
+}
+
+TEST_CASE("An owner that has not got the brick, or a wrong order, is an error on all ranks", "[distribution]")
+{
+    everywhere<algorithms::WrongOwner>();
 }
 #endif

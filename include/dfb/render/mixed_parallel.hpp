@@ -8,7 +8,7 @@
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
 //                                  called before: all pairs of the frame, and of each how many passes it has. The
 //                                  frame's report then has the cost of each pair, for the next plan.
-// It must decide alike on all ranks.
+// It must decide alike on all ranks. A rank that does not hold the brick makes the frame fail.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -20,6 +20,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <string>
 #include <tuple>
 #include <type_traits>
 #include <unordered_map>
@@ -200,11 +201,18 @@ struct MixedWork {
         if constexpr (HasPlan<Owner>::value)
             owner.plan(world, pairs, passes);
         jobs.clear();
-        for (std::size_t p = 0; p < pairs.size(); ++p)
-            for (int pass = 0; pass < passes[p]; ++pass)
-                if (owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], pairs[p].tile, pass)
-                    == world.rank())
+        for (std::size_t p = 0; p < pairs.size(); ++p) {
+            const SharedBrick& brick = world.bricks()[static_cast<std::size_t>(pairs[p].brick)];
+            for (int pass = 0; pass < passes[p]; ++pass) {
+                const int rank = owner(brick, pairs[p].tile, pass);
+                if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
+                    throw InvalidArgument("the tile-brick owner gives tile " + std::to_string(pairs[p].tile)
+                                          + " of brick " + std::to_string(brick.brick.id) + " to rank "
+                                          + std::to_string(rank) + ", which does not hold it");
+                if (rank == world.rank())
                     jobs.push_back({p, pass});
+            }
+        }
     }
 };
 
@@ -358,7 +366,8 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
         std::vector<int>&place = work.place, &firstPair = work.firstPair, &empty = work.empty;
         place.assign(world.bricks().size(), -1);
         for (std::size_t i = 0; i < order.size(); ++i)
-            place.at(static_cast<std::size_t>(order[i])) = static_cast<int>(i);
+            if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
+                place[brick] = static_cast<int>(i);
         if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
             throw InvalidArgument("the order does not have each brick once");
         std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
