@@ -16,10 +16,10 @@ set(level_5 dither.hpp tile.hpp render/footprint.hpp)
 set(level_6 compositing.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 fragment_compositor.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
 set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
-            detail/tile_table.hpp detail/verdict.hpp)
+            detail/tile_table.hpp detail/frame_terms.hpp)
 set(level_9 detail/finished_record.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
-            testing/verified.hpp detail/frame_figures.hpp detail/outcome.hpp)
-set(level_10 detail/final_gather.hpp testing/adversarial.hpp)
+            testing/verified.hpp detail/verdict.hpp)
+set(level_10 detail/final_gather.hpp detail/frame_figures.hpp detail/outcome.hpp testing/adversarial.hpp)
 set(level_11 detail/tile_pipeline.hpp)
 set(level_12 detail/frame_engine.hpp)
 set(level_13 display_wall.hpp distributed_framebuffer.hpp)

@@ -47,7 +47,7 @@ public:
         std::sort(declared_.begin(), declared_.end());
         const auto twice = std::adjacent_find(declared_.begin(), declared_.end());
         if (twice != declared_.end())
-            fail(ErrorKind::DuplicateInput, 1, twice->first, 1, 2, "declared twice");
+            failTwice(1, twice->first, twice->second, -1, -1);
         hasDeclaration_ = true;
         for (const Input& input : inputs_)
             if (input.generation == 1)
@@ -61,36 +61,60 @@ public:
 
     // Takes note of one input. Throws Error, naming generation, source, expected and got, for: a negative number
     // of children, a duplicate (generation, source, part), more inputs than announced, and an input of a
-    // generation or source that nobody announced. After a throw the tree is of no further use until reset().
-    void arrive(int generationIndex, std::uint32_t source, std::uint16_t part, int children)
+    // generation or source that nobody announced. After a throw the tree is of no further use until reset(). `rank`:
+    // that it comes from, if that is known; for what is said of errors.
+    void arrive(int generationIndex, std::uint32_t source, std::uint16_t part, int children, int rank = -1)
     {
-        const Input input{generationIndex, source, part};
+        const Input input{generationIndex, source, part, rank, children};
         if (generationIndex < 0)
-            fail(ErrorKind::UnannouncedInput, 0, source, 0, 0, "the generation is negative");
+            fail(ErrorKind::UnannouncedInput, 0, source, rank, 0, 0, "the generation is negative");
         if (generationIndex >= maxGenerations)
-            fail(ErrorKind::UnannouncedInput, generationIndex, source, maxGenerations, generationIndex,
+            fail(ErrorKind::UnannouncedInput, generationIndex, source, rank, maxGenerations, generationIndex,
                  "a tree has at most " + std::to_string(maxGenerations) + " generations");
         if (children < 0)
-            fail(ErrorKind::NegativeChildren, generationIndex, source, -1, -1,
+            fail(ErrorKind::NegativeChildren, generationIndex, source, rank, -1, -1,
                  "announced " + std::to_string(children) + " children");
         const auto place = std::lower_bound(inputs_.begin(), inputs_.end(), input);
         if (place != inputs_.end() && *place == input)
-            fail(ErrorKind::DuplicateInput, generationIndex, source, 1, 2, "part " + std::to_string(part));
+            failTwice(generationIndex, source, part, place->rank, rank);
         if (hasDeclaration_ && generationIndex == 1)
             checkDeclared(input);
         if (closed_ && generationIndex >= current_)
-            fail(ErrorKind::UnannouncedInput, generationIndex, source, 0, 1, "no parent announced it");
+            fail(ErrorKind::UnannouncedInput, generationIndex, source, rank, 0, 1, "no parent announced it");
         inputs_.insert(place, input);
         Generation& g = generation(generationIndex);
         ++g.arrived;
         g.children += children;
         if (generationIndex < current_ || (generationIndex == current_ && g.arrived > g.expected))
-            fail(ErrorKind::TooManyInputs, generationIndex, source, g.expected, g.arrived, "");
+            fail(ErrorKind::TooManyInputs, generationIndex, source, rank, g.expected, g.arrived, "");
         advance();
     }
 
     bool complete() const noexcept { return closed_; }
     int arrivedCount() const noexcept { return static_cast<int>(inputs_.size()); }
+
+    // Throws Error (DuplicateInput): two ranks, which may be one, or -1 if that is not known, have the same input.
+    [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
+                                       int otherRank)
+    {
+        ErrorInfo info;
+        info.kind = ErrorKind::DuplicateInput;
+        info.from = std::max(rank, otherRank);
+        info.generation = generation;
+        info.source = source;
+        info.expected = 1;
+        info.got = 2;
+        info.message = "source " + std::to_string(source) + " (in the library's loops: the id of a brick)"
+                       + (part > 0 ? " part " + std::to_string(part) : "");
+        if (std::min(rank, otherRank) < 0 || rank == otherRank)
+            info.message += " comes twice" + (info.from < 0 ? "" : " from rank " + std::to_string(info.from));
+        else
+            info.message += " comes from rank " + std::to_string(std::min(rank, otherRank)) + " and from rank "
+                            + std::to_string(std::max(rank, otherRank))
+                            + ": a brick may be in the World of one rank only. If several hold it, use SharedWorld and "
+                              "renderMixedParallel()";
+        throw Error(std::move(info));
+    }
 
     // What the first incomplete generation still waits for.
     struct Missing {
@@ -98,6 +122,12 @@ public:
         std::int64_t expected = 0, got = 0;
         // Those that are known by name, because they were declared.
         std::vector<std::pair<std::uint32_t, std::uint16_t>> inputs;
+        // Else: the inputs that announced those of this generation, and those of it that have come.
+        struct Known {
+            std::uint32_t source;
+            int rank; // -1: not known
+        };
+        std::vector<Known> announcers, arrived;
 
         std::string text() const
         {
@@ -112,11 +142,19 @@ public:
         if (closed_)
             return std::nullopt;
         const Generation& g = generations_[static_cast<std::size_t>(current_)];
-        Missing m{current_, g.expected, g.arrived, {}};
-        if (hasDeclaration_ && current_ == 1)
+        Missing m{current_, g.expected, g.arrived, {}, {}, {}};
+        if (hasDeclaration_ && current_ == 1) {
             for (const auto& [source, part] : declared_)
-                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part}))
+                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part, -1, 0}))
                     m.inputs.emplace_back(source, part);
+            return m;
+        }
+        for (const Input& input : inputs_) {
+            if (input.generation == current_ - 1 && input.children > 0)
+                m.announcers.push_back({input.source, input.rank});
+            else if (input.generation == current_)
+                m.arrived.push_back({input.source, input.rank});
+        }
         return m;
     }
 
@@ -130,6 +168,7 @@ private:
         int generation;
         std::uint32_t source;
         std::uint16_t part;
+        int rank, children; // do not tell it from others
         bool operator==(const Input& o) const
         {
             return generation == o.generation && source == o.source && part == o.part;
@@ -186,22 +225,24 @@ private:
     void checkDeclared(const Input& input) const
     {
         if (!std::binary_search(declared_.begin(), declared_.end(), std::make_pair(input.source, input.part)))
-            fail(ErrorKind::UnannouncedInput, input.generation, input.source, 0, 1,
+            fail(ErrorKind::UnannouncedInput, input.generation, input.source, input.rank, 0, 1,
                  "its rank did not declare it, part " + std::to_string(input.part));
     }
 
     // Blames the first input of a generation, where the culprit can not be told from the others.
     [[noreturn]] void failAt(int generationIndex, ErrorKind kind, std::int64_t expected, std::int64_t got) const
     {
-        const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), Input{generationIndex, 0, 0});
-        fail(kind, generationIndex, first != inputs_.end() ? first->source : 0, expected, got, "");
+        const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), Input{generationIndex, 0, 0, -1, 0});
+        const bool isThere = first != inputs_.end();
+        fail(kind, generationIndex, isThere ? first->source : 0, isThere ? first->rank : -1, expected, got, "");
     }
 
-    [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, std::int64_t expected,
-                                  std::int64_t got, std::string message)
+    [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, int rank,
+                                  std::int64_t expected, std::int64_t got, std::string message)
     {
         ErrorInfo info;
         info.kind = kind;
+        info.from = rank;
         info.generation = generationIndex;
         info.source = source;
         info.expected = expected;

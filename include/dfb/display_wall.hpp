@@ -88,19 +88,20 @@ public:
         messaging_->start();
         detail::Agreement mine{true, describe(), messaging_->rank()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
-            mine = {false, wrong};
+            mine = {false, wrong, messaging_->rank()};
         else
             try {
                 takeMemory();
             } catch (const std::exception& e) { // the others must not wait for this rank
-                mine = {false, "rank " + std::to_string(messaging_->rank()) + ": " + e.what()};
+                mine = {false, e.what(), messaging_->rank()};
             }
-        const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
+        const auto all = detail::agree(*messaging_, mine);
         if (!all.fine) {
             messaging_->stop();
             messaging_.reset();
-            throw InvalidArgument(all.text);
+            all.refuse();
         }
+        messaging_->messenger().setAlike();
     }
 
     DisplayWall(const DisplayWall&) = delete;
@@ -233,20 +234,27 @@ private:
     std::string describe() const
     {
         const auto text = [](auto value) { return std::to_string(value); };
-        std::string all = "a wall of " + text(layout_.columns) + 'x' + text(layout_.rows) + " displays of "
-                          + text(layout_.displayWidth) + 'x' + text(layout_.displayHeight) + ", bezels "
-                          + text(layout_.bezelX) + ' ' + text(layout_.bezelY) + ", format "
-                          + text(static_cast<int>(format_)) + ", ranks";
+        detail::Agreement::Settings settings;
+        settings.add("the wall's columns x rows", text(layout_.columns) + 'x' + text(layout_.rows));
+        settings.add("the size of its displays", text(layout_.displayWidth) + 'x' + text(layout_.displayHeight));
+        settings.add("the size of its bezels", text(layout_.bezelX) + 'x' + text(layout_.bezelY));
+        settings.add("its format", nameOf(format_));
+        std::string ranks;
         for (const int rank : layout_.ranks)
-            all += ' ' + text(rank);
-        return all;
+            ranks += (ranks.empty() ? "" : ", ") + text(rank);
+        settings.add("the list of its displays' ranks", '{' + ranks + '}');
+        settings.add("checksums", messaging_->messenger().options().checksums);
+        return settings.text();
     }
 
     std::string whatIsWrong() const
     {
         if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
             || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
-            return "this is no wall: " + describe();
+            return "a wall of " + std::to_string(layout_.columns) + 'x' + std::to_string(layout_.rows) + " displays of "
+                   + std::to_string(layout_.displayWidth) + 'x' + std::to_string(layout_.displayHeight) + ", bezels of "
+                   + std::to_string(layout_.bezelX) + 'x' + std::to_string(layout_.bezelY) + ", format "
+                   + nameOf(format_) + ": can not be";
         if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
             return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
                    + std::to_string(layout_.ranks.size()) + " ranks";

@@ -48,7 +48,12 @@ inline const char* toString(ErrorKind kind)
 // What went wrong, and where. A negative number means "does not apply".
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
-    int rank = -1; // the rank that noticed; or the one that is lost
+    // Where it went wrong: the rank whose code threw, that cancelled or left, passed the wrong argument, or is lost. Of
+    // inputs and messages that are wrong or do not come: the rank that noticed, which need not be to blame.
+    int rank = -1;
+    // The rank that the input or message came from. If something did not come (TimedOut, Transport): the rank that is
+    // waited for; of an input of a tile, the one that announced it.
+    int from = -1;
     std::int64_t frame = -1;
     std::int64_t tile = -1;
     std::int64_t pass = -1;
@@ -68,7 +73,17 @@ struct ErrorInfo {
             text += separator + std::string(name) + ' ' + std::to_string(value);
             separator = ", ";
         };
-        add("rank", rank);
+        const bool isLate = kind == ErrorKind::TimedOut || (kind == ErrorKind::Transport && from >= 0);
+        const bool isHere = kind == ErrorKind::UserCode || kind == ErrorKind::Cancelled
+                            || kind == ErrorKind::InvalidArgument || (kind == ErrorKind::Transport && !isLate);
+        add(isHere ? "rank" : "noticed by rank", rank);
+        const bool isInput = kind == ErrorKind::TooManyInputs || kind == ErrorKind::DuplicateInput
+                             || kind == ErrorKind::UnannouncedInput || kind == ErrorKind::NegativeChildren;
+        add(isInput           ? "from rank"
+            : !isLate         ? "in a message from rank"
+            : generation >= 0 ? "announced by rank"
+                              : "waiting for rank",
+            from);
         add("frame", frame);
         add("tile", tile);
         add("pass", pass);

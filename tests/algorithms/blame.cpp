@@ -2,4 +2,7 @@
 #define ALGORITHMS_WITHOUT_TESTS
 #include "blame.hpp"
 
+template algorithms::Result algorithms::inProcess<algorithms::BlamedParams>(int);
+template algorithms::Result algorithms::inProcess<algorithms::BlamedConfig>(int);
+template algorithms::Result algorithms::inProcess<algorithms::BlamedTree>(int);
 template algorithms::Result algorithms::inProcess<algorithms::BlamedLoop>(int);

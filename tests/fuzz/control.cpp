@@ -69,6 +69,7 @@ bool verdicts(const fuzz::Input& in)
         const d::Verdict v = d::Verdict::from(all);
         const bool failed = d::Verdict::from(a).error || d::Verdict::from(b).error;
         fuzz::require(!failed || v.error, "an error is not lost");
+        fuzz::require(v.differing.empty() || v.error, "ranks that differ are told so");
     }
     return both;
 }
@@ -342,7 +343,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         add(name, which, bytes);
     };
     d::Verdict good, bad;
-    good.paramsHash = bad.paramsHash = 77;
+    good.terms.passes = bad.terms.passes = 77;
     good.sums = {1, 2, 3, 4, 5, 6, 7, 8};
     bad.error.emplace();
     bad.error->kind = dfb::ErrorKind::TimedOut;
@@ -354,10 +355,10 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     bad.error->rank = 3;
     bad.mergeErrors = {{3, 0.5}, {4, 1}};
     addTwo("verdicts_lists", Verdict, bad, bad);
-    const d::Agreement a{true, "size 4, tiles of 8", 0}, b{true, "size 4, tiles of 16", 1}, c{false, "no", 2};
+    const d::Agreement a{true, "width=4\ntiles=8\n", 0}, b{true, "width=4\ntiles=16\n", 1}, c{false, "no", 2};
     addTwo("agreement", Agreement, a, a);
     addTwo("agreement_differs", Agreement, a, b);
-    addTwo("agreement_other_items", Agreement, a, d::Agreement{true, "size 4", 1});
+    addTwo("agreement_other_items", Agreement, a, d::Agreement{true, "width=4\n", 1});
     addTwo("agreement_wrong", Agreement, a, c);
     const auto input = [](std::int32_t tile, std::uint32_t source, std::uint16_t part) {
         return Output().put(tile).put(source).put(part).bytes();

@@ -187,8 +187,17 @@ dfb::WallLayout wallLayout()
 }
 
 // What the other rank says of it.
-const std::string wallText = "a wall of 2x1 displays of 10x13, bezels 0 0, format "
-                             + std::to_string(static_cast<int>(dfb::OutputFormat::RGBA8)) + ", ranks 0 1";
+std::string wallText(bool checksums)
+{
+    d::Agreement::Settings settings;
+    settings.add("the wall's columns x rows", "2x1");
+    settings.add("the size of its displays", "10x13");
+    settings.add("the size of its bezels", "0x0");
+    settings.add("its format", "RGBA8");
+    settings.add("the list of its displays' ranks", "{0, 1}");
+    settings.add("checksums", checksums);
+    return settings.text();
+}
 
 dfb::FrameBufferConfig configFor(Way way)
 {
@@ -239,7 +248,7 @@ std::string vote(Way way, int inputsOnTheWay = 0)
 {
     d::Verdict verdict;
     verdict.sums[9] = inputsOnTheWay;
-    verdict.paramsHash = d::fingerprintOf(paramsFor(way));
+    verdict.terms = d::FrameTerms::of(paramsFor(way), 1);
     return reductionOf(FrameVerdict, verdict.bytes());
 }
 
@@ -332,7 +341,7 @@ private:
         PixelOp pixelOp;
         if constexpr (!std::is_same_v<PixelOp, dfb::NoPixelOp>) {
             if (!way_.has(NoConfiguration))
-                agree(0, d::Agreement{true, wallText, 1});
+                agree(0, d::Agreement{true, wallText(options.checksums), 1});
             wall_.emplace(messenger_, wallLayout(), dfb::OutputFormat::RGBA8, peer_->tasks);
             pixelOp.wall = &*wall_;
         }
@@ -617,7 +626,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("reduction_that_is_none", {}, of(MessageKind::ReduceUp, Output().put(9u).bytes()));
     add("result_from_below", {}, of(MessageKind::ReduceDown, vote({})));
     d::Verdict verdict;
-    verdict.paramsHash = d::fingerprintOf(paramsFor({}));
+    verdict.terms = d::FrameTerms::of(paramsFor({}), 1);
     verdict.tileErrors = {{99, 1.0}};
     add("vote_on_no_tile", {}, of(MessageKind::ReduceUp, reductionOf(FrameVerdict, verdict.bytes())));
     for (const int tile : {2, -2})
@@ -642,7 +651,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("other_byte_order", {}, of(MessageKind::Fragment, Output().put(header).bytes(), OtherHeader));
     add("other_channels", {}, of(MessageKind::Fragment, inputOf({Deep}, 0, true)));
     add("configuration", {NoConfiguration},
-        of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "size 4x4", 1}.bytes())) + end);
+        of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "width=4\n", 1}.bytes())) + end);
     add("configuration_broken", {NoConfiguration}, of(MessageKind::ReduceUp, std::string("\0\0\0\0no", 6)) + end);
     const auto gathered = [](std::int32_t rank, std::uint64_t count, const std::string& bytes) {
         return of(MessageKind::ReduceUp, Output().put(+OwnScope).put(rank).put(count).text(bytes).bytes());

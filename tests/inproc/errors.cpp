@@ -530,7 +530,10 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
                 });
                 INFO((oddDeclares ? "declares" : "does not declare") << ", rank " << odd << joined(bad.texts));
                 CHECK(allSame(bad.texts));
-                CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
+                CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree: frame "));
+                const std::string value = oddDeclares ? "true" : "false";
+                CHECK(has(bad.texts[0], "FrameParams::declared is "));
+                CHECK(has(bad.texts[0], value + " on rank " + std::to_string(odd)));
                 CHECK(bad.wrongAfter == 0);
             }
 }
@@ -565,6 +568,9 @@ TEST_CASE("Ranks that were given other passes or samples find out, also where no
                           INFO((c.samples ? "samples" : "passes") << ", rank " << c.odd << joined(bad.texts));
                           CHECK(allSame(bad.texts));
                           CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
+                          CHECK(has(bad.texts[0], c.samples ? "FrameParams::samples is " : "FrameParams::passes is "));
+                          CHECK(has(bad.texts[0], (c.samples ? "a plan of 56 samples on rank " : "2 on rank ")
+                                                      + std::to_string(c.odd)));
                           CHECK(bad.wrongAfter == 0);
                       });
 }
@@ -603,11 +609,11 @@ TEST_CASE("Ranks with different operations are refused on every rank", "[errors]
     INFO(joined(tileOps) << joined(pixelOps));
     CHECK(allSame(tileOps));
     CHECK(has(tileOps[0], "InvalidArgument"));
-    CHECK(has(tileOps[0], "[tile operation dfb::BasicAlphaBlend<16"));
-    CHECK(has(tileOps[0], "and [tile operation dfb::BasicDepthComposite<16"));
+    CHECK(has(tileOps[0], "the tile operation is dfb::BasicAlphaBlend<16"));
+    CHECK(has(tileOps[0], " on rank 0 and dfb::BasicDepthComposite<16"));
     CHECK_FALSE(has(tileOps[0], "pixel operation"));
     CHECK(allSame(pixelOps));
-    CHECK(has(pixelOps[0], "and [pixel operation dfb::NoPixelOp]"));
+    CHECK(has(pixelOps[0], "and dfb::NoPixelOp on rank 1"));
     CHECK(madeOf<Blended, Blended>(s) == std::vector<std::string>(2, "fine"));
 }
 
@@ -847,8 +853,8 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
             });
             INFO(mistake.name << " from rank " << culprit << joined(bad.texts));
             CHECK(allSame(bad.texts));
-            // The owner noticed.
-            CHECK(has(bad.texts[0], "rank 1, frame 1, tile " + std::to_string(index) + ", pass 0"));
+            CHECK(has(bad.texts[0], "noticed by rank 1, from rank " + std::to_string(culprit) + ", frame 1, tile "
+                                        + std::to_string(index) + ", pass 0"));
             for (const std::string& part : mistake.parts)
                 CHECK(has(bad.texts[0], part));
             CHECK(bad.wrongAfter == 0);
@@ -970,7 +976,8 @@ TEST_CASE("An input that takes the place of an announced one is an error, whatev
               withInputTooMany<dfb::BasicOrderedBlend<16>>(allowPartial)}) {
             INFO(joined(texts));
             CHECK(allSame(texts));
-            CHECK(has(texts[0], "FrameError: dfb: ranks disagree: expected 0, got 1: more inputs were sent"));
+            CHECK(has(texts[0], "FrameError: dfb: ranks disagree: frame "));
+            CHECK(has(texts[0], ", expected 0, got 1: more inputs were sent"));
         }
 }
 

@@ -273,7 +273,7 @@ TEST_CASE("A rank that is built for other tiles or operations is refused on ever
             INFO("rank " << odd << ": " << text);
             CHECK(sameEverywhere(text));
             CHECK(has(text, "InvalidArgument"));
-            CHECK(has(text, smaller ? "[tiles of " : "[tile operation dfb::BasicDepthComposite<16"));
+            CHECK(has(text, smaller ? "the size of tiles is " : "dfb::BasicDepthComposite<16"));
         }
     Blend fb(MPI_COMM_WORLD, config); // nothing is left of those
 }

@@ -358,12 +358,16 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
         const bool same = sameEverywhere(text);
         INFO(text);
         CHECK(same);
-        CHECK(has(text, "FrameError: dfb: timed out: rank " + std::to_string(fb.tileOwner(5))));
+        CHECK(has(text, "FrameError: dfb: timed out: noticed by rank " + std::to_string(fb.tileOwner(5))
+                            + ", announced by rank " + std::to_string(declared ? last : fb.tileOwner(5))));
         CHECK(has(text, "tile 5"));
         CHECK(has(text, "generation 1"));
         CHECK(has(text, declared ? "expected 1, got 0" : "expected 2, got 0"));
         if (declared)
             CHECK(has(text, "missing source 77 part 3 of rank " + std::to_string(last)));
+        else
+            CHECK(has(text, "; announced by source " + std::to_string(fb.tileOwner(5)) + " of rank "
+                                + std::to_string(fb.tileOwner(5))));
         CHECK(goodFrame(fb, s));
     }
 }

@@ -72,8 +72,8 @@ TEST_CASE("A rank listens for its neighbours in the tree of reductions, and they
             const dfb::ReductionKey key{1, 1};
             std::set<int> tree;
             table.enter(key, {}, combine, [](const auto&) {});
-            for (const int child : table.missing(key))
-                tree.insert(child);
+            for (const auto& part : table.missing(key))
+                tree.insert(part.rank);
             if (rank != 0)
                 tree.insert(rank & (rank - 1));
             CHECK(tree == listens[static_cast<std::size_t>(rank)]);

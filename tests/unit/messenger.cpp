@@ -325,6 +325,33 @@ TEST_CASE("Where checksums are wanted an input without one is refused", "[messen
     messenger.detach(address);
 }
 
+TEST_CASE("By which messages ranks find out that only one of them uses checksums", "[messenger]")
+{
+    using Kind = dfb::detail::MessageKind;
+    for (const bool uses : {false, true})
+        for (const bool isAlike : {false, true})
+            for (const Kind kind : {Kind::ReduceUp, Kind::ReduceDown, Kind::Fragment, Kind::Manifest, Kind::Abort}) {
+                const auto a = wireOf(0, 2), b = wireOf(1, 2);
+                Messenger sender(a, {dfb::Progress::Thread, !uses}), messenger(b, {dfb::Progress::Thread, uses});
+                if (isAlike)
+                    messenger.setAlike();
+                Receiver receiver;
+                std::uint32_t address = 0;
+                messenger.attach(receiver, address);
+                dfb::Buffer message = messageOf(*sender.pool(), 0, 5);
+                auto header = headerOf(message);
+                header.kind = kind;
+                std::memcpy(message.data(), &header, sizeof header);
+                sender.send(1, std::move(message));
+                carry(*a, *b);
+                INFO((uses ? "the receiver" : "the sender") << " uses checksums, kind " << static_cast<int>(kind));
+                const bool isTaken = !isAlike && (kind == Kind::ReduceUp || kind == Kind::ReduceDown);
+                CHECK(receiver.got.size() == (isTaken ? 1u : 0u));
+                CHECK(receiver.malformedFrom.size() == (isTaken ? 0u : 1u));
+                messenger.detach(address);
+            }
+}
+
 TEST_CASE("What is lost is said in words, by rank", "[messenger]")
 {
     const auto a = wireOf(0, 4), b = wireOf(1, 4);

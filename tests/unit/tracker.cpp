@@ -458,4 +458,47 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
     }
 }
 
+TEST_CASE("What is missing of a tree that nobody declared: who announced it, and who has come", "[tracker]")
+{
+    dfb::DependencyTracker tracker;
+    tracker.arrive(1, 4, 0, 2, 1);
+    tracker.arrive(0, 7, 0, 2, 5);
+    REQUIRE(tracker.missing());
+    REQUIRE(tracker.missing()->announcers.size() == 1);
+    CHECK(tracker.missing()->announcers[0].source == 7);
+    CHECK(tracker.missing()->announcers[0].rank == 5);
+    REQUIRE(tracker.missing()->arrived.size() == 1);
+    CHECK(tracker.missing()->arrived[0].source == 4);
+    CHECK(tracker.missing()->arrived[0].rank == 1);
+    tracker.arrive(1, 3, 0, 0, 2); // announces nothing
+    REQUIRE(tracker.missing());
+    CHECK(tracker.missing()->generation == 2);
+    REQUIRE(tracker.missing()->announcers.size() == 1);
+    CHECK(tracker.missing()->announcers[0].source == 4);
+    CHECK(tracker.missing()->arrived.empty());
+}
+
+TEST_CASE("An input that comes twice: from which ranks, and what to do about a brick of several", "[tracker]")
+{
+    const auto textOf = [](int first, int second) {
+        dfb::DependencyTracker tracker;
+        tracker.arrive(1, 7, 2, 0, first);
+        try {
+            tracker.arrive(1, 7, 2, 0, second);
+        } catch (const dfb::Error& e) {
+            CHECK(e.info().kind == dfb::ErrorKind::DuplicateInput);
+            CHECK(e.info().from == std::max(first, second));
+            return e.info().message;
+        }
+        return std::string("nothing");
+    };
+    const std::string two = "source 7 (in the library's loops: the id of a brick) part 2 comes from rank 1 and from "
+                            "rank 4: a brick may be in the "
+                            "World of one rank only. If several hold it, use SharedWorld and renderMixedParallel()";
+    CHECK(textOf(1, 4) == two);
+    CHECK(textOf(4, 1) == two); // whichever came first
+    CHECK(textOf(4, 4) == "source 7 (in the library's loops: the id of a brick) part 2 comes twice from rank 4");
+    CHECK(textOf(-1, -1) == "source 7 (in the library's loops: the id of a brick) part 2 comes twice");
+}
+
 } // namespace tracker_cases

@@ -98,6 +98,7 @@ inline void put(ByteWriter& out, const ErrorInfo& e)
 {
     out.put(e.kind);
     out.put(static_cast<std::int32_t>(e.rank));
+    out.put(static_cast<std::int32_t>(e.from));
     for (std::int64_t v : {e.frame, e.tile, e.pass, e.generation, e.source, e.expected, e.got})
         out.put(v);
     out.putText(e.message);
@@ -109,6 +110,7 @@ inline ErrorInfo getErrorInfo(ByteReader& in)
     e.kind = in.get<ErrorKind>();
     in.require(e.kind <= ErrorKind::Transport);
     e.rank = in.get<std::int32_t>();
+    e.from = in.get<std::int32_t>();
     for (std::int64_t* v : {&e.frame, &e.tile, &e.pass, &e.generation, &e.source, &e.expected, &e.got})
         *v = in.get<std::int64_t>();
     e.message = in.getText();

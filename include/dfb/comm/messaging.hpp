@@ -236,7 +236,7 @@ public:
     void giveUp(int source, ErrorInfo error)
     {
         error.rank = rank();
-        error.message += ", in a message from rank " + std::to_string(source);
+        error.from = source;
         messenger_->giveUp(error);
     }
 

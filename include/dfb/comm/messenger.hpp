@@ -33,7 +33,9 @@ namespace dfb {
 // How messages travel: for all framebuffers and walls of a messenger. Only `checksums` must be the same on all ranks.
 struct MessengerOptions {
     Progress progress = Progress::Auto;
-    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
+    // A CRC-32C in each message: whoever does not trust the network pays for it. The first object that is made on it says
+    // if it is not the same on all ranks.
+    bool checksums = false;
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
     // On ranks with a progress thread: while messages are expected, in a frame or a call that waits for all ranks, a
     // rank of which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this
@@ -221,6 +223,10 @@ public:
             return nullptr;
     }
 
+    // All ranks have found that they were set up alike, which includes `checksums`; from any thread, any number of
+    // times. Before, what they say to find out may have a checksum or not; see checkChecksum().
+    void setAlike() noexcept { isAlike_ = true; }
+
     // Messages that came twice, since the start; they are dropped.
     std::int64_t duplicates() const noexcept { return duplicates_; }
 
@@ -344,10 +350,19 @@ private:
         return crc == 0 ? 1 : crc;
     }
 
+    // By such messages ranks find out whether they were set up alike, and that they can not go on. A rank that uses
+    // checksums reads those of one that does not, and the other way round, so that both can say what differs.
+    static bool isOfSetUp(detail::MessageKind kind)
+    {
+        using Kind = detail::MessageKind;
+        return kind == Kind::ReduceUp || kind == Kind::ReduceDown || kind == Kind::Failure || kind == Kind::AreYouThere
+               || kind == Kind::Present;
+    }
+
     void checkChecksum(detail::MessageHeader header, Buffer& message) const
     {
         const std::uint32_t got = header.checksum;
-        if ((got != 0) != options_.checksums)
+        if ((got != 0) != options_.checksums && (isAlike_ || !isOfSetUp(header.kind)))
             detail::failMalformed(got != 0 ? "with a checksum; this rank uses none" : "without a checksum");
         if (got == 0)
             return;
@@ -512,6 +527,7 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     Transport transport_;
     std::atomic<std::int64_t> duplicates_{0};
+    std::atomic<bool> isAlike_{false};
 
     mutable std::mutex peersMutex_;
     // Under peersMutex_:

@@ -109,21 +109,25 @@ public:
         return find(key) != nullptr;
     }
 
-    // The neighbours in the tree that this rank waits for: children whose parts have not come, or else its parent.
-    std::vector<int> missing(const ReductionKey& key)
+    // What this rank waits for: parts that have not come, each from a child, and of the ranks from that one to `last`;
+    // if it has all of them, the result, from its parent, which has a lower rank.
+    struct Missing {
+        int rank, last;
+    };
+    std::vector<Missing> missing(const ReductionKey& key)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         const State* state = find(key);
         if (!state)
             return {};
-        std::vector<int> ranks;
+        std::vector<Missing> parts;
         for (int child : children_)
             if (std::none_of(state->parts.begin(), state->parts.end(),
                              [child](const auto& part) { return part.first == child; }))
-                ranks.push_back(child);
-        if (ranks.empty() && rank_ != 0)
-            ranks.push_back(parent());
-        return ranks;
+                parts.push_back({child, std::min(child + (child & -child), size_) - 1});
+        if (parts.empty() && rank_ != 0)
+            parts.push_back({parent(), parent()});
+        return parts;
     }
 
     // Drops what is known of this scope up to `number`, now and when it comes later.

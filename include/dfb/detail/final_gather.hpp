@@ -394,13 +394,22 @@ public:
     {
         std::string text;
         for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
-            const std::int64_t announced = tilesOf_[r].announced, received = tilesOf_[r].received;
-            if (static_cast<int>(r) == rank_ || received == announced)
+            if (!isMissing(r))
                 continue;
+            const std::int64_t announced = tilesOf_[r].announced, received = tilesOf_[r].received;
             text += (text.empty() ? "finished tiles have not come from rank " : ", rank ") + std::to_string(r) + " ("
                     + std::to_string(received) + " of " + (announced < 0 ? "all" : std::to_string(announced)) + ")";
         }
         return text;
+    }
+
+    // The first of those ranks, or -1.
+    int firstMissing() const
+    {
+        for (std::size_t r = 0; r < tilesOf_.size(); ++r)
+            if (isMissing(r))
+                return static_cast<int>(r);
+        return -1;
     }
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
@@ -462,6 +471,11 @@ public:
     }
 
 private:
+    bool isMissing(std::size_t r) const
+    {
+        return static_cast<int>(r) != rank_ && tilesOf_[r].received != tilesOf_[r].announced;
+    }
+
     enum class TileState : std::uint8_t { Undefined, Background, Old, Received };
     // A message that is being filled.
     struct Batch {

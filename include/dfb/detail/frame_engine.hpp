@@ -75,24 +75,26 @@ public:
                                                   Tile::size, Pipeline::travelling(config_), layout().tileCount(),
                                                   [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
-            mine = {false, e.info().message};
+            mine = {false, e.info().message, rank()};
         } catch (const OutOfMemory& e) {
             const bool several = config_.framesInFlight > 1;
-            mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()
+            mine = {false, e.what()
                                + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
                                                 + " frames in flight"
-                                          : "")};
+                                          : ""),
+                    rank()};
         } catch (const std::exception& e) {
             // No memory, or out of the owner map: the others must not wait for this rank.
-            mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};
+            mine = {false, e.what(), rank()};
         }
-        const auto all = Agreement::from(messaging_->reduce(mine.bytes(), Agreement::combine));
+        const auto all = agree(*messaging_, mine);
         if (!all.fine) {
             messaging_->stop(); // what has come already is for this object, as long as it is whole
             outcome_.reset();
             messaging_.reset(); // before the exception passes: all ranks throw it, so this end is in order
-            throw InvalidArgument(all.text);
+            all.refuse();
         }
+        messaging_->messenger().setAlike();
         tellImagePlace();
     }
 
@@ -127,6 +129,7 @@ public:
         messaging_->requireProgress();
         messaging_->messenger().throwIfFailed();
         params_ = params;
+        terms_ = FrameTerms::of(params, rank());
         manifests_.newFrame(!lastFailed_); // if it did, some owners may have what was declared in it, and others not
 
         TileInfo info;
@@ -248,6 +251,7 @@ public:
             if (!messaging_->wait([this] { return jobs_.ready() || outcome_->failed(); }, deadline)) {
                 ErrorInfo info;
                 info.kind = ErrorKind::TimedOut;
+                info.from = jobServer();
                 info.message = "no word of rank " + std::to_string(jobServer()) + " on what there is to render";
                 failWith(std::make_exception_ptr(Error(std::move(info))));
             }
@@ -545,7 +549,7 @@ private:
     static ErrorInfo messageFrom(int source)
     {
         ErrorInfo where;
-        where.message = "in a message from rank " + std::to_string(source);
+        where.from = source;
         return where;
     }
 
@@ -657,7 +661,7 @@ private:
                 const Verdict verdict = Verdict::from(messaging_->bytesOf(message));
                 if (!verdict.fits(layout().tileCount()))
                     failMalformed("a verdict on tiles that there are not", layout().tileCount() - 1);
-                differs = isUp && verdict.paramsHash != fingerprintOf(params_);
+                differs = isUp && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
                 if (!messaging_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
@@ -665,7 +669,7 @@ private:
             } else if (scope == SameParams) {
                 const Bytes bytes = messaging_->bytesOf(message);
                 ByteReader in(bytes);
-                differs = in.get<std::uint64_t>() != fingerprintOf(params_);
+                differs = !in.get<FrameTerms>().difference(terms_).empty();
                 in.end();
             } else {
                 failMalformed("a reduction of a kind that there is not", SameParams, scope);
@@ -687,7 +691,8 @@ private:
     {
         ErrorInfo where;
         typename TileTable<TileOp>::Arrival arrival;
-        guarded([&] { pipeline_->arrive(std::move(message), where, arrival); }, where, source);
+        guarded([&] { pipeline_->arrive(std::move(message), source >= 0 ? source : rank(), where, arrival); }, where,
+                source);
         if (arrival.spoilt) {
             pipeline_->table().saidWhy();
             tryVote();
@@ -771,8 +776,7 @@ private:
             return true;
         } catch (...) {
             ErrorInfo place = where;
-            if (source >= 0)
-                place.message = messageFrom(source).message;
+            place.from = source;
             failWith(std::current_exception(), place);
             return false;
         }
@@ -847,8 +851,7 @@ private:
             info.emplace();
             info->message = "not all ranks have declared their inputs";
             info->expected = size();
-            for (const int other : messaging_->reductions().missing({AllDeclared, gate_.frame()}))
-                info->message += ", no word from rank " + std::to_string(other);
+            addWaitedFor(*info, "no word from", {AllDeclared, gate_.frame()});
         } else if (!ownTilesDone_) {
             info = pipeline_->table().missing(params_.declared);
             if (!info) {
@@ -858,11 +861,12 @@ private:
         } else if (!pipeline_->gather().complete()) {
             info.emplace();
             info->message = pipeline_->gather().missing();
+            info->from = pipeline_->gather().firstMissing();
             info->expected = pipeline_->gather().senderCount();
             info->got = pipeline_->gather().ranksDone();
         } else {
             info.emplace();
-            info->message = outcome_->waitsFor();
+            addWaitedFor(*info, "no verdict from", outcome_->key());
         }
         if (info) {
             info->kind = ErrorKind::TimedOut;
@@ -872,6 +876,24 @@ private:
                 info->message += (info->message.empty() ? "" : "; ") + lost;
         }
         return info;
+    }
+
+    // Says whose part of a reduction this rank waits for, and in `from`, if there is only one that it can be.
+    void addWaitedFor(ErrorInfo& info, const char* what, const ReductionKey& key)
+    {
+        const auto missing = messaging_->reductions().missing(key);
+        std::string text;
+        for (const auto& part : missing) {
+            text += (text.empty() ? std::string(what) + " rank " : ", rank ") + std::to_string(part.rank);
+            if (part.rank < rank())
+                text += ", through which the result comes";
+            else if (part.last > part.rank)
+                text += " or another up to " + std::to_string(part.last) + ", whose part comes with that one's";
+        }
+        if (missing.size() == 1 && missing.front().rank > rank() && missing.front().last == missing.front().rank)
+            info.from = missing.front().rank;
+        if (!text.empty())
+            info.message += (info.message.empty() ? "" : ", ") + text;
     }
 
     // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
@@ -885,7 +907,7 @@ private:
             [this] {
                 Verdict v;
                 const std::int64_t repeated = messaging_->messenger().duplicates();
-                v.paramsHash = fingerprintOf(params_);
+                v.terms = terms_;
                 const auto reports = pipeline_->reports();
                 v.sums = {messaging_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
                           messaging_->messagesSent() - messagesBefore_,
@@ -983,7 +1005,10 @@ private:
             verdict = params_.timeoutMs > 0 ? waitInTime() : waitWithoutLimit();
             if (!verdict.error)
                 verdict.error = verdict.strayInputs();
-            if (verdict.error && params_.allowPartial) // finished tiles may still be on their way
+            if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
+                verdict.error->frame = gate_.frame();
+            if (verdict.error && params_.allowPartial              // finished tiles may still be on their way
+                && verdict.error->kind != ErrorKind::Disagreement) // but not from ranks that send none
                 messaging_->wait([this] { return pipeline_->gather().complete() && messaging_->flow().allSent(); },
                                  Clock::now() + std::chrono::milliseconds(params_.timeoutMs));
         } catch (const TransportError&) {
@@ -1050,7 +1075,7 @@ private:
     void compareParams()
     {
         ByteWriter mine;
-        mine.put(fingerprintOf(params_));
+        mine.put(terms_);
         messaging_->reductions().enter(
             {SameParams, gate_.frame()}, mine.bytes(), [](const Bytes& a, const Bytes&) { return a; },
             [](const Bytes&) {});
@@ -1063,8 +1088,9 @@ private:
         info.rank = rank();
         info.frame = gate_.frame();
         info.message = "no verdict after " + std::to_string(after.count()) + " ms";
-        for (const std::string& more : {outcome_->waitsFor(), messaging_->messenger().lost()})
-            info.message += (more.empty() ? "" : ": ") + more;
+        addWaitedFor(info, "no verdict from", outcome_->key());
+        if (const std::string lost = messaging_->messenger().lost(); !lost.empty())
+            info.message += "; " + lost;
         messaging_->messenger().giveUp(info);
         throw TransportError(std::move(info));
     }
@@ -1082,6 +1108,7 @@ private:
     FrameGate gate_;
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
+    FrameTerms terms_; // of params_
     std::uint64_t lastAccumulationId_ = 0;
     int nextSample_ = 0; // of each tile, if the next frame has no plan and accumulates
     bool frameOpen_ = false, lastFailed_ = false;

@@ -113,7 +113,7 @@ public:
             mine = figures();
             mine.error = error_;
         }
-        messaging_.reductions().enter({scope_, gate_.frame()}, mine.bytes(), Verdict::combine,
+        messaging_.reductions().enter(key(), mine.bytes(), Verdict::combine,
                                       [this](const ReductionTable::Bytes& result) {
                                           verdict_ = Verdict::from(result);
                                           hasVerdict_ = true;
@@ -127,14 +127,8 @@ public:
         return messaging_.wait([this] { return hasVerdict_.load(); }, deadline) ? &*verdict_ : nullptr;
     }
 
-    // The ranks whose votes, or whose word of the verdict, this rank waits for.
-    std::string waitsFor()
-    {
-        std::string text;
-        for (const int rank : messaging_.reductions().missing({scope_, gate_.frame()}))
-            text += (text.empty() ? "no verdict from rank " : ", ") + std::to_string(rank);
-        return text;
-    }
+    // Of the reduction in which the verdict comes.
+    ReductionKey key() const { return {scope_, gate_.frame()}; }
 
 private:
     Messaging<Transport>& messaging_;

@@ -47,7 +47,7 @@ public:
     friend bool operator!=(const SmallBytes& a, const SmallBytes& b) { return !(a == b); }
 
 private:
-    static constexpr std::size_t most = 256; // a verdict without an error or figures has 129
+    static constexpr std::size_t most = 256; // a verdict without an error or figures has 221
 
     std::size_t fewCount_ = 0;
     std::array<std::byte, most> few_{};

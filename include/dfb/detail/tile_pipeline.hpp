@@ -177,8 +177,9 @@ public:
         return message;
     }
 
-    // Takes an input. `where` gets what is known of the place: the tile. See TileTable::arrive() for the rest.
-    void arrive(Buffer&& message, ErrorInfo& where, typename TileTable<TileOp>::Arrival& arrival)
+    // Takes an input of rank `from`. `where` gets what is known of the place: the tile. See TileTable::arrive() for the
+    // rest.
+    void arrive(Buffer&& message, int from, ErrorInfo& where, typename TileTable<TileOp>::Arrival& arrival)
     {
         Fragment fragment = decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
@@ -199,7 +200,7 @@ public:
                           static_cast<std::int64_t>(fragment.colorFormat()));
         if (isLossy())
             losses_.add(fragment, coder_);
-        table_.arrive(std::move(fragment), arrival);
+        table_.arrive(std::move(fragment), from, arrival);
     }
 
     // Runs both operations on a complete tile and hands it on.

@@ -132,16 +132,16 @@ public:
         bool spoilt = false; // the tile is: call saidWhy() when it is known why
     };
 
-    // Hands an input to its tile. Throws what the tracker and the op throw: then the tile is spoilt, and no more is
-    // waited for, so that both may be set in `arrival`.
-    void arrive(Fragment&& fragment, Arrival& arrival)
+    // Hands an input of rank `from` to its tile. Throws what the tracker and the op throw: then the tile is spoilt, and
+    // no more is waited for, so that both may be set in `arrival`.
+    void arrive(Fragment&& fragment, int from, Arrival& arrival)
     {
         const TileHeader h = fragment.header();
         const std::lock_guard<std::mutex> lock(mutexOf(h.tile));
         try {
             Slot& slot = slotFor(h.tile);
             DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
-            tree.arrive(h.generation, h.source, h.part, h.children);
+            tree.arrive(h.generation, h.source, h.part, h.children, from);
             slot.touched = true;
             if (slot.ready) {
                 ++arrived_;
@@ -286,6 +286,7 @@ public:
                     first->pass = pass;
                     first->generation = m->generation;
                     first->source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().first);
+                    first->from = announcerOf(*m, inputs);
                     first->expected = m->expected;
                     first->got = m->got;
                 }
@@ -395,11 +396,34 @@ private:
         slot.names.clear();
         for (const ExpectedInput& input : inputs)
             slot.names.emplace_back(input.source, input.part);
-        for (DependencyTracker& tree : slot.trees)
-            tree.declare(slot.names);
+        try {
+            for (DependencyTracker& tree : slot.trees)
+                tree.declare(slot.names);
+        } catch (const Error&) {
+            failIfTwice(inputs); // with the ranks, which the tracker does not know
+            throw;
+        }
     }
 
-    // In words: which of the inputs are missing, and from whom.
+    static void failIfTwice(const ExpectedInputs::Range& inputs)
+    {
+        for (const ExpectedInput& a : inputs)
+            for (const ExpectedInput& b : inputs)
+                if (&a < &b && a.source == b.source && a.part == b.part)
+                    DependencyTracker::failTwice(1, a.source, a.part, a.rank, b.rank);
+    }
+
+    // The rank that has declared the first of the inputs that are missing, or announced some of them, or -1.
+    static int announcerOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
+    {
+        if (!missing.inputs.empty())
+            for (const ExpectedInput& input : expected)
+                if (std::make_pair(input.source, input.part) == missing.inputs.front())
+                    return input.rank;
+        return missing.announcers.empty() ? -1 : missing.announcers.front().rank;
+    }
+
+    // In words: which of the inputs are missing, and from whom; or who announced them, and which have come.
     static std::string namesOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
     {
         std::string text;
@@ -411,6 +435,17 @@ private:
                 if (input.source == source && input.part == part)
                     text += " of rank " + std::to_string(input.rank);
         }
+        return text + listOf("; announced by", missing.announcers) + listOf("; here are", missing.arrived);
+    }
+    static std::string listOf(const char* what, const std::vector<DependencyTracker::Missing::Known>& inputs)
+    {
+        constexpr std::size_t most = 8;
+        std::string text;
+        for (std::size_t i = 0; i < std::min(most, inputs.size()); ++i)
+            text += (i == 0 ? std::string(what) + " source " : ", ") + std::to_string(inputs[i].source) + " of rank "
+                    + std::to_string(inputs[i].rank);
+        if (inputs.size() > most)
+            text += " and " + std::to_string(inputs.size() - most) + " more";
         return text;
     }
 

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
+#include <dfb/detail/frame_terms.hpp>
 #include <dfb/frame.hpp>
 
 #include <algorithm>
@@ -16,9 +17,11 @@
 #include <cxxabi.h>
 #include <exception>
 #include <iterator>
+#include <limits>
 #include <memory>
 #include <optional>
 #include <string>
+#include <tuple>
 #include <type_traits>
 #include <typeinfo>
 #include <utility>
@@ -44,6 +47,8 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     if (info.kind == ErrorKind::InvalidArgument)
         info.kind = ErrorKind::UserCode; // of a call within a renderer or an op
     const auto fill = [](std::int64_t& to, std::int64_t from) { to = to < 0 ? from : to; };
+    if (info.from < 0)
+        info.from = where.from;
     fill(info.tile, where.tile);
     fill(info.pass, where.pass);
     fill(info.generation, where.generation);
@@ -53,39 +58,10 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     return info;
 }
 
-// FNV-1a over 64-bit words.
-class Fingerprint {
-public:
-    void add(std::uint64_t v) noexcept { value_ = (value_ ^ v) * 1099511628211u; }
-    std::uint64_t value() const noexcept { return value_; }
-
-private:
-    std::uint64_t value_ = 1469598103934665603u;
-};
-
-inline std::uint64_t fingerprintOf(const FrameParams& p)
-{
-    Fingerprint f;
-    for (float channel : p.background) {
-        std::uint32_t bits = 0;
-        std::memcpy(&bits, &channel, sizeof bits);
-        f.add(bits);
-    }
-    f.add(static_cast<std::uint64_t>(p.passes));
-    if (p.samples)
-        for (const TileSamples& t : *p.samples)
-            f.add(static_cast<std::uint64_t>(t.first) << 32 | static_cast<std::uint32_t>(t.count));
-    f.add(static_cast<std::uint64_t>(p.maxLayers));
-    f.add(p.accumulationId);
-    f.add(p.declared);
-    f.add(static_cast<std::uint64_t>(p.timeoutMs));
-    f.add(p.allowPartial);
-    return f.value();
-}
-
 struct Verdict {
     std::optional<ErrorInfo> error;
-    std::uint64_t paramsHash = 0; // of what begin() was given; the same on all ranks
+    FrameTerms terms;      // what begin() was given; the same on all ranks
+    std::string differing; // what of it is not, in words
     // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
     // pixels with alpha outside [0, 1], compressed links, inputs that were sent without those that have come, tiles
     // that needed no more although more was to come.
@@ -104,7 +80,8 @@ struct Verdict {
         out.put(static_cast<std::uint8_t>(error.has_value()));
         if (error)
             put(out, *error);
-        out.put(paramsHash);
+        out.put(terms);
+        out.putText(differing);
         out.put(sums);
         out.put(maxima);
         out.put(wireErrorBound);
@@ -127,7 +104,8 @@ struct Verdict {
         in.require(failed <= 1);
         if (failed)
             v.error = getErrorInfo(in);
-        v.paramsHash = in.get<std::uint64_t>();
+        v.terms = in.get<FrameTerms>();
+        v.differing = in.getText();
         v.sums = in.get<decltype(v.sums)>();
         v.maxima = in.get<decltype(v.maxima)>();
         v.wireErrorBound = in.get<double>();
@@ -204,12 +182,13 @@ struct Verdict {
         return all;
     }
 
-    static ErrorInfo disagreement()
+    // `what`: "" as long as only this is known, that something differs.
+    static ErrorInfo disagreement(const std::string& what = "")
     {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
-        info.message = "the frame was begun with different parameters (background, passes, samples, maxLayers, "
-                       "accumulationId, declared, timeoutMs, allowPartial)";
+        info.message = what.empty() ? "the frame was begun with different parameters"
+                                    : what + ": it must be the same on all ranks";
         return info;
     }
 
@@ -238,11 +217,16 @@ struct Verdict {
         return e.kind != ErrorKind::TimedOut ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
-    // Of several errors, one that says most, and the one of the lowest rank; of what is missing, all.
+    // Of several errors, one that says most, if it can be also which rank is waited for, and the one of the lowest
+    // rank; of what is missing, all.
     static ErrorInfo chosen(const ErrorInfo& a, const ErrorInfo& b)
     {
         constexpr std::size_t mostText = 2000;
-        const bool second = weight(a) != weight(b) ? weight(b) > weight(a) : b.rank < a.rank;
+        const auto order = [](const ErrorInfo& e) {
+            const int w = weight(e);
+            return std::make_tuple(-w, (w == 1 || w == 2) && e.from < 0, e.rank);
+        };
+        const bool second = order(b) < order(a);
         ErrorInfo info = second ? b : a;
         const ErrorInfo& other = second ? a : b;
         if (weight(a) == 3 && weight(b) == 3 && a.rank != b.rank && info.message.size() < mostText)
@@ -256,8 +240,10 @@ struct Verdict {
         const Verdict b = from(second);
         if (b.error)
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
-        if (a.paramsHash != b.paramsHash)
-            a.error = disagreement(); // whatever else came of it
+        if (a.differing.empty())
+            a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
+        if (!a.differing.empty())
+            a.error = disagreement(a.differing); // whatever else came of it
         for (std::size_t i = 0; i < a.sums.size(); ++i)
             a.sums[i] = static_cast<std::int64_t>(static_cast<std::uint64_t>(a.sums[i])
                                                   + static_cast<std::uint64_t>(b.sums[i]));
@@ -275,8 +261,22 @@ struct Verdict {
 // What one rank was made with, or what was wrong with it; combined, whether all are fine and alike.
 struct Agreement {
     bool fine = true;
-    std::string text; // items parted by commas, or what is wrong
-    int rank = 0;     // whose; the lowest of those that are alike
+    std::string text; // of Settings; or what is wrong
+    int rank = 0;     // whose; the lowest of those that are alike; -1 if what is wrong is that two differ
+
+    // Names and values, a line each.
+    class Settings {
+    public:
+        template <class Value>
+        void add(const char* name, const Value& value)
+        {
+            text_ += std::string(name) + separator + textOf(value) + '\n';
+        }
+        const std::string& text() const noexcept { return text_; }
+
+    private:
+        std::string text_;
+    };
 
     // `checksums`: see MessengerOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
     // `ownerOf(tile)`: the owner map's answers.
@@ -287,26 +287,41 @@ struct Agreement {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
             owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
-        const auto text = [](auto value) {
-            if constexpr (!std::is_floating_point_v<decltype(value)>)
-                return std::to_string(value);
-            char digits[40]; // all of them
-            std::snprintf(digits, sizeof digits, "%.17g", static_cast<double>(value));
-            return std::string(digits);
-        };
-        return {true,
-                "version " + text(DFB_VERSION_MAJOR) + '.' + text(DFB_VERSION_MINOR) + ", size " + text(c.width) + 'x'
-                    + text(c.height) + ", tiles of " + text(tileSize) + ", channels " + text(TileOp::channels)
-                    + ", sent channels " + text(sent) + ", format " + text(static_cast<int>(c.format)) + ", depth "
-                    + text(c.depth) + ", aux " + text(c.aux) + ", display rank " + text(c.displayRank)
-                    + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
-                    + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
-                    + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
-                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", least transmittance "
-                    + text(c.minTransmittance) + ", checksums " + text(checksums) + ", message pool "
-                    + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither " + text(c.dither)
-                    + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation + typeid(PixelOp).name(),
-                rank};
+        Settings s;
+        s.add("the version of dfb", std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR));
+        s.add(tileOperation, std::string(typeid(TileOp).name()));
+        s.add(pixelOperation, std::string(typeid(PixelOp).name()));
+        s.add("the size of tiles", tileSize);
+        s.add("the mask of channels", TileOp::channels);
+        s.add("the mask of channels that travel", sent);
+        s.add("width", c.width);
+        s.add("height", c.height);
+        s.add("format", nameOf(c.format));
+        s.add("depth", c.depth);
+        s.add("aux", c.aux);
+        s.add("dither", c.dither);
+        s.add("displayRank", c.displayRank);
+        s.add("framesInFlight", c.framesInFlight);
+        s.add(ownerMap, owners.value());
+        s.add("the id of codec", c.codec ? c.codec->id() : 0);
+        s.add("compression", c.compression == CompressionMode::Auto ? "Auto" : "Always");
+        s.add("wire.color", nameOf(c.wire.color));
+        s.add("wire.budget", c.wire.budget);
+        s.add("wire.maxColor", c.wire.maxColor);
+        s.add("minTransmittance", c.minTransmittance);
+        s.add("gather", c.gather == GatherMode::AtEnd ? "AtEnd" : "Batches");
+        s.add("messagePoolBytes", c.messagePoolBytes);
+        s.add("checksums", checksums);
+        return {true, s.text(), rank};
+    }
+
+    // Of a result that is not fine.
+    [[noreturn]] void refuse() const
+    {
+        ErrorInfo info;
+        info.rank = rank;
+        info.message = text;
+        throw InvalidArgument(std::move(info));
     }
 
     SmallBytes bytes() const
@@ -338,50 +353,88 @@ struct Agreement {
             return first;
         if (!b.fine)
             return second;
-        return Agreement{false,
-                         "ranks " + std::to_string(a.rank) + " and " + std::to_string(b.rank)
-                             + " were configured differently: " + difference(a.text, b.text),
-                         a.rank}
-            .bytes();
+        return Agreement{false, difference(a, b), -1}.bytes();
     }
 
 private:
-    static constexpr const char* tileOperation = "tile operation ";
-    static constexpr const char* pixelOperation = "pixel operation ";
+    static constexpr const char* tileOperation = "the tile operation";
+    static constexpr const char* pixelOperation = "the pixel operation";
+    static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
+    static constexpr char separator = '=';
+
+    static std::string textOf(const std::string& value) { return value; }
+    static std::string textOf(const char* value) { return value; }
+    template <class Value>
+    static std::string textOf(Value value)
+    {
+        if constexpr (std::is_same_v<Value, bool>) {
+            return value ? "true" : "false";
+        } else if constexpr (std::is_floating_point_v<Value>) {
+            char digits[40]; // as few as tell it from all others
+            const int most = std::numeric_limits<Value>::max_digits10;
+            for (int count = 1; count <= most; ++count) {
+                std::snprintf(digits, sizeof digits, "%.*g", count, static_cast<double>(value));
+                if (static_cast<Value>(std::strtod(digits, nullptr)) == value)
+                    break;
+            }
+            return digits;
+        } else {
+            return std::to_string(value);
+        }
+    }
 
     // Types are compared by the names that all compilers have for them, and shown as they are written.
-    static std::string readable(const std::string& item)
+    static std::string readable(const std::string& name, const std::string& value)
     {
-        for (const std::string start : {tileOperation, pixelOperation}) {
-            if (item.compare(0, start.size(), start) != 0)
-                continue;
-            const std::unique_ptr<char, decltype(&std::free)> name(
-                abi::__cxa_demangle(item.c_str() + start.size(), nullptr, nullptr, nullptr), &std::free);
-            if (name)
-                return start + name.get();
-        }
-        return item;
+        if (name != tileOperation && name != pixelOperation)
+            return value;
+        const std::unique_ptr<char, decltype(&std::free)> written(
+            abi::__cxa_demangle(value.c_str(), nullptr, nullptr, nullptr), &std::free);
+        return written ? written.get() : value;
     }
 
-    // The items that are not the same in both; all, if they have not the same items.
-    static std::string difference(const std::string& a, const std::string& b)
+    // What is not the same in both, in words.
+    static std::string difference(const Agreement& a, const Agreement& b)
     {
-        const std::vector<std::string> as = itemsOf(a), bs = itemsOf(b);
+        const auto as = settingsOf(a.text), bs = settingsOf(b.text);
+        const std::string ranks[] = {" on rank " + std::to_string(a.rank), " on rank " + std::to_string(b.rank)};
         std::string differing;
         for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
-            if (as[i] != bs[i])
-                differing += (differing.empty() ? "[" : ", [") + readable(as[i]) + "] and [" + readable(bs[i]) + "]";
-        return differing.empty() ? "[" + a + "] and [" + b + "]" : differing;
+            if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name != ownerMap || differing.empty()))
+                differing += (differing.empty() ? "" : "; ") + name + " is " + readable(name, value) + ranks[0]
+                             + " and " + readable(name, bs[i].second) + ranks[1];
+        if (differing.empty())
+            differing = "the settings" + ranks[0] + " are not those" + ranks[1];
+        return differing + ": it must be the same on all ranks";
     }
-    static std::vector<std::string> itemsOf(const std::string& text)
+    static std::vector<std::pair<std::string, std::string>> settingsOf(const std::string& text)
     {
-        std::vector<std::string> items;
-        for (std::size_t at = 0, end = 0; end != std::string::npos; at = end + 2) {
-            end = text.find(", ", at);
-            items.push_back(text.substr(at, end == std::string::npos ? end : end - at));
+        std::vector<std::pair<std::string, std::string>> settings;
+        for (std::size_t at = 0; at < text.size();) {
+            const std::size_t end = std::min(text.find('\n', at), text.size());
+            const std::string line = text.substr(at, end - at);
+            const std::size_t middle = std::min(line.find(separator), line.size());
+            settings.emplace_back(line.substr(0, middle), line.substr(std::min(middle + 1, line.size())));
+            at = end + 1;
         }
-        return items;
+        return settings;
     }
 };
+
+// Collective. What all ranks were made with, or what is wrong. Then no rank returns before all know it: the first that
+// throws it may take the messenger along, and who has not heard of the reason by then would get another error.
+template <class Messaging>
+Agreement agree(Messaging& messaging, const Agreement& mine)
+{
+    const auto all = Agreement::from(messaging.reduce(mine.bytes(), Agreement::combine));
+    if (!all.fine) {
+        try {
+            messaging.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
+        } catch (const TransportError&) {
+            // So one has gone, which it does when all know.
+        }
+    }
+    return all;
+}
 
 } // namespace dfb::detail

@@ -1,0 +1,98 @@
+// FrameTerms: what a frame was begun with, as far as it must be the same on all ranks; and which of it is not.
+#pragma once
+
+#include <dfb/frame.hpp>
+
+#include <array>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <string>
+#include <type_traits>
+
+namespace dfb::detail {
+
+// FNV-1a over 64-bit words.
+class Fingerprint {
+public:
+    void add(std::uint64_t v) noexcept { value_ = (value_ ^ v) * 1099511628211u; }
+    std::uint64_t value() const noexcept { return value_; }
+
+private:
+    std::uint64_t value_ = 1469598103934665603u;
+};
+
+// The fields of FrameParams; travels with each verdict as it is.
+struct FrameTerms {
+    std::uint64_t samplesHash = 0; // 0: there is no plan
+    std::int64_t sampleCount = 0;  // of all tiles in the plan
+    std::uint64_t accumulationId = 0;
+    std::array<std::uint32_t, 4> background{}; // bits: what is no number is the same as itself
+    std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
+    std::int32_t declared = 0, allowPartial = 0;
+    std::int32_t rank = 0; // whose; the lowest of those that are alike
+
+    static FrameTerms of(const FrameParams& p, int rank)
+    {
+        FrameTerms t;
+        if (p.samples) {
+            Fingerprint f;
+            for (const TileSamples& s : *p.samples) {
+                f.add(static_cast<std::uint64_t>(s.first) << 32 | static_cast<std::uint32_t>(s.count));
+                t.sampleCount += s.count;
+            }
+            t.samplesHash = f.value();
+        }
+        t.accumulationId = p.accumulationId;
+        std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
+        t.passes = p.passes;
+        t.maxLayers = p.maxLayers;
+        t.timeoutMs = p.timeoutMs;
+        t.declared = p.declared;
+        t.allowPartial = p.allowPartial;
+        t.rank = rank;
+        return t;
+    }
+
+    // The first field that is not the same in both, with its values and ranks; "" if they are alike.
+    std::string difference(const FrameTerms& o) const
+    {
+        std::string text;
+        const auto compare = [&](const char* name, const auto& mine, const auto& its, const auto& textOf) {
+            if (text.empty() && mine != its)
+                text = std::string("FrameParams::") + name + " is " + textOf(*this) + " on rank " + std::to_string(rank)
+                       + " and " + textOf(o) + " on rank " + std::to_string(o.rank);
+        };
+        const auto number = [&](const char* name, auto member) {
+            compare(name, this->*member, o.*member, [&](const FrameTerms& t) { return std::to_string(t.*member); });
+        };
+        const auto flag = [&](const char* name, std::int32_t FrameTerms::*member) {
+            compare(name, this->*member, o.*member, [&](const FrameTerms& t) { return t.*member ? "true" : "false"; });
+        };
+        compare("background", background, o.background, backgroundText);
+        number("passes", &FrameTerms::passes);
+        compare("samples", samplesHash, o.samplesHash, [](const FrameTerms& t) {
+            return t.samplesHash == 0 ? "null" : "a plan of " + std::to_string(t.sampleCount) + " samples";
+        });
+        number("maxLayers", &FrameTerms::maxLayers);
+        number("accumulationId", &FrameTerms::accumulationId);
+        flag("declared", &FrameTerms::declared);
+        number("timeoutMs", &FrameTerms::timeoutMs);
+        flag("allowPartial", &FrameTerms::allowPartial);
+        return text;
+    }
+
+private:
+    static std::string backgroundText(const FrameTerms& t)
+    {
+        std::array<float, 4> c{};
+        std::memcpy(c.data(), t.background.data(), sizeof c);
+        char text[80];
+        std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g, %.9g)", static_cast<double>(c[0]),
+                      static_cast<double>(c[1]), static_cast<double>(c[2]), static_cast<double>(c[3]));
+        return text;
+    }
+};
+static_assert(std::has_unique_object_representations_v<FrameTerms>); // no byte of a verdict is undefined
+
+} // namespace dfb::detail
