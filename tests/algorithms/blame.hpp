@@ -211,6 +211,13 @@ struct BlamedConfig {
                        {refused + "width is ", valuesText(odd, "97", "98")});
         }
         BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+        for (const int odd : oddRanks(size)) {
+            std::vector<std::int64_t> values(rank == odd ? 3 : 2);
+            expectText(result, "allReduce() of rank " + std::to_string(odd),
+                       scene::outcomeOf([&] { fb.allReduce(values, BlameFrameBuffer<Transport>::Reduce::Sum); }),
+                       {"InvalidArgument: dfb: invalid argument: the number of values in allReduce() is ",
+                        valuesText(odd, "2", "3"), "2 on rank "});
+        }
         expectGoodFrame(result, fb, s, "all of them");
         return result;
     }

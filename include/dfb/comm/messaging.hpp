@@ -2,6 +2,7 @@
 // credit, reductions, and waiting without spinning.
 #pragma once
 
+#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/flow_control.hpp>
 #include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
@@ -328,14 +329,21 @@ public:
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
     {
-        const auto* first = reinterpret_cast<const std::byte*>(values.data());
-        const Bytes result = reduce(
-            Bytes(first, first + values.size() * sizeof(std::int64_t)),
-            [operation](const Bytes& a, const Bytes& b) { return ReductionTable::combineElements(a, b, operation); });
-        if (result.size() != values.size() * sizeof(std::int64_t))
-            throw InvalidArgument("allReduce() was called with different numbers of values on different ranks");
+        ByteWriter mine;
+        mine.put(static_cast<std::int32_t>(rank()));
+        for (const std::int64_t value : values)
+            mine.put(value);
+        const Bytes result = reduce(mine.bytes(), [operation](const Bytes& a, const Bytes& b) {
+            return ReductionTable::combineElements(a, b, operation);
+        });
+        ByteReader in(result);
+        if (in.get<std::int32_t>() < 0)
+            throw InvalidArgument("the number of values in allReduce() is " + in.getText()
+                                  + ": it must be the same on all ranks");
+        in.require(in.left() == values.size() * sizeof(std::int64_t));
         std::vector<std::int64_t> reduced(values.size());
-        std::copy(result.begin(), result.end(), reinterpret_cast<std::byte*>(reduced.data()));
+        for (std::int64_t& value : reduced)
+            value = in.get<std::int64_t>();
         return reduced;
     }
 

@@ -5,17 +5,18 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
+#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/detail/small_bytes.hpp>
 
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 #include <deque>
 #include <functional>
 #include <map>
 #include <mutex>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -47,21 +48,30 @@ public:
         }
     }
 
-    // Combines arrays of int64 element by element. Arrays of different lengths give one byte, which is no array.
+    // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1:
+    // what follows is a text, on arrays that are not equally long. Throws Error (MalformedMessage).
     template <class Operation>
     static Bytes combineElements(const Bytes& a, const Bytes& b, Operation operation)
     {
-        if (a.size() != b.size() || a.size() % sizeof(std::int64_t) != 0)
-            return Bytes(1);
-        Bytes result(a.size());
-        for (std::size_t i = 0; i < a.size(); i += sizeof(std::int64_t)) {
-            std::int64_t x, y;
-            std::memcpy(&x, a.data() + i, sizeof x);
-            std::memcpy(&y, b.data() + i, sizeof y);
-            x = operation(x, y);
-            std::memcpy(result.data() + i, &x, sizeof x);
+        detail::ByteReader as(a), bs(b);
+        const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
+        if (rankA < 0 || rankB < 0)
+            return rankA < 0 ? a : b;
+        detail::ByteWriter out;
+        if (as.left() != bs.left()) {
+            const auto text = [](const detail::ByteReader& in, std::int32_t rank) {
+                return std::to_string(in.left() / sizeof(std::int64_t)) + " on rank " + std::to_string(rank);
+            };
+            out.put(std::int32_t{-1});
+            out.putText(text(as, rankA) + " and " + text(bs, rankB));
+            return out.bytes();
         }
-        return result;
+        out.put(rankA);
+        while (as.left() > 0) {
+            const auto x = as.get<std::int64_t>(), y = bs.get<std::int64_t>();
+            out.put(operation(x, y));
+        }
+        return out.bytes();
     }
 
     // Takes part with `own`; every rank does so once per key. `done` gets the result, the same on all ranks.
