@@ -12,6 +12,8 @@
 #include <utility>
 #include <vector>
 
+namespace manifest_cases {
+
 namespace {
 
 using Inputs = std::vector<dfb::TileInput>;
@@ -138,3 +140,5 @@ TEST_CASE("Manifests and answers that cannot be are refused", "[manifest]")
     owner.complete();
     CHECK(receive(3).find("after all ranks have declared") != std::string::npos);
 }
+
+} // namespace manifest_cases
