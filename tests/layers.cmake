@@ -3,7 +3,7 @@
 cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
-set(level_0 version.hpp fwd.hpp comm/compression_gains.hpp detail/fifo.hpp detail/hidden_tiles.hpp detail/small_bytes.hpp testing/reference.hpp)
+set(level_0 version.hpp fwd.hpp comm/compression_gains.hpp detail/fifo.hpp detail/hidden_tiles.hpp detail/quiescence.hpp detail/small_bytes.hpp testing/reference.hpp)
 set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp processors.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp comm/progress.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
 set(level_2 levels.hpp detail/background_pixels.hpp wire_codes.hpp detail/image_gate.hpp comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp

@@ -121,10 +121,11 @@ public:
         return config;
     }
 
-    // Collective, after the frame of that number has ended well on all ranks: returns when all displays have it, which
-    // is the moment to show it on all of them. If some display has not got all of it within `timeoutMs` (0: no limit),
-    // throws Error (TimedOut), or MalformedMessage if a part of it, or of a later frame, was not to be believed; the
-    // same on all ranks. What the displays show stays. Whatever the limit, waits for all ranks to call it, as
+    // Collective, after the frame of that number has ended on all ranks: returns when all displays have it, which is
+    // the moment to show it on all of them. Throws Error, the same on all ranks, if some display has not got all of it
+    // within `timeoutMs` (TimedOut; 0: no limit), if no rank has sent all of it, as of a frame that ended partial or
+    // failed (MissingInput), or if a part of it, or of a later frame, was not to be believed (MalformedMessage). What
+    // the displays show stays. Whatever the limit, waits for all ranks to call it, as
     // allReduce() does. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
@@ -136,8 +137,10 @@ public:
             std::optional<std::chrono::steady_clock::time_point> deadline;
             if (timeoutMs > 0)
                 deadline = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs);
-            complete = messaging_->wait([&] { return hasAll(frame) || hasError(); }, deadline) && !hasError();
-            missing = complete ? "" : whatIsMissing(frame);
+            tellSent(frame);
+            messaging_->wait([&] { return isOver(frame) || hasError(); }, deadline);
+            missing = whatIsMissing(frame);
+            complete = missing.empty();
         } catch (...) {
             messaging_->messenger().expectMessages(false);
             throw;
@@ -151,13 +154,19 @@ public:
                 std::swap(shown_.at(display), picture.image);
         if (all.fine)
             shownFrame_ = frame;
+        messaging_->reductions().forget(SentPixels, frame);
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
+        sent_.erase(sent_.begin(), sent_.upper_bound(frame));
+        allSent_.erase(allSent_.begin(), allSent_.upper_bound(frame));
         last_ = frame;
         if (isMalformed(missing) && frame >= errorFrame_)
             error_.clear();
         if (!all.fine) {
             ErrorInfo info;
-            info.kind = isMalformed(all.text) ? ErrorKind::MalformedMessage : ErrorKind::TimedOut;
+            const bool isUnsent = all.text.find(unsent) != std::string::npos;
+            info.kind = isMalformed(all.text) ? ErrorKind::MalformedMessage
+                        : isUnsent            ? ErrorKind::MissingInput
+                                              : ErrorKind::TimedOut;
             info.frame = frame;
             info.message = all.text.substr(isMalformed(all.text) ? malformed.size() : 0);
             throw Error(std::move(info));
@@ -205,6 +214,7 @@ public:
                 convertPixels(tile.color + 4 * first, part.width(), format_, out);
             }
             messaging_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
+            countSent(tile.frame, d, static_cast<std::int64_t>(part.width()) * part.height());
         }
     }
 
@@ -223,6 +233,10 @@ private:
     // In front of an Agreement's text that is not about time.
     static constexpr std::string_view malformed = "malformed: ";
     static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
+    // At the end of what a display misses.
+    static constexpr std::string_view unsent = " that no rank has sent";
+
+    enum Scope : std::uint32_t { SentPixels = detail::Messaging<Transport>::ownScope + 1 }; // of reductions
 
     struct Picture {
         Image image;
@@ -230,6 +244,7 @@ private:
         std::vector<std::uint64_t> covered{}; // a bit for each pixel, each row from a word on
     };
     using Pictures = std::map<int, Picture>; // by display
+    using Sums = ReductionTable::Bytes;
 
     std::string describe() const
     {
@@ -292,6 +307,13 @@ private:
                 messaging_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
                 break;
             case detail::MessageKind::FinishedTiles: store(header.number, message); break;
+            case detail::MessageKind::ReduceUp:
+            case detail::MessageKind::ReduceDown:
+                if (messaging_->keyOf(header, message).scope == SentPixels) {
+                    receiveSent(source, header, message);
+                    break;
+                }
+                [[fallthrough]];
             default:
                 detail::failMalformed("a message of a kind that no wall gets", -1,
                                       static_cast<std::int64_t>(header.kind));
@@ -419,15 +441,76 @@ private:
         return pictures;
     }
 
-    bool hasAll(std::int64_t frame)
+    // ---- how many pixels of a frame all ranks have sent to each display
+
+    void countSent(std::int64_t frame, int display, std::int64_t pixels)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        if (shown_.empty())
-            return true;
-        const auto found = coming_.find(frame);
-        return found != coming_.end() && std::all_of(found->second->begin(), found->second->end(), [](const auto& p) {
-                   return p.second.pixelsLeft == 0;
-               });
+        auto& sent = sent_[frame];
+        sent.resize(static_cast<std::size_t>(layout_.displayCount()));
+        sent[static_cast<std::size_t>(display)] += pixels;
+    }
+
+    // This rank has sent all of its frame. Waits for nothing.
+    void tellSent(std::int64_t frame)
+    {
+        std::vector<std::int64_t> mine;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            mine = sent_[frame];
+        }
+        mine.resize(static_cast<std::size_t>(layout_.displayCount()));
+        const auto* first = reinterpret_cast<const std::byte*>(mine.data());
+        messaging_->reductions().enter(
+            {SentPixels, frame}, Sums(first, first + mine.size() * sizeof mine[0]),
+            [](const Sums& a, const Sums& b) {
+                return ReductionTable::combineElements(a, b, [](std::int64_t x, std::int64_t y) {
+                    return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
+                });
+            },
+            [this, frame](const Sums& all) {
+                {
+                    const std::lock_guard<std::mutex> lock(mutex_);
+                    if (frame <= last_)
+                        return;
+                    auto& sent = allSent_[frame];
+                    sent.resize(static_cast<std::size_t>(layout_.displayCount()));
+                    std::copy(all.begin(), all.end(), reinterpret_cast<std::byte*>(sent.data()));
+                }
+                messaging_->notify();
+            });
+    }
+
+    void receiveSent(int source, const detail::MessageHeader& header, const Buffer& message)
+    {
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (header.number > lastPossible())
+                detail::failMalformed("word of a frame that no rank can have begun", lastPossible(), header.number);
+        }
+        if (messaging_->bytesOf(message).size()
+            != static_cast<std::size_t>(layout_.displayCount()) * sizeof(std::int64_t))
+            detail::failMalformed("word of what was sent to other displays than there are");
+        messaging_->receiveReduction(source, header, message);
+    }
+
+    // Under mutex_: what has not come to a display of this rank, and whether nothing more will.
+    std::int64_t pixelsLeft(std::int64_t frame, int display) { return picturesOf(frame)->at(display).pixelsLeft; }
+    bool hasAllSent(std::int64_t frame, int display)
+    {
+        const auto found = allSent_.find(frame);
+        const std::int64_t pixels = static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight;
+        return found != allSent_.end()
+               && found->second[static_cast<std::size_t>(display)] == pixels - pixelsLeft(frame, display);
+    }
+
+    // No display of this rank has to wait any more.
+    bool isOver(std::int64_t frame)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
+            return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
+        });
     }
     bool hasError()
     {
@@ -442,10 +525,11 @@ private:
             return std::string(malformed) + error_;
         std::string text;
         for (const auto& [display, image] : shown_) {
-            const std::int64_t left = picturesOf(frame)->at(display).pixelsLeft;
+            const std::int64_t left = pixelsLeft(frame, display);
             if (left > 0)
                 text += (text.empty() ? "display " : ", display ") + std::to_string(display) + " of rank "
-                        + std::to_string(messaging_->rank()) + " misses " + std::to_string(left) + " pixels";
+                        + std::to_string(messaging_->rank()) + " misses " + std::to_string(left) + " pixels"
+                        + std::string(hasAllSent(frame, display) ? unsent : "");
         }
         return text;
     }
@@ -457,11 +541,12 @@ private:
     std::int64_t shownFrame_ = -1;
 
     std::mutex mutex_;
-    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels
-    std::int64_t last_ = 0;                                    // finished; under mutex_
-    std::int64_t newest_ = 0;                                  // of which this rank has put() a tile; under mutex_
-    std::string error_;                                        // under mutex_
-    std::int64_t errorFrame_ = 0;                              // the last that error_ may be about; under mutex_
+    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, but for the pixels
+    std::map<std::int64_t, std::vector<std::int64_t>> sent_, allSent_; // pixels by frame and display; under mutex_
+    std::int64_t last_ = 0;                                            // finished; under mutex_
+    std::int64_t newest_ = 0;     // of which this rank has put() a tile; under mutex_
+    std::string error_;           // under mutex_
+    std::int64_t errorFrame_ = 0; // the last that error_ may be about; under mutex_
 
     std::unique_ptr<detail::Messaging<Transport>> messaging_; // last: its tasks use the others
 };

@@ -147,8 +147,10 @@ public:
         // during end() or after it, when it does nothing.
         void cancel() const { engine_->cancel(number_); }
 
-        // Collective; for several framebuffers, in the same order on all ranks. Waits until all tiles of all ranks are
-        // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
+        // Collective; for several framebuffers, in the same order on all ranks. This rank's last setTile() must have
+        // returned by then: what has not been sent when all ranks are in end() counts as missing. Waits until all tiles
+        // of all ranks are finished and the image is complete on the display rank, or the frame has failed, as it does
+        // when nothing is under way that could complete it (MissingInput). Throws FrameError, the same
         // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
         // begin the next. Throws InvalidArgument on a thread that may not call MPI (see Progress): the frame is still
         // open then.

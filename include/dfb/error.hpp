@@ -24,7 +24,8 @@ enum class ErrorKind : std::uint32_t {
     UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
     Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time
-    Transport         // the transport reported a failure
+    Transport,        // the transport reported a failure
+    MissingInput      // a frame can not become complete: all ranks wait for it, and nothing is under way any more
 };
 
 inline const char* toString(ErrorKind kind)
@@ -41,6 +42,7 @@ inline const char* toString(ErrorKind kind)
     case ErrorKind::Cancelled: return "frame cancelled";
     case ErrorKind::TimedOut: return "timed out";
     case ErrorKind::Transport: return "transport failure";
+    case ErrorKind::MissingInput: return "missing input, all ranks wait and nothing is under way";
     }
     return "unknown error";
 }

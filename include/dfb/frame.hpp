@@ -33,7 +33,7 @@ enum class CompressionMode : std::uint8_t {
 };
 
 // What a framebuffer is made with; how its messages travel is said by the MessengerOptions. Everything but the executor
-// must be the same on all ranks, as must the types of its operations, which is checked when it is made.
+// and quietMs must be the same on all ranks, as must the types of its operations, which is checked when it is made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
@@ -45,8 +45,8 @@ struct FrameBufferConfig {
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
     CompressionMode compression = CompressionMode::Always;
-    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or all of it; what else they have travels as
-    // it is. Finished tiles travel in `format`.
+    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or all of it; what else they have travels
+    // as it is. Finished tiles travel in `format`.
     WirePrecision wire{};
     // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
     // left out. That changes it by no more than this times the largest colour.
@@ -58,6 +58,10 @@ struct FrameBufferConfig {
     // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see Messenger::threadShare().
     // A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
+    // So long a rank waits in end() until it looks whether anything is still under way on any rank; then it does so
+    // more and more seldom. A frame that nothing can complete any more is found by that: see ErrorKind::MissingInput. 1
+    // or more.
+    int quietMs = 2000;
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.
@@ -88,12 +92,15 @@ struct FrameParams {
     bool declared = false;
     // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
-    // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
+    // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks. Not
+    // needed for inputs that are never sent: when all ranks are in end() and nothing is under way any more, the frame
+    // fails with ErrorKind::MissingInput, some seconds after the last of them.
     int timeoutMs = 0;
     // A frame that fails has the tiles that were finished by then: end() throws nothing but says so in
     // FrameReport::failure. An exception of a renderer or an operation, or inputs at odds, cost no more than their
-    // tiles; what misses an input is given up after timeoutMs, which must not be 0. Ranks that disagree fail it all the
-    // same. See also DistributedFrameBuffer::isComplete().
+    // tiles; what misses an input is given up when nothing is under way any more, or after timeoutMs. Without that a
+    // message that could not be read ends the frame at once, with the tiles that are finished. Ranks that disagree fail
+    // it all the same. See also DistributedFrameBuffer::isComplete().
     bool allowPartial = false;
 };
 
@@ -137,8 +144,8 @@ struct FrameReport {
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained
-    // All: how far colour and alpha of a pixel may be off for WirePrecision and minTransmittance, from what came. Neither
-    // changes depth, positions and ids.
+    // All: how far colour and alpha of a pixel may be off for WirePrecision and minTransmittance, from what came.
+    // Neither changes depth, positions and ids.
     double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports

@@ -53,7 +53,10 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
     const auto watched = std::make_shared<Board>();
     std::atomic<bool> armed{false}, done{false};
     watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
-        if (from != 1 || header.receiver != wallAddress || header.kind != kind || !armed || done.exchange(true))
+        if (from != 1 || header.receiver != wallAddress || header.kind != kind || !armed)
+            return What::Pass;
+        const bool isReduction = kind == MessageKind::ReduceUp; // the one that finish() waits for
+        if ((isReduction && dfb::detail::loadAs<std::uint32_t>(message.data() + body) != 0) || done.exchange(true))
             return What::Pass;
         return change(message);
     };

@@ -108,7 +108,7 @@ inline ErrorInfo getErrorInfo(ByteReader& in)
 {
     ErrorInfo e;
     e.kind = in.get<ErrorKind>();
-    in.require(e.kind <= ErrorKind::Transport);
+    in.require(e.kind <= ErrorKind::MissingInput);
     e.rank = in.get<std::int32_t>();
     e.from = in.get<std::int32_t>();
     for (std::int64_t* v : {&e.frame, &e.tile, &e.pass, &e.generation, &e.source, &e.expected, &e.got})

@@ -7,6 +7,7 @@
 #include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/detail/fifo.hpp>
+#include <dfb/detail/quiescence.hpp>
 #include <dfb/exec.hpp>
 
 #include <algorithm>
@@ -46,7 +47,8 @@ class Messaging final : private MessageReceiver {
 public:
     using Bytes = ReductionTable::Bytes;
     using Clock = std::chrono::steady_clock;
-    static constexpr std::uint32_t ownScope = 0; // of reduce(); the handler uses others
+    // Of reduce(), and of rounds that only look whether anything is under way; the handler uses others as well.
+    static constexpr std::uint32_t ownScope = 0, quietScope = ~std::uint32_t{0};
 
     // `poolBytes`: see FlowControl.
     Messaging(std::shared_ptr<Messenger<Transport>> messenger, std::shared_ptr<Executor> executor,
@@ -97,6 +99,7 @@ public:
     void newEpoch(std::int64_t number)
     {
         epoch_ = number;
+        sentOn_ = takenOn_ = 0;
         flow_.newEpoch();
     }
     FlowControl& flow() noexcept { return flow_; }
@@ -180,6 +183,28 @@ public:
                                   "it");
     }
 
+    // Takes note that this message of the epoch has been taken.
+    void countTaken(int source, const MessageHeader& header, const Buffer& message)
+    {
+        if (source != rank() && carriesOn(header.kind, message))
+            ++takenOn_;
+    }
+
+    // The messages of the epoch that make who takes them do something, at a moment at which this object rests: no task
+    // of it is queued or runs, and nothing waits to be sent. Nothing if it does not rest.
+    std::optional<MessageCounts> countsAtRest()
+    {
+        const MessageCounts counts{sentOn_, takenOn_};
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (tasks_ > 0)
+                return std::nullopt;
+        }
+        if (!flow_.allSent() || !messenger_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
+            return std::nullopt;
+        return counts; // they were these when there was no task
+    }
+
     // Message bytes and messages to other ranks since the start.
     std::int64_t bytesSent() const noexcept { return bytesSent_; }
     std::int64_t messagesSent() const noexcept { return messagesSent_; }
@@ -208,7 +233,7 @@ public:
     // What a ReduceUp or ReduceDown message belongs to, and what it brings.
     static ReductionKey keyOf(const MessageHeader& header, const Buffer& message)
     {
-        return {loadAs<std::uint32_t>(message.data() + sizeof header), header.number};
+        return {scopeOf(message), header.number};
     }
     static Bytes bytesOf(const Buffer& message)
     {
@@ -424,6 +449,29 @@ private:
     {
         bytesSent_ += static_cast<std::int64_t>(message.size());
         ++messagesSent_;
+        if (carriesOn(loadAs<MessageHeader>(message.data()).kind, message))
+            ++sentOn_;
+    }
+
+    // Whether a message makes who takes it do something for its frame. Credit does so only for what waits for it.
+    static bool carriesOn(MessageKind kind, const Buffer& message)
+    {
+        switch (kind) {
+        case MessageKind::Credit:
+        case MessageKind::CreditRequest:
+        case MessageKind::ImagePlace: return false;
+        case MessageKind::ReduceUp:
+        case MessageKind::ReduceDown: {
+            const bool hasScope = message.size() >= sizeof(MessageHeader) + sizeof(std::uint32_t);
+            const std::uint32_t scope = hasScope ? scopeOf(message) : ownScope;
+            return scope != ownScope && scope != quietScope;
+        }
+        default: return true;
+        }
+    }
+    static std::uint32_t scopeOf(const Buffer& message)
+    {
+        return loadAs<std::uint32_t>(message.data() + sizeof(MessageHeader));
     }
 
     struct Arrival {
@@ -517,7 +565,8 @@ private:
     FlowControl flow_;
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
-    std::atomic<std::int64_t> reductionCount_{0}; // of reduce()
+    std::atomic<std::uint64_t> sentOn_{0}, takenOn_{0}; // see countsAtRest()
+    std::atomic<std::int64_t> reductionCount_{0};       // of reduce()
     std::mutex damageMutex_;
     std::optional<std::pair<int, ErrorInfo>> damage_; // under damageMutex_
 

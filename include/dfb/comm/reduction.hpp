@@ -74,7 +74,8 @@ public:
         return out.bytes();
     }
 
-    // Takes part with `own`; every rank does so once per key. `done` gets the result, the same on all ranks.
+    // Takes part with `own`; every rank does so once per key, or again when it has got the result. `done` gets the
+    // result, the same on all ranks.
     void enter(const ReductionKey& key, Bytes own, Combine combine, Done done)
     {
         std::unique_lock<std::mutex> lock(mutex_);

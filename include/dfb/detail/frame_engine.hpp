@@ -11,6 +11,7 @@
 #include <dfb/detail/job_share.hpp>
 #include <dfb/detail/manifest.hpp>
 #include <dfb/detail/outcome.hpp>
+#include <dfb/detail/quiescence.hpp>
 #include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/frame.hpp>
 
@@ -67,6 +68,8 @@ public:
                                       + ") that the inputs of this tile operation do not have");
             if (const int ms = messaging_->messenger().options().peerTimeoutMs; ms != 0 && ms < 100)
                 throw InvalidArgument("a time-out for peers of " + std::to_string(ms) + " ms: 0, or 100 and more");
+            if (config_.quietMs < 1)
+                throw InvalidArgument("quietMs is " + std::to_string(config_.quietMs) + ": it must be 1 or more");
             checkWire();
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
@@ -123,9 +126,8 @@ public:
         if (params.maxLayers < 0)
             throw InvalidArgument("at most " + std::to_string(params.maxLayers) + " layers");
         checkSamples(params);
-        if (params.timeoutMs < 0 || (params.timeoutMs == 0 && params.allowPartial))
-            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms"
-                                  + (params.allowPartial ? " for a frame that may be partial" : ""));
+        if (params.timeoutMs < 0)
+            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
         messaging_->requireProgress();
         messaging_->messenger().throwIfFailed();
         params_ = params;
@@ -151,6 +153,7 @@ public:
         if (OpaqueHides<TileOp>::value)
             hidden_.newFrame(layout().tileCount());
         outcome_->newFrame();
+        quiescence_.newFrame(std::chrono::milliseconds(config_.quietMs));
         ownTilesDone_ = endCalled_ = false;
         inputsSent_ = 0;
         bytesBefore_ = messaging_->bytesSent();
@@ -421,13 +424,17 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
-    enum Scope : std::uint32_t { AllDeclared = Messaging<Transport>::ownScope + 1, FrameVerdict, SameParams };
+    enum Scope : std::uint32_t {
+        AllDeclared = Messaging<Transport>::ownScope + 1,
+        FrameVerdict,
+        Quiet = Messaging<Transport>::quietScope
+    };
 
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
 
-    // So long end() waits before ranks compare what they began the frame with.
-    static constexpr std::chrono::milliseconds untilCompared{2000};
+    // So long end() waits between two looks at what nobody tells it.
+    static constexpr std::chrono::milliseconds untilAsked{2000};
 
     bool compresses() const
     {
@@ -471,6 +478,7 @@ private:
         }
         if (hasCredit)
             messaging_->flow().consumed(source, byteCount);
+        messaging_->countTaken(source, header, message);
         guarded([&] { handle(source, header, std::move(message)); }, {}, source);
         gate_.leave();
     }
@@ -666,13 +674,10 @@ private:
                 if (!messaging_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
                 differs = isUp && !params_.declared;
-            } else if (scope == SameParams) {
-                const Bytes bytes = messaging_->bytesOf(message);
-                ByteReader in(bytes);
-                differs = !in.get<FrameTerms>().difference(terms_).empty();
-                in.end();
+            } else if (scope == Quiet) {
+                differs = !Round::from(messaging_->bytesOf(message)).terms.difference(terms_).empty();
             } else {
-                failMalformed("a reduction of a kind that there is not", SameParams, scope);
+                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
             }
             if (differs)
                 failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
@@ -794,8 +799,9 @@ private:
     bool isBearable(const std::exception_ptr& reason) const
     {
         const ErrorKind kind = errorInfoOf(reason, {}).kind;
-        return params_.allowPartial && kind != ErrorKind::TimedOut && kind != ErrorKind::Cancelled
-               && kind != ErrorKind::Disagreement;
+        return params_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
+               && kind != ErrorKind::Disagreement
+               && (kind != ErrorKind::MalformedMessage || params_.timeoutMs > 0); // what it said would be waited for
     }
 
     // False if this rank has voted.
@@ -833,18 +839,18 @@ private:
     void failElsewhere(const ErrorInfo& info)
     {
         std::optional<ErrorInfo> mine;
-        if (info.kind == ErrorKind::TimedOut && !outcome_->failed())
-            mine = missing(); // this rank's part of what is missing
+        if (isMissing(info.kind) && !outcome_->failed())
+            mine = missing(info.kind); // this rank's part of what is missing
         ErrorInfo copy = info;
-        if (info.kind == ErrorKind::TimedOut)
+        if (isMissing(info.kind))
             copy.tile = copy.expected = -1; // it must not pass for the list of the rank that it came from
         outcome_->failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(copy) ? *mine : copy);
         dropRest();
         tryVote();
     }
 
-    // What this rank waits for, if it does.
-    std::optional<ErrorInfo> missing()
+    // What this rank waits for, if it does; `kind`: how that is known to be missing.
+    std::optional<ErrorInfo> missing(ErrorKind kind)
     {
         std::optional<ErrorInfo> info;
         if (!ownTilesDone_ && params_.declared && tilesLeft_ >= countUnknown / 2) {
@@ -869,10 +875,10 @@ private:
             addWaitedFor(*info, "no verdict from", outcome_->key());
         }
         if (info) {
-            info->kind = ErrorKind::TimedOut;
+            info->kind = kind;
             info->rank = rank();
             info->frame = gate_.frame();
-            if (const std::string lost = messaging_->messenger().lost(); !lost.empty())
+            if (const std::string lost = messaging_->messenger().lost(); kind == ErrorKind::TimedOut && !lost.empty())
                 info->message += (info->message.empty() ? "" : "; ") + lost;
         }
         return info;
@@ -896,12 +902,18 @@ private:
             info.message += (info.message.empty() ? "" : ", ") + text;
     }
 
+    // This rank waits for nothing but the others.
+    bool isDone() const
+    {
+        return endCalled_ && ownTilesDone_ && pipeline_->table().isSaid() && pipeline_->gather().complete();
+    }
+
     // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
     void tryVote()
     {
         outcome_->vote(
             [this] {
-                return endCalled_ && ownTilesDone_ && pipeline_->table().isSaid() && pipeline_->gather().complete();
+                return isDone(); // or the frame has failed
             },
             [this] { return mayVote(); },
             [this] {
@@ -998,6 +1010,7 @@ private:
     {
         renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
         endCalled_ = true;
+        nextLook_ = Clock::now() + quiescence_.interval();
         std::exception_ptr transportError;
         Verdict verdict;
         try {
@@ -1007,16 +1020,15 @@ private:
                 verdict.error = verdict.strayInputs();
             if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
                 verdict.error->frame = gate_.frame();
-            if (verdict.error && params_.allowPartial              // finished tiles may still be on their way
-                && verdict.error->kind != ErrorKind::Disagreement) // but not from ranks that send none
-                messaging_->wait([this] { return pipeline_->gather().complete() && messaging_->flow().allSent(); },
-                                 Clock::now() + std::chrono::milliseconds(params_.timeoutMs));
+            if (verdict.error && params_.allowPartial
+                && verdict.error->kind != ErrorKind::Disagreement) // not from ranks that send none
+                waitForFinishedTiles();
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
         gate_.close([this] { return messaging_->executor().help(); });
         messaging_->reductions().forget(AllDeclared, gate_.frame());
-        messaging_->reductions().forget(SameParams, gate_.frame());
+        messaging_->reductions().forget(Quiet, gate_.frame());
         messaging_->messenger().expectMessages(false);
         frameOpen_ = false;
         lastFailed_ = transportError || verdict.error;
@@ -1036,14 +1048,9 @@ private:
     {
         const auto limit = std::chrono::milliseconds(params_.timeoutMs);
         const auto start = Clock::now();
-        if (limit > untilCompared) {
-            if (const Verdict* verdict = outcome_->wait(start + untilCompared))
-                return *verdict;
-            compareParams();
-        }
-        if (const Verdict* verdict = outcome_->wait(start + limit))
+        if (const Verdict* verdict = waitAndLook(start + limit))
             return *verdict;
-        if (const auto what = missing(); what && !outcome_->failed())
+        if (const auto what = missing(ErrorKind::TimedOut); what && !outcome_->failed())
             failWith(std::make_exception_ptr(Error(*what)));
         if (const Verdict* verdict = outcome_->wait(start + 2 * limit))
             return *verdict;
@@ -1055,30 +1062,93 @@ private:
     Verdict waitWithoutLimit()
     {
         const auto limit = std::chrono::milliseconds(messaging_->messenger().options().peerTimeoutMs);
-        if (const Verdict* verdict = outcome_->wait(Clock::now() + untilCompared))
-            return *verdict;
-        compareParams();
+        const auto step = limit.count() > 0 ? std::min(limit, untilAsked) : untilAsked;
         std::optional<Clock::time_point> deadline;
         for (;;) {
-            const auto next = Clock::now() + std::min<std::chrono::milliseconds>(limit, untilCompared);
-            if (const Verdict* verdict = outcome_->wait(limit.count() > 0 ? std::optional(next) : std::nullopt))
+            if (const Verdict* verdict = waitAndLook(Clock::now() + step))
                 return *verdict;
-            if (!deadline && outcome_->isDamaged())
+            if (!deadline && limit.count() > 0 && outcome_->isDamaged())
                 deadline = Clock::now() + limit;
             if (deadline && Clock::now() >= *deadline)
                 giveUpVerdict(limit);
         }
     }
 
-    // Ranks that were given different parameters may wait for each other for ever. Therefore those that have waited
-    // for some time send up the tree what they were given; see receiveReduction().
-    void compareParams()
+    // The verdict; null if it has not come by then. Meanwhile this rank looks, now and then, whether anything is under
+    // way.
+    const Verdict* waitAndLook(Clock::time_point deadline)
     {
-        ByteWriter mine;
-        mine.put(terms_);
-        messaging_->reductions().enter(
-            {SameParams, gate_.frame()}, mine.bytes(), [](const Bytes& a, const Bytes&) { return a; },
-            [](const Bytes&) {});
+        for (;;) {
+            if (const Verdict* verdict = outcome_->wait(std::min(deadline, nextLook_)))
+                return verdict;
+            const auto now = Clock::now();
+            if (now >= nextLook_) {
+                nextLook_ = now + quiescence_.interval();
+                look();
+            }
+            if (now >= deadline)
+                return nullptr;
+        }
+    }
+
+    // What travels in a round of quiescence_. Ranks that were given different parameters may wait for each other for
+    // ever: therefore it carries what they were given, and shows the difference on its way up the tree, as soon as two
+    // of them are in end(); see receiveReduction().
+    struct Round {
+        FrameTerms terms;
+        Quiescence::Report report;
+
+        Bytes bytes() const
+        {
+            ByteWriter out;
+            out.put(terms);
+            out.put(report);
+            return out.bytes();
+        }
+        static Round from(const Bytes& bytes)
+        {
+            ByteReader in(bytes);
+            Round round;
+            round.terms = in.get<FrameTerms>();
+            round.report = in.get<Quiescence::Report>();
+            in.end();
+            return round;
+        }
+        static Bytes combine(const Bytes& first, const Bytes& second)
+        {
+            const Round a = from(first), b = from(second);
+            return Round{a.terms, Quiescence::sum(a.report, b.report)}.bytes();
+        }
+    };
+
+    // Enters a round, if this rank rests, and the last one has come to its end. By the thread that is in end().
+    void look()
+    {
+        tryVote();
+        const auto counts = messaging_->countsAtRest();
+        if (!counts || !quiescence_.mayEnter())
+            return;
+        const auto isWaiting = [this] { return !isDone() && !outcome_->failed(); };
+        const Round mine{terms_, {*counts, isWaiting() ? 1u : 0u}};
+        quiescence_.enter();
+        messaging_->reductions().enter({Quiet, gate_.frame()}, mine.bytes(), Round::combine,
+                                       [this, isWaiting](const Bytes& all) {
+                                           if (!quiescence_.endRound(Round::from(all).report) || !isWaiting())
+                                               return;
+                                           if (const auto what = missing(ErrorKind::MissingInput))
+                                               failWith(std::make_exception_ptr(Error(*what)));
+                                       });
+    }
+
+    // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
+    void waitForFinishedTiles()
+    {
+        const auto areThere = [this] { return pipeline_->gather().complete() && messaging_->flow().allSent(); };
+        if (params_.timeoutMs == 0) // but what could not be read does not come again
+            messaging_->wait([&] { return areThere() || outcome_->isDamaged(); });
+        messaging_->wait(areThere,
+                         Clock::now()
+                             + (params_.timeoutMs > 0 ? std::chrono::milliseconds(params_.timeoutMs) : untilAsked));
     }
 
     [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
@@ -1103,6 +1173,8 @@ private:
     std::any loopMemory_; // see Frame
     JobShare jobs_;
     HiddenTiles hidden_;
+    Quiescence quiescence_;
+    Clock::time_point nextLook_; // at it; of the thread that is in end()
 
     // The frame.
     FrameGate gate_;

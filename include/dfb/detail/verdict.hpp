@@ -58,6 +58,12 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     return info;
 }
 
+// An error that is about what has not come.
+inline bool isMissing(ErrorKind kind) noexcept
+{
+    return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
+}
+
 struct Verdict {
     std::optional<ErrorInfo> error;
     FrameTerms terms;      // what begin() was given; the same on all ranks
@@ -214,7 +220,7 @@ struct Verdict {
             return 0;
         if (e.kind == ErrorKind::Disagreement)
             return 5;
-        return e.kind != ErrorKind::TimedOut ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
+        return !isMissing(e.kind) ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
     // Of several errors, one that says most, if it can be also which rank is waited for, and the one of the lowest
