@@ -53,8 +53,8 @@ struct ErrorInfo {
     // Where it went wrong: the rank whose code threw, that cancelled or left, passed the wrong argument, or is lost. Of
     // inputs and messages that are wrong or do not come: the rank that noticed, which need not be to blame.
     int rank = -1;
-    // The rank that the input or message came from. If something did not come (TimedOut, Transport): the rank that is
-    // waited for; of an input of a tile, the one that announced it.
+    // The rank that the input or message came from. If something did not come (TimedOut, MissingInput, Transport): the
+    // rank that is waited for; of an input of a tile, the one that announced it.
     int from = -1;
     std::int64_t frame = -1;
     std::int64_t tile = -1;
@@ -75,7 +75,8 @@ struct ErrorInfo {
             text += separator + std::string(name) + ' ' + std::to_string(value);
             separator = ", ";
         };
-        const bool isLate = kind == ErrorKind::TimedOut || (kind == ErrorKind::Transport && from >= 0);
+        const bool isLate = kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput
+                            || (kind == ErrorKind::Transport && from >= 0);
         const bool isHere = kind == ErrorKind::UserCode || kind == ErrorKind::Cancelled
                             || kind == ErrorKind::InvalidArgument || (kind == ErrorKind::Transport && !isLate);
         add(isHere ? "rank" : "noticed by rank", rank);

@@ -21,6 +21,8 @@
 #include <utility>
 #include <vector>
 
+namespace quiet_stress_cases {
+
 namespace {
 
 using Transport = dfb::testing::FaultTransport<dfb::InprocTransport>;
@@ -177,3 +179,5 @@ TEST_CASE("However slow ranks and messages are, a frame that gets all its inputs
 }
 
 TEST_CASE("The same for a long time", "[.stress][quiet]") { stress(400, 60); }
+
+} // namespace quiet_stress_cases

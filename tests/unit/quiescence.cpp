@@ -11,6 +11,8 @@
 #include <random>
 #include <vector>
 
+namespace quiescence_cases {
+
 namespace {
 
 using dfb::detail::Quiescence;
@@ -223,3 +225,5 @@ TEST_CASE("Rounds become rarer, up to a limit, and begin again with the next fra
     q.newFrame(std::chrono::milliseconds(0));
     CHECK(q.interval().count() == 1);
 }
+
+} // namespace quiescence_cases
