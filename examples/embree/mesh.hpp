@@ -19,6 +19,14 @@ struct Mesh {
     std::vector<Triangle> triangles;
 };
 
+// For Loaders::fromFirst(): all that a mesh is made of. Does not compile if there is anything else in it.
+template <class Function>
+void arraysOf(Mesh& mesh, const Function& function)
+{
+    auto& [positions, triangles] = mesh;
+    function(positions, triangles);
+}
+
 // The whole file. Throws std::runtime_error if it cannot be read or is empty.
 inline std::string readFile(const std::string& path)
 {

@@ -210,8 +210,9 @@ public:
         if (!onAllRanks([&] {
                 if (fb_->isDisplayRank())
                     requireFilesWritable();
-                scene_ = std::make_unique<RankScene>(loadRankScene(o_, fb_->rank(), fb_->size()));
             }))
+            return 1;
+        if (!onAllRanks([&] { load(); })) // collective: all ranks or none
             return 1;
         settings_ = renderSettings(o_);
         params_.passes = o_.spp;
@@ -260,6 +261,15 @@ private:
         if (lowest == fb_->rank())
             std::fprintf(stderr, "dfb_render: %s\n", error.c_str());
         return lowest == fb_->size();
+    }
+
+    void load()
+    {
+        const Loaders loaders(
+            fb_->rank(), fb_->size(),
+            [this](const Loaders::Numbers& numbers) { return fb_->allReduce(numbers, Reduce::Min); },
+            [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); });
+        scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
     }
 
     std::vector<std::string> files() const

@@ -6,6 +6,7 @@
 // rank knows all of them, and two cells that share a face have the same number for it.
 #pragma once
 
+#include "loaders.hpp"
 #include "obj.hpp"
 #include "ply.hpp"
 #include "spheres.hpp"
@@ -93,7 +94,7 @@ struct Scene {
     {
         VolumeObject object(std::move(source), fit);
         grow(object.bounds());
-        const Box visible = visibleBounds(object.source);
+        const Box visible = object.source.visible ? *object.source.visible : visibleBounds(object.source);
         focus.grow(object.placement.toWorld(visible.lo));
         focus.grow(object.placement.toWorld(visible.hi));
         volumes.push_back(std::move(object));
@@ -152,18 +153,26 @@ private:
     std::uint32_t nextGeometry_ = 0;
 };
 
-// Reads a file by its ending. Throws std::runtime_error that names the file.
-inline void addFile(Scene& scene, const std::string& path, bool fit)
+// Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
+// of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
+// texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
+// whole of it until its bricks are loaded. Throws std::runtime_error that names the file, the same on all ranks.
+inline void addFile(Scene& scene, const std::string& path, bool fit, const Loaders& loaders = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    const auto bytes = [&] {
+        std::string all = readFile(path);
+        *loaders.readCounter() += all.size();
+        return all;
+    };
     if (ending == ".raw")
-        scene.add(openVolume(path), fit);
+        scene.add(openVolume(path, loaders), fit);
     else if (ending == ".ply")
-        scene.add(parsePly(readFile(path), path), fit);
+        scene.add(loaders.fromFirst<Mesh>([&] { return parsePly(bytes(), path); }), fit);
     else if (ending == ".obj")
-        scene.add(parseObj(readFile(path), path), fit);
+        scene.add(loaders.fromFirst<Mesh>([&] { return parseObj(bytes(), path); }), fit);
     else if (ending == ".xyz")
-        scene.add(parseXyz(readFile(path), path), fit);
+        scene.add(loaders.fromFirst<std::vector<Sphere>>([&] { return parseXyz(bytes(), path); }), fit);
     else
         throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
 }

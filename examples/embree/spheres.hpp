@@ -18,6 +18,13 @@ struct Sphere {
     Vec3 color; // linear RGB
 };
 
+// For Loaders::fromFirst().
+template <class Function>
+void arraysOf(std::vector<Sphere>& spheres, const Function& function)
+{
+    function(spheres);
+}
+
 namespace detail {
 
 // Radius by Bondi, in Angstrom; colour near the usual one (Corey, Pauling, Koltun).

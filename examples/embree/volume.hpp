@@ -1,7 +1,8 @@
 // Volume: regular grids of scalars, and the part of one that a brick holds.
 //
 // Files are headerless, name_XxYxZ_type.raw (the Open SciVis convention): x fastest, little-endian, type one of
-// uint8, uint16, float32. Only the rows that are asked for are read.
+// uint8, uint16, float32. Only the rows that are asked for are read: a rank reads its bricks, and its share of what
+// all ranks must know of the whole volume (least and greatest value, where there is something to see).
 //
 // Values are normalised to [0, 1] over a range that is a function of the whole file, and so the same on all ranks:
 // 0..255 for uint8, the least and greatest value for uint16 and float32. A float32 file with values on both sides
@@ -9,17 +10,24 @@
 // the least value and have no part in the range.
 #pragma once
 
+#include "loaders.hpp"
 #include "vec.hpp"
 
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <cstring>
 #include <fstream>
 #include <functional>
 #include <istream>
+#include <limits>
 #include <memory>
+#include <optional>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
@@ -49,6 +57,7 @@ using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* ou
 struct VolumeSource {
     VolumeInfo info;
     std::function<RowReader()> open; // each call gives a reader of its own
+    std::optional<Box> visible;      // visibleBounds(), if they are known
 };
 
 // ---- files -----------------------------------------------------------------------------------------------------
@@ -114,11 +123,13 @@ void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
 
 } // namespace detail
 
-// Dimensions and type from the name, the range from one pass over the stream where it is needed; checks that the
-// stream is as long as the name says. Throws std::runtime_error that names the file, the expected and the found.
-inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
+// Dimensions and type from the name; checks that the stream is as long as the name says. Throws std::runtime_error
+// that names the file, the expected and the found.
+inline VolumeInfo checkVolume(std::istream& stream, const std::string& path)
 {
-    VolumeInfo info = parseVolumeName(path);
+    if (!stream)
+        throw std::runtime_error(path + ": cannot be opened");
+    const VolumeInfo info = parseVolumeName(path);
     const std::uint64_t expected = static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
                                    * static_cast<std::uint64_t>(info.dims[2]) * voxelBytes(info.type);
     stream.seekg(0, std::ios::end);
@@ -128,22 +139,51 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
     if (static_cast<std::uint64_t>(got) != expected)
         throw std::runtime_error(path + ": expected " + std::to_string(expected) + " bytes from the name, got "
                                  + std::to_string(got));
-    if (info.type == VoxelType::UInt8)
-        return info;
+    return info;
+}
 
+// The least and the greatest of the finite values of voxels [begin, end), in file order; infinity and minus infinity
+// if there are none. Adds what it reads to `bytesRead`.
+inline std::pair<float, float> rangeOf(std::istream& stream, const std::string& path, VoxelType type,
+                                       std::uint64_t begin, std::uint64_t end, std::uint64_t& bytesRead)
+{
     float lo = std::numeric_limits<float>::infinity(), hi = -lo;
-    std::vector<std::byte> chunk(1 << 20);
-    stream.seekg(0);
-    for (std::uint64_t done = 0; done < expected;) {
-        const std::size_t bytes = static_cast<std::size_t>(std::min<std::uint64_t>(chunk.size(), expected - done));
-        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(bytes)))
-            throw std::runtime_error(path + ": reading failed after " + std::to_string(done) + " bytes");
-        if (info.type == VoxelType::UInt16)
-            detail::growRange<std::uint16_t>(chunk.data(), bytes / 2, lo, hi);
+    const std::size_t size = voxelBytes(type), most = std::size_t{1} << 20;
+    std::vector<std::byte> chunk;
+    stream.seekg(static_cast<std::streamoff>(begin * size));
+    while (begin < end) {
+        const std::size_t count = static_cast<std::size_t>(std::min<std::uint64_t>(most / size, end - begin));
+        chunk.resize(count * size);
+        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(chunk.size())))
+            throw std::runtime_error(path + ": reading failed after " + std::to_string(begin * size) + " bytes");
+        if (type == VoxelType::UInt8)
+            detail::growRange<std::uint8_t>(chunk.data(), count, lo, hi);
+        else if (type == VoxelType::UInt16)
+            detail::growRange<std::uint16_t>(chunk.data(), count, lo, hi);
         else
-            detail::growRange<float>(chunk.data(), bytes / 4, lo, hi);
-        done += bytes;
+            detail::growRange<float>(chunk.data(), count, lo, hi);
+        begin += count;
+        bytesRead += chunk.size();
     }
+    return {lo, hi};
+}
+
+// Collective: checkVolume() of this rank's own stream, and the range, of which each rank looks at a share of the
+// voxels. Throws std::runtime_error, the same on all ranks.
+inline VolumeInfo describeVolume(std::istream& stream, const std::string& path, const Loaders& loaders = {})
+{
+    VolumeInfo info;
+    const std::vector<float> range = loaders.leastOf(2, [&] {
+        info = checkVolume(stream, path);
+        if (info.type == VoxelType::UInt8)
+            return std::vector<float>{0, -255};
+        const auto [begin, end] =
+            loaders.shareOf(static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
+                            * static_cast<std::uint64_t>(info.dims[2]));
+        const auto [lo, hi] = rangeOf(stream, path, info.type, begin, end, *loaders.readCounter());
+        return std::vector<float>{lo, -hi};
+    });
+    const float lo = range[0], hi = -range[1];
     if (lo > hi)
         throw std::runtime_error(path + ": not one of its voxels is finite");
     info.minimum = lo < 0 && hi > 0 ? 0 : lo;
@@ -158,11 +198,12 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
     return info;
 }
 
-// Reads rows of a stream that describeVolume has accepted.
-inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::string& path, const VolumeInfo& info)
+// Reads rows of a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
+inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::string& path, const VolumeInfo& info,
+                           std::shared_ptr<std::uint64_t> bytesRead = nullptr)
 {
     std::streamoff position = -1;
-    return [stream, path, info, position](int x0, int x1, int y, int z, std::byte* out) mutable {
+    return [stream, path, info, bytesRead, position](int x0, int x1, int y, int z, std::byte* out) mutable {
         const auto wide = [](int i) { return static_cast<std::streamoff>(i); };
         const std::streamoff begin =
             ((wide(z) * info.dims[1] + y) * info.dims[0] + x0) * static_cast<std::streamoff>(voxelBytes(info.type));
@@ -173,6 +214,8 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
             throw std::runtime_error(path + ": reading row y=" + std::to_string(y) + " z=" + std::to_string(z)
                                      + " failed");
         position = begin + bytes;
+        if (bytesRead)
+            *bytesRead += static_cast<std::uint64_t>(bytes);
         if (info.type == VoxelType::Float32)
             for (int i = 0; i < x1 - x0; ++i) {
                 float value;
@@ -183,27 +226,13 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
     };
 }
 
-inline VolumeSource openVolume(const std::string& path)
-{
-    auto open = [path] {
-        auto stream = std::make_shared<std::ifstream>(path, std::ios::binary);
-        if (!*stream)
-            throw std::runtime_error(path + ": cannot be opened");
-        return stream;
-    };
-    VolumeSource source;
-    source.info = describeVolume(*open(), path);
-    source.open = [open, path, info = source.info] { return rowReader(open(), path, info); };
-    return source;
-}
-
 // The box, in voxels, of what stands out from the background, as far as a lattice of about 64^3 of its voxels shows
-// it: to point a camera. The whole domain if nothing does.
-inline Box visibleBounds(const VolumeSource& source)
+// it: to point a camera. The whole domain if nothing does. Collective: each rank reads a share of the rows. Throws
+// std::runtime_error, the same on all ranks.
+inline Box visibleBounds(const VolumeSource& source, const Loaders& loaders = {})
 {
     const VolumeInfo& info = source.info;
     const float threshold = 0.1f;
-    const RowReader read = source.open();
     std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
     const auto value = [&](int x) {
         const auto as = [&](auto voxel) {
@@ -214,21 +243,60 @@ inline Box visibleBounds(const VolumeSource& source)
                : info.type == VoxelType::UInt16 ? as(std::uint16_t{})
                                                 : as(float{});
     };
-    Box box;
     const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
-    for (int z = 0; z < info.dims[2]; z += stride(2))
-        for (int y = 0; y < info.dims[1]; y += stride(1)) {
+    const auto rows = [&](std::size_t axis) { return 1 + (info.dims[axis] - 1) / stride(axis); };
+    const float none = std::numeric_limits<float>::infinity();
+    const std::vector<float> sides = loaders.leastOf(6, [&] {
+        const RowReader read = source.open();
+        std::vector<float> least(6, none); // of the coordinates, and of their negatives
+        const auto [begin, end] =
+            loaders.shareOf(static_cast<std::uint64_t>(rows(1)) * static_cast<std::uint64_t>(rows(2)));
+        for (std::uint64_t i = begin; i < end; ++i) {
+            const int y = static_cast<int>(i % static_cast<std::uint64_t>(rows(1))) * stride(1);
+            const int z = static_cast<int>(i / static_cast<std::uint64_t>(rows(1))) * stride(2);
             read(0, info.dims[0], y, z, row.data());
             for (int x = 0; x < info.dims[0]; x += stride(0))
-                if ((value(x) - info.minimum) > threshold * (info.maximum - info.minimum))
-                    box.grow({static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)});
+                if ((value(x) - info.minimum) > threshold * (info.maximum - info.minimum)) {
+                    const std::array<float, 3> p{static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)};
+                    for (std::size_t axis = 0; axis < 3; ++axis) {
+                        least[axis] = std::min(least[axis], p[axis]);
+                        least[axis + 3] = std::min(least[axis + 3], -p[axis]);
+                    }
+                }
         }
+        return least;
+    });
+    Box box;
+    if (sides[0] < none) {
+        box.grow({sides[0], sides[1], sides[2]});
+        box.grow({-sides[3], -sides[4], -sides[5]});
+    }
     if (box.empty()) {
         box.grow({0, 0, 0});
         box.grow({static_cast<float>(info.dims[0] - 1), static_cast<float>(info.dims[1] - 1),
                   static_cast<float>(info.dims[2] - 1)});
     }
     return box;
+}
+
+// Collective: the ranks share what has to be known of the whole volume. Throws std::runtime_error, the same on all
+// ranks.
+inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {})
+{
+    const auto open = [path] {
+        auto stream = std::make_shared<std::ifstream>();
+        // Without a buffer no byte is read that nobody asked for; rows are read as a whole.
+        stream->rdbuf()->pubsetbuf(nullptr, 0);
+        stream->open(path, std::ios::binary);
+        return stream; // one that is not open is a stream that cannot be read
+    };
+    VolumeSource source;
+    source.info = describeVolume(*open(), path, loaders);
+    source.open = [open, path, info = source.info, counter = loaders.readCounter()] {
+        return rowReader(open(), path, info, counter);
+    };
+    source.visible = visibleBounds(source, loaders);
+    return source;
 }
 
 // ---- the part in memory ----------------------------------------------------------------------------------------
