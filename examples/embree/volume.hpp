@@ -313,17 +313,31 @@ public:
         bytes_.resize(nxy_ * static_cast<std::size_t>(hi[2] - lo[2]) * size);
         const RowReader read = source.open();
         const int x0 = std::max(lo[0], 0), x1 = std::min(hi[0], info_.dims[0]);
-        for (int z = lo[2]; z < hi[2]; ++z)
-            for (int y = lo[1]; y < hi[1]; ++y) {
-                std::byte* row = bytes_.data() + index(lo[0], y, z) * size;
-                std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
-                read(x0, x1, std::clamp(y, 0, info_.dims[1] - 1), std::clamp(z, 0, info_.dims[2] - 1), inside);
-                for (int x = lo[0]; x < x0; ++x)
-                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
-                for (int x = x1; x < hi[0]; ++x)
-                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
-                                inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
-            }
+        const std::size_t rowBytes = nx_ * size;
+        // Calls f(y, z, the row in the block) for the rows whose voxels are in the volume, or for the others.
+        const auto forRows = [&](bool areInside, const auto& f) {
+            for (int z = lo[2]; z < hi[2]; ++z)
+                for (int y = lo[1]; y < hi[1]; ++y)
+                    if (areInside == (y >= 0 && y < info_.dims[1] && z >= 0 && z < info_.dims[2]))
+                        f(y, z, bytes_.data() + index(lo[0], y, z) * size);
+        };
+        const auto readRow = [&](int y, int z, std::byte* row) {
+            std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
+            read(x0, x1, y, z, inside);
+            for (int x = lo[0]; x < x0; ++x)
+                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
+            for (int x = x1; x < hi[0]; ++x)
+                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
+                            inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
+        };
+        forRows(true, readRow);
+        forRows(false, [&](int y, int z, std::byte* row) {
+            const int nearY = std::clamp(y, 0, info_.dims[1] - 1), nearZ = std::clamp(z, 0, info_.dims[2] - 1);
+            if (nearY >= lo[1] && nearY < hi[1] && nearZ >= lo[2] && nearZ < hi[2])
+                std::memcpy(row, bytes_.data() + index(lo[0], nearY, nearZ) * size, rowBytes);
+            else
+                readRow(nearY, nearZ, row);
+        });
     }
 
     const VolumeInfo& info() const { return info_; }
