@@ -112,11 +112,6 @@ inline dfb::WallLayout wallOf(const Options& o, int rankCount)
     layout.bezelX = layout.bezelY = o.bezel;
     layout.displayWidth = (o.width - (o.wallColumns - 1) * o.bezel) / o.wallColumns;
     layout.displayHeight = (o.height - (o.wallRows - 1) * o.bezel) / o.wallRows;
-    if (layout.width() != o.width || layout.height() != o.height || layout.displayWidth < 1 || layout.displayHeight < 1)
-        throw dfb::InvalidArgument("an image of " + std::to_string(o.width) + 'x' + std::to_string(o.height)
-                                   + " pixels can not be shared by " + std::to_string(o.wallColumns) + 'x'
-                                   + std::to_string(o.wallRows) + " equal displays with bezels of "
-                                   + std::to_string(o.bezel));
     for (int d = 0; d < layout.displayCount(); ++d)
         layout.ranks.push_back(d % rankCount);
     return layout;
@@ -211,9 +206,9 @@ public:
                 if (fb_->isDisplayRank())
                     requireFilesWritable();
             }))
-            return 1;
+            return exitFailed;
         if (!onAllRanks([&] { load(); })) // collective: all ranks or none
-            return 1;
+            return exitFailed;
         settings_ = renderSettings(o_);
         params_.passes = o_.spp;
         params_.maxLayers = static_cast<int>(scene_->bounds.size()) * std::max(1, o_.deep);
@@ -241,7 +236,7 @@ public:
             endFirst(open);
         runMs_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - begin).count();
         progress.end();
-        return finish() ? 0 : 1;
+        return finish() ? 0 : exitFailed;
     }
 
 private:
