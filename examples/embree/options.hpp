@@ -444,7 +444,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
     app.add_option("--background", background,
                    "Opaque colour behind the scene, linear, each 0 to 1; default: none, "
-                   "the image stays transparent")
+                   "the image stays transparent, and a .png has alpha")
         ->option_text("R,G,B")
         ->group(picture);
     app.add_option("--exposure", options.exposure, "Tone-map with this factor, above 0; default 0: off")
@@ -455,7 +455,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
 
     const char* files = "Files to write";
-    app.add_option("--output", options.output, "The last frame: sRGB in a .png, linear colour in a .pfm; default none")
+    app.add_option("--output", options.output,
+                   "The last frame: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
+                   "black in a .pfm; default none")
         ->check(detail::ending({".png", ".pfm"}))
         ->option_text("FILE")
         ->group(files);

@@ -1,11 +1,14 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
+#include <dfb/dither.hpp>
+
 #include <nlohmann/json.hpp>
 #include <png.h>
 #define XXH_INLINE_ALL
 #include <xxhash.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstddef>
 #include <cstdint>
@@ -64,28 +67,60 @@ inline void requireWritable(const std::string& path)
         std::filesystem::remove(path, ignored);
 }
 
-// An 8-bit RGB PNG of RGBA pixels that are sRGB-encoded, row 0 on top. Alpha is left out: premultiplied colour is
-// the image over black.
-inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba)
+// An 8-bit PNG of RGBA pixels whose colour is sRGB-encoded, row 0 on top. With `hasAlpha` their alpha is straight, as
+// PNG has it, and is written; else it is left out: premultiplied colour is the image over black.
+inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha)
 {
     const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    std::vector<std::uint8_t> rgb(3 * pixels);
-    for (std::size_t i = 0; i < pixels; ++i)
-        std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
+    std::vector<std::uint8_t> rgb;
+    if (!hasAlpha) {
+        rgb.resize(3 * pixels);
+        for (std::size_t i = 0; i < pixels; ++i)
+            std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
+    }
     png_image image{};
     image.version = PNG_IMAGE_VERSION;
     image.width = static_cast<png_uint_32>(width);
     image.height = static_cast<png_uint_32>(height);
-    image.format = PNG_FORMAT_RGB;
+    image.format = hasAlpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
     // Not png_image_write_to_file: when that fails it deletes what was at the path, be it a device.
     errno = 0;
     std::FILE* file = std::fopen(path.c_str(), "wb");
     if (file == nullptr)
         detail::failToWrite(path, std::strerror(errno));
-    const bool written = png_image_write_to_stdio(&image, file, 0, rgb.data(), 0, nullptr) != 0;
+    const void* first = hasAlpha ? static_cast<const void*>(srgba) : rgb.data();
+    const bool written = png_image_write_to_stdio(&image, file, 0, first, 0, nullptr) != 0;
     const bool closed = std::fclose(file) == 0;
     if (!written || !closed)
         detail::failToWrite(path, written ? std::strerror(errno) : image.message);
+}
+
+// Pixels of a PNG from linear premultiplied RGBA of an image, row 0 on top: sRGB-encoded colour with straight alpha.
+// Alpha is round(255 * alpha). The colour is that of colour / alpha, divided in double and clamped to 1, at the nearest
+// sRGB level or dithered; it is 0 where alpha is 0 or less, which loses colour that has no alpha. Over black the
+// picture is the premultiplied image again, but for the rounding of both to 8 bits.
+inline std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither)
+{
+    const std::size_t rowSize = 4 * static_cast<std::size_t>(width);
+    std::vector<std::uint8_t> pixels(rowSize * static_cast<std::size_t>(height)), alphas(rowSize);
+    std::vector<double> row(rowSize);
+    for (int y = 0; y < height; ++y, rgba += rowSize) {
+        for (std::size_t i = 0; i < rowSize; i += 4) {
+            const double alpha = std::min(static_cast<double>(rgba[i + 3]), 1.0);
+            for (std::size_t c = i; c < i + 3; ++c)
+                row[c] = alpha > 0 ? static_cast<double>(rgba[c]) / alpha : 0.0;
+            row[i + 3] = 1; // dithering keeps colours below alpha, which is for premultiplied ones
+        }
+        std::uint8_t* out = pixels.data() + static_cast<std::size_t>(y) * rowSize;
+        if (dither)
+            dfb::ditherPixels(row.data(), width, dfb::OutputFormat::SRGBA8, 0, y, reinterpret_cast<std::byte*>(out));
+        else
+            dfb::convertPixels(row.data(), width, dfb::OutputFormat::SRGBA8, reinterpret_cast<std::byte*>(out));
+        dfb::convertPixels(rgba, width, dfb::OutputFormat::RGBA8, reinterpret_cast<std::byte*>(alphas.data()));
+        for (std::size_t i = 3; i < rowSize; i += 4)
+            out[i] = alphas[i];
+    }
+    return pixels;
 }
 
 // Linear RGB as a colour PFM, from RGBA pixels, row 0 on top.
@@ -116,7 +151,7 @@ inline void writeIdPng(const std::string& path, int width, int height, const std
         for (std::size_t c = 0; c < 3 && ids[i] != 0xffffffffu; ++c)
             rgba[4 * i + c] = static_cast<std::uint8_t>(64 + (hash >> (8 * c)) % 192);
     }
-    writePng(path, width, height, rgba.data());
+    writePng(path, width, height, rgba.data(), false);
 }
 
 // XXH3 of the pixels as they are in memory, 16 hexadecimal digits.

@@ -50,10 +50,11 @@ inline constexpr bool is_adaptive_v = std::is_same_v<TileOp, AdaptiveBlend> || s
 template <class TileOp>
 inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 
+// Unless 8 bits per channel are all that is written. They lose too much to divide by alpha, as a PNG with alpha wants.
 inline bool wantsFloat(const Options& o)
 {
-    return !o.stats.empty() || !o.alpha.empty()
-           || (o.output.size() > 4 && o.output.substr(o.output.size() - 4) == ".pfm");
+    return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background)
+           || detail::endingOf(o.output) == ".pfm";
 }
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
@@ -124,14 +125,16 @@ inline std::string numbered(const std::string& path, int number)
     return path.substr(0, dot) + '.' + std::to_string(number) + path.substr(dot);
 }
 
-inline void writeImage(const std::string& path, const dfb::Image& image, bool dither = false)
+// A .pfm, or a .png that has alpha unless the image is opaque.
+inline void writeImage(const std::string& path, const dfb::Image& image, bool isOpaque, bool dither)
 {
-    const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
     const int width = image.width(), height = image.height();
-    if (!isFloat) {
-        writePng(path, width, height, image.rgba8());
-    } else if (path.substr(path.size() - 4) == ".pfm") {
+    if (image.format() != dfb::OutputFormat::RGBA32F) {
+        writePng(path, width, height, image.rgba8(), false);
+    } else if (detail::endingOf(path) == ".pfm") {
         writePfm(path, width, height, image.rgba32f());
+    } else if (!isOpaque) {
+        writePng(path, width, height, straightPixels(width, height, image.rgba32f(), dither).data(), true);
     } else {
         std::vector<std::byte> srgb(4 * image.pixelCount());
         for (int y = 0; y < height; ++y) {
@@ -141,14 +144,14 @@ inline void writeImage(const std::string& path, const dfb::Image& image, bool di
             else
                 dfb::convertPixels(image.rgba32f() + first, width, dfb::OutputFormat::SRGBA8, srgb.data() + first);
         }
-        writePng(path, width, height, reinterpret_cast<const std::uint8_t*>(srgb.data()));
+        writePng(path, width, height, reinterpret_cast<const std::uint8_t*>(srgb.data()), false);
     }
 }
 
 inline void writeFiles(const Options& o, const dfb::Image& image, const RunStats& stats)
 {
     if (!o.output.empty() && !image.empty())
-        writeImage(o.output, image, o.dither);
+        writeImage(o.output, image, o.background.has_value(), o.dither);
     if (!o.alpha.empty())
         writeGreyPfm(o.alpha, o.width, o.height, image.rgba32f() + 3, 4);
     if (!o.depth.empty())
@@ -424,7 +427,7 @@ private:
         if constexpr (hasWall)
             for (int d = 0; d < wall_->layout().displayCount(); ++d)
                 if (wall_->layout().ranks[static_cast<std::size_t>(d)] == fb_->rank())
-                    writeImage(numbered(o_.output, d), wall_->image(d));
+                    writeImage(numbered(o_.output, d), wall_->image(d), o_.background.has_value(), false);
     }
 
     RunStats statsOf(const std::vector<std::int64_t>& overheadNs, const std::vector<std::int64_t>& totalNs,
