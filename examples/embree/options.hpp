@@ -2,6 +2,7 @@
 #pragma once
 
 #include "camera.hpp"
+#include "frame_pattern.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire_format.hpp>
@@ -15,6 +16,7 @@
 #include <map>
 #include <optional>
 #include <sstream>
+#include <stdexcept>
 #include <string>
 #include <utility>
 #include <vector>
@@ -70,11 +72,15 @@ struct Options {
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
-    std::string output, alpha, depth, aux, stats; // empty: not written
+    std::string output, alpha, depth, aux, stats; // empty: not written. All but stats may be patterns
 
     // All options but the scene as they count, by name and as words of the command line; without those that are empty.
     std::vector<std::pair<std::string, std::string>> values;
 
+    bool writesNothing() const
+    {
+        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty();
+    }
 };
 
 // What the program exits with, beside 0.
@@ -456,17 +462,18 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
 
     const char* files = "Files to write";
     app.add_option("--output", options.output,
-                   "The last frame: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
-                   "black in a .pfm; default none")
+                   "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
+                   "black in a .pfm. %d, or %04d for 4 digits, in the name stands for the number of the frame, from 0 "
+                   "on; without it the last frame is written. Also in the next three; default none")
         ->check(detail::ending({".png", ".pfm"}))
         ->option_text("FILE")
         ->group(files);
-    app.add_option("--alpha", options.alpha, "Its opacity, as a greyscale .pfm; default none")
+    app.add_option("--alpha", options.alpha, "The opacity, as a greyscale .pfm; default none")
         ->check(detail::ending({".pfm"}))
         ->option_text("FILE")
         ->group(files);
     app.add_option("--depth", options.depth,
-                   "Its distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
+                   "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
                    "nothing; default none")
         ->check(detail::ending({".pfm"}))
         ->option_text("FILE")
@@ -478,8 +485,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(files);
     app.add_option(
            "--stats", options.stats,
-           "Times in ms, bytes, messages, tiles and samples of each rank, samples saved, and a hash of the image; "
-           "default none")
+           "Where the time has gone, in ms, on each rank and the slowest: total = load + render + compositing (with "
+           "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of the image, "
+           "the options; default none")
         ->check(detail::ending({".json"}))
         ->option_text("FILE")
         ->group(files);
@@ -492,6 +500,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                "  dfb_render demo --ranks 4 --output demo.png\n"
                "  mpiexec -n 8 dfb_render synthetic --size 2048x2048 --frames 8 --stats stats.json\n"
                "  mpiexec -n 4 dfb_render bunny.ply neghip_64x64x64_uint8.raw --spp 4 --output both.png\n"
+               "  mpiexec -n 4 dfb_render demo --frames 36 --output turn_%02d.png\n"
                "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. Of an option that is given twice "
                "the last counts.");
     try {
@@ -547,6 +556,16 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                                                          + " equal displays with bezels of "
                                                          + std::to_string(options.bezel));
         }
+        for (const auto& [name, text] : {std::pair{"--output", &options.output}, std::pair{"--alpha", &options.alpha},
+                                         std::pair{"--depth", &options.depth}, std::pair{"--aux", &options.aux}}) {
+            try {
+                FramePattern{*text};
+            } catch (const std::invalid_argument& wrong) {
+                throw CLI::ValidationError(name, wrong.what());
+            }
+        }
+        if (options.stats.find('%') != std::string::npos)
+            throw CLI::ValidationError("--stats", "'" + options.stats + "': one file for all frames, without %");
         options.values = detail::valuesOf(app, wordsOf);
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";

@@ -19,6 +19,7 @@
 #include <stdexcept>
 #include <string>
 #include <system_error>
+#include <utility>
 #include <vector>
 
 namespace example {
@@ -171,17 +172,30 @@ inline double meanAlpha(const float* rgba, std::size_t pixelCount)
     return pixelCount > 0 ? sum / static_cast<double>(pixelCount) : 0;
 }
 
+// Where the time of a rank has gone. Times are this rank's own; waiting for slower ranks counts as compositing.
+struct Times {
+    double loadMs = 0;        // setting up, reading and preparing its part of the scene
+    double renderMs = 0;      // rendering, and compositing of what came in between
+    double compositingMs = 0; // from the end of its rendering to the finished image
+    double writeMs = 0;       // writing files, but for the statistics
+
+    double totalMs() const { return loadMs + renderMs + compositingMs + writeMs; }
+};
+
+// Of a rank in one frame; it loads nothing then.
+struct RankFrameStats {
+    Times times;
+    // Tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
+    std::uint64_t tilesRendered = 0, work = 0;
+};
+
 struct FrameStats {
-    double totalMs = 0;               // from the start of rendering to the finished image
-    double renderMsMax = 0;           // of the slowest rank
-    double compositingOverheadMs = 0; // from the end of the slowest rendering to the finished image
-    std::uint64_t bytesSent = 0;      // by all ranks
+    std::vector<RankFrameStats> ranks;
+    std::uint64_t bytesSent = 0; // by all ranks
     std::uint64_t messagesSent = 0;
     std::uint64_t tilesTotal = 0;
     std::uint64_t tilesTouched = 0;
     std::uint64_t peakMemoryBytes = 0; // of the rank with the most
-    // Of each rank: tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
-    std::vector<std::uint64_t> tilesRendered, workOfRanks;
     std::uint64_t orderUndefinedPixels = 0;
     double mergeErrorBound = 0;
     std::string wireColor; // the format of the colour on its way
@@ -190,9 +204,19 @@ struct FrameStats {
     std::int64_t compressedLinks = 0;
 };
 
+// Of a rank in the whole run.
+struct RankStats {
+    Times times;
+    double totalMs = 0; // by the clock, from its start to when all files but the statistics were written
+    int threads = 1;
+    std::uint64_t bytesRead = 0; // of files
+};
+
 struct RunStats {
-    int ranks = 1;
-    std::string transport, mode;
+    std::vector<RankStats> ranks;
+    std::vector<std::string> scene;
+    std::vector<std::pair<std::string, std::string>> options; // name and value, as on the command line
+    std::string version, transport, mode;
     int width = 0, height = 0;
     std::string imageHash; // of the last frame
     double meanAlpha = 0;
@@ -201,25 +225,79 @@ struct RunStats {
     std::vector<FrameStats> frames;
 };
 
+// The rank that rendered last, and so waited least for others. (No clocks of different ranks are compared.)
+template <class Rank>
+std::size_t slowestOf(const std::vector<Rank>& ranks)
+{
+    const auto least = std::min_element(ranks.begin(), ranks.end(), [](const Rank& a, const Rank& b) {
+        return a.times.compositingMs < b.times.compositingMs;
+    });
+    return static_cast<std::size_t>(least - ranks.begin());
+}
+
+namespace detail {
+
+// The `value` of each rank.
+template <class Rank, class Value>
+nlohmann::ordered_json ofRanks(const std::vector<Rank>& ranks, const Value& value)
+{
+    nlohmann::ordered_json all = nlohmann::ordered_json::array();
+    for (const Rank& rank : ranks)
+        all.push_back(value(rank));
+    return all;
+}
+
+// An option's value: a number, true or false where it is one, else a text.
+inline nlohmann::ordered_json valueOf(const std::string& text)
+{
+    const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);
+    return value.is_number() || value.is_boolean() ? value : nlohmann::ordered_json(text);
+}
+
+} // namespace detail
+
 inline nlohmann::ordered_json toJson(const RunStats& run)
 {
+    using detail::ofRanks;
     nlohmann::ordered_json json;
-    json["ranks"] = run.ranks;
+    json["version"] = run.version;
+    json["scene"] = run.scene;
+    json["options"] = nlohmann::ordered_json::object();
+    for (const auto& [name, text] : run.options)
+        json["options"][name] = detail::valueOf(text);
+    json["ranks"] = run.ranks.size();
+    json["threads_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.threads; });
     json["transport"] = run.transport;
     json["mode"] = run.mode;
     json["width"] = run.width;
     json["height"] = run.height;
     json["image_hash"] = run.imageHash;
     json["mean_alpha"] = run.meanAlpha;
+    const std::size_t slowest = slowestOf(run.ranks);
+    json["slowest_rank"] = slowest;
+    const auto add = [](auto& to, const auto& ranks, std::size_t which, const char* name, const auto& value) {
+        to[name] = value(ranks[which]);
+        to[std::string(name) + "_of_ranks"] = ofRanks(ranks, value);
+    };
+    add(json, run.ranks, slowest, "total_ms", [](const RankStats& r) { return r.totalMs; });
+    add(json, run.ranks, slowest, "load_ms", [](const RankStats& r) { return r.times.loadMs; });
+    add(json, run.ranks, slowest, "render_ms", [](const RankStats& r) { return r.times.renderMs; });
+    add(json, run.ranks, slowest, "compositing_ms", [](const RankStats& r) { return r.times.compositingMs; });
+    add(json, run.ranks, slowest, "write_ms", [](const RankStats& r) { return r.times.writeMs; });
+    json["bytes_read_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.bytesRead; });
     json["run_ms"] = run.runMs;
     json["samples_taken"] = run.samplesTaken;
     json["samples_saved"] = run.samplesSaved;
     json["frames"] = nlohmann::ordered_json::array();
     for (const FrameStats& frame : run.frames) {
         nlohmann::ordered_json entry;
-        entry["total_ms"] = frame.totalMs;
-        entry["render_ms_max"] = frame.renderMsMax;
-        entry["compositing_overhead_ms"] = frame.compositingOverheadMs;
+        using Rank = RankFrameStats;
+        const std::size_t last = slowestOf(frame.ranks);
+        entry["slowest_rank"] = last;
+        add(entry, frame.ranks, last, "total_ms", [](const Rank& r) { return r.times.totalMs(); });
+        add(entry, frame.ranks, last, "render_ms", [](const Rank& r) { return r.times.renderMs; });
+        add(entry, frame.ranks, last, "compositing_ms", [](const Rank& r) { return r.times.compositingMs; });
+        add(entry, frame.ranks, last, "write_ms", [](const Rank& r) { return r.times.writeMs; });
         entry["bytes_sent"] = frame.bytesSent;
         entry["messages_sent"] = frame.messagesSent;
         entry["tiles_total"] = frame.tilesTotal;
@@ -231,8 +309,8 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["wire_error_bound"] = frame.wireErrorBound;
         entry["compressed"] = frame.compressed;
         entry["compressed_links"] = frame.compressedLinks;
-        entry["tiles_rendered"] = frame.tilesRendered;
-        entry["work_of_ranks"] = frame.workOfRanks;
+        entry["tiles_rendered"] = ofRanks(frame.ranks, [](const Rank& r) { return r.tilesRendered; });
+        entry["work_of_ranks"] = ofRanks(frame.ranks, [](const Rank& r) { return r.work; });
         json["frames"].push_back(entry);
     }
     return json;

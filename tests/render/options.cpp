@@ -207,7 +207,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
     const Options o =
         options({"demo",         "--spp",    "2",        "--size",   "5x5",         "--mode",  "image",  "--background",
                  "1,1,1",        "--output", "a.png",    "--dither", "--mode=data", "--spp=3", "--size", "7x6",
-                 "--background", "0,0.5,0",  "--dither", "--output", "b.png"});
+                 "--background", "0,0.5,0",  "--dither", "--output", "b_%03d.png"});
     CHECK(o.scene == std::vector<std::string>{"demo"});
     CHECK(o.spp == 3);
     CHECK(o.width == 7);
@@ -215,7 +215,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
     CHECK(o.mode == Mode::Data);
     REQUIRE(o.background);
     CHECK(*o.background == std::array<float, 3>{0.0f, 0.5f, 0.0f});
-    CHECK(o.output == "b.png");
+    CHECK(o.output == "b_%03d.png");
     CHECK(options({"demo", "--size", "6x6", "--wall", "1x1", "--wall", "3x2"}).wallColumns == 3);
     // Every option that takes a value.
     const std::vector<std::pair<std::string, std::string>> values{{"--mode", "image"},
@@ -284,6 +284,30 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
     CHECK(values.count("alpha") == 0); // no such file
     CHECK(values.count("help") == 0);
     CHECK(values.count("scene") == 0);
+}
+
+TEST_CASE("A pattern numbers the files of the frames", "[options]")
+{
+    CHECK(FramePattern("a.png").isPattern() == false);
+    CHECK(FramePattern("a.png").path(7) == "a.png");
+    CHECK(FramePattern("").path(7).empty());
+    CHECK(FramePattern("f_%d.png").isPattern());
+    CHECK(FramePattern("f_%d.png").path(0) == "f_0.png");
+    CHECK(FramePattern("f_%d.png").path(12345) == "f_12345.png");
+    CHECK(FramePattern("d%%/f_%04d.png").path(12) == "d%/f_0012.png");
+    CHECK(FramePattern("f_%04d.png").path(12345) == "f_12345.png");
+    CHECK(FramePattern("50%%.png").path(3) == "50%.png");
+    CHECK_FALSE(FramePattern("50%%.png").isPattern());
+    for (const std::string option : {"--output", "--alpha", "--depth", "--aux"}) {
+        const std::string ending = option == "--output" ? ".png" : option == "--aux" ? "" : ".pfm";
+        for (const std::string bad :
+             {"%s",   "%n",   "%",       "%%%",   "%5", "%x",  "%-4d", "%+d", "%ld",  "%*d",  "%.3d",
+              "%1$d", "%d%d", "%04d_%d", "%100d", "%i", "% d", "%0d",  "%3d", "%00d", "%010d"})
+            checkRefused({option, "f_" + bad + ending});
+        CHECK(parse({"demo", "--frames", "3", option, "f_%d" + ending}).options);
+        CHECK(parse({"demo", option, "f_%03d" + ending}).options); // a single frame, too
+    }
+    checkRefused({"--stats", "s_%d.json"}); // one file for all frames
 }
 
 TEST_CASE("A scene must be named", "[options]")

@@ -80,7 +80,11 @@ double linearOf(double srgb) { return srgb <= 0.04045 ? srgb / 12.92 : std::pow(
 RunStats someStats()
 {
     RunStats stats;
-    stats.ranks = 3;
+    stats.scene = {"a.ply", "b.xyz"};
+    stats.options = {{"spp", "4"}, {"mode", "data"}, {"opacity", "0.6"}, {"dither", "true"}, {"size", "640x480"}};
+    stats.version = "1.2.3";
+    // Rank 1 waits least.
+    stats.ranks = {{{10, 20, 60, 5}, 95, 2, 100}, {{30, 50.5, 14.5, 0}, 95, 3, 5000000000u}, {{1, 2, 92, 0}, 95, 2, 0}};
     stats.transport = "inproc";
     stats.mode = "data";
     stats.width = 640;
@@ -88,9 +92,8 @@ RunStats someStats()
     stats.imageHash = "00ff00ff00ff00ff";
     stats.meanAlpha = 0.25;
     stats.frames.resize(2);
-    stats.frames[1].totalMs = 12.5;
-    stats.frames[1].renderMsMax = 10.25;
-    stats.frames[1].compositingOverheadMs = 1.125;
+    stats.frames[0].ranks.resize(3);
+    stats.frames[1].ranks = {{{0, 10.25, 1.125, 2}, 5, 600}, {{0, 1, 10.5, 0}, 7, 800}, {{0, 2, 9.25, 0}, 0, 0}};
     stats.frames[1].bytesSent = 5000000000u;
     stats.frames[1].messagesSent = 77;
     stats.frames[1].tilesTotal = 80;
@@ -261,16 +264,43 @@ TEST_CASE("The statistics have every field that a reader of them looks for", "[o
     CHECK(json.at("height") == 480);
     CHECK(json.at("image_hash") == "00ff00ff00ff00ff");
     CHECK(json.at("mean_alpha") == 0.25);
+    CHECK(json.at("version") == "1.2.3");
+    CHECK(json.at("scene") == nlohmann::json{"a.ply", "b.xyz"});
+    CHECK(json.at("options").at("spp") == 4);
+    CHECK(json.at("options").at("mode") == "data");
+    CHECK(json.at("options").at("opacity") == 0.6);
+    CHECK(json.at("options").at("dither") == true);
+    CHECK(json.at("options").at("size") == "640x480");
+    CHECK(json.at("threads_of_ranks") == nlohmann::json{2, 3, 2});
+    CHECK(json.at("bytes_read_of_ranks") == nlohmann::json{100, 5000000000u, 0});
+    CHECK(json.at("slowest_rank") == 1);
+    CHECK(json.at("total_ms") == 95);
+    CHECK(json.at("load_ms") == 30);
+    CHECK(json.at("render_ms") == 50.5);
+    CHECK(json.at("compositing_ms") == 14.5);
+    CHECK(json.at("write_ms") == 0);
+    CHECK(json.at("total_ms_of_ranks") == nlohmann::json{95, 95, 95});
+    CHECK(json.at("load_ms_of_ranks") == nlohmann::json{10, 30, 1});
+    CHECK(json.at("render_ms_of_ranks") == nlohmann::json{20, 50.5, 2});
+    CHECK(json.at("compositing_ms_of_ranks") == nlohmann::json{60, 14.5, 92});
+    CHECK(json.at("write_ms_of_ranks") == nlohmann::json{5, 0, 0});
     REQUIRE(json.at("frames").is_array());
     REQUIRE(json.at("frames").size() == 2);
     for (const auto& frame : json.at("frames"))
-        for (const char* name : {"total_ms", "render_ms_max", "compositing_overhead_ms", "bytes_sent", "messages_sent",
+        for (const char* name : {"total_ms", "render_ms", "compositing_ms", "write_ms", "bytes_sent", "messages_sent",
                                  "tiles_total", "tiles_touched", "peak_memory_bytes"})
             CHECK(frame.at(name).is_number());
     const auto& frame = json.at("frames").at(1);
-    CHECK(frame.at("total_ms") == 12.5);
-    CHECK(frame.at("render_ms_max") == 10.25);
-    CHECK(frame.at("compositing_overhead_ms") == 1.125);
+    CHECK(frame.at("slowest_rank") == 0);
+    CHECK(frame.at("total_ms") == 13.375);
+    CHECK(frame.at("render_ms") == 10.25);
+    CHECK(frame.at("compositing_ms") == 1.125);
+    CHECK(frame.at("write_ms") == 2);
+    CHECK(frame.at("total_ms_of_ranks") == nlohmann::json{13.375, 11.5, 11.25});
+    CHECK(frame.at("render_ms_of_ranks") == nlohmann::json{10.25, 1, 2});
+    CHECK(frame.at("compositing_ms_of_ranks") == nlohmann::json{1.125, 10.5, 9.25});
+    CHECK(frame.at("tiles_rendered") == nlohmann::json{5, 7, 0});
+    CHECK(frame.at("work_of_ranks") == nlohmann::json{600, 800, 0});
     CHECK(frame.at("bytes_sent") == 5000000000u);
     CHECK(frame.at("messages_sent") == 77);
     CHECK(frame.at("tiles_total") == 80);
