@@ -41,8 +41,7 @@ public:
         config.width = width;
         config.height = height;
         config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
-        config.progress = dfb::Progress::Caller;
-        bench::MarchedBricks bricks(comm_, config, o_.views);
+        bench::MarchedBricks bricks(comm_, config, o_.views, false);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
 #ifdef DFB_BENCH_HAS_ICET
         for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {

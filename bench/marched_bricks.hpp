@@ -136,10 +136,11 @@ class MarchedBricks {
 
 public:
     // Collective. The communicator remains the caller's; `config` has size and executor, and what else dfb should do.
-    MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount)
-        : comm_(comm), messenger_(makeMessenger(comm, config.progress == dfb::Progress::Thread)),
-          config_(std::move(config)), width_(config_.width), height_(config_.height), rank_(rankIn(comm)),
-          grid_(sizeOf(comm)), marcher_(boxOf(rank_)), world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
+    // `hasThreads`: see makeMessenger().
+    MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount, bool hasThreads = true)
+        : comm_(comm), messenger_(makeMessenger(comm, hasThreads)), config_(std::move(config)), width_(config_.width),
+          height_(config_.height), rank_(rankIn(comm)), grid_(sizeOf(comm)), marcher_(boxOf(rank_)),
+          world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
           image_(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f)
     {
         config_.format = dfb::OutputFormat::RGBA32F;

@@ -28,8 +28,7 @@ tools() {
     fi
 }
 
-libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev
-    libtinyobjloader-dev"
+libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev"
 
 # Without dpkg: the header that each library is known by.
@@ -50,7 +49,6 @@ CLI11 CLI/CLI.hpp
 nlohmann-json nlohmann/json.hpp
 xxHash xxhash.h
 libpng png.h
-tinyobjloader tiny_obj_loader.h
 $([ "$with" != bench ] || echo GoogleBenchmark benchmark/benchmark.h)
 END
 }

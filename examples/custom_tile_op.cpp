@@ -102,40 +102,48 @@ int main(int argc, char** argv)
     params.timeoutMs = 10000; // a patch that was announced and does not come is an error then
     auto frame = fb.begin(params);
     const auto tile = std::make_unique<FrameBuffer::Tile>();
-    for (int level = 0; level < levels; ++level)
-        for (int j = 0; j < height / patchSize[level]; ++j)
-            for (int i = 0; i < width / patchSize[level]; ++i) {
-                if ((3 * i + 5 * j + level) % fb.size() != fb.rank() || !exists(level, i, j))
-                    continue; // another rank has it
-                const int perTile = patchSize[0] / patchSize[level];
-                frame.start(*tile, j / perTile * (width / patchSize[0]) + i / perTile);
-                tile->generation = level;
-                tile->part = static_cast<std::uint16_t>(j % perTile * perTile + i % perTile);
-                for (int child = 0; child < 4 && level + 1 < levels; ++child)
-                    tile->children += exists(level + 1, 2 * i + child % 2, 2 * j + child / 2);
-                tile->forEachPixel([&](int x, int y, float* rgba) {
-                    if (x / patchSize[level] == i && y / patchSize[level] == j)
-                        colorOf(level, x, y, rgba);
-                });
-                frame.setTile(*tile);
-            }
+    frame.guard([&] { // an exception comes out of end(), on all ranks
+        for (int level = 0; level < levels; ++level)
+            for (int j = 0; j < height / patchSize[level]; ++j)
+                for (int i = 0; i < width / patchSize[level]; ++i) {
+                    if ((3 * i + 5 * j + level) % fb.size() != fb.rank() || !exists(level, i, j))
+                        continue; // another rank has it
+                    const int perTile = patchSize[0] / patchSize[level];
+                    frame.start(*tile, j / perTile * (width / patchSize[0]) + i / perTile);
+                    tile->generation = level;
+                    tile->part = static_cast<std::uint16_t>(j % perTile * perTile + i % perTile);
+                    for (int child = 0; child < 4 && level + 1 < levels; ++child)
+                        tile->children += exists(level + 1, 2 * i + child % 2, 2 * j + child / 2);
+                    tile->forEachPixel([&](int x, int y, float* rgba) {
+                        if (x / patchSize[level] == i && y / patchSize[level] == j)
+                            colorOf(level, x, y, rgba);
+                    });
+                    frame.setTile(*tile);
+                }
+    });
     frame.end();
     if (!fb.isDisplayRank())
         return 0;
 
     std::ofstream file("custom_tile_op.ppm", std::ios::binary);
     file << "P6 " << width << ' ' << height << " 255\n";
+    constexpr int finest = patchSize[levels - 1];
+    std::vector<int> shown; // the level that each patch of the finest size shows
+    for (int j = 0; j < height / finest; ++j)
+        for (int i = 0; i < width / finest; ++i) {
+            int level = levels - 1;
+            while (!exists(level, i * finest / patchSize[level], j * finest / patchSize[level]))
+                --level;
+            shown.push_back(level);
+        }
     int wrong = 0;
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {
             const std::uint8_t* pixel = fb.image().rgba8() + 4 * (y * width + x);
             file.write(reinterpret_cast<const char*>(pixel), 3);
-            int level = levels - 1;
-            while (!exists(level, x / patchSize[level], y / patchSize[level]))
-                --level;
             float rgba[4];
             std::byte expected[4];
-            colorOf(level, x, y, rgba);
+            colorOf(shown[static_cast<std::size_t>(y / finest * (width / finest) + x / finest)], x, y, rgba);
             dfb::convertPixels(rgba, 1, dfb::OutputFormat::SRGBA8, expected);
             wrong += std::memcmp(pixel, expected, 4) != 0;
         }

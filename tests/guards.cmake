@@ -71,6 +71,21 @@ add_test(NAME guard.core_dependencies # -H lists what is included
 set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
   FAIL_REGULAR_EXPRESSION "/mpi\\.h;/mpicxx\\.h;/snappy[a-z-]*\\.h;/(tbb|oneapi)/[a-z_/]*\\.h")
 
+# The benchmarks, which are not built with the tests, still compile.
+if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
+  file(GLOB _programs CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/bench/bench_*.cpp)
+  find_package(benchmark CONFIG QUIET)
+  if(NOT TARGET benchmark::benchmark)
+    list(FILTER _programs EXCLUDE REGEX "bench_kernels")
+  endif()
+  foreach(_program IN LISTS _programs)
+    get_filename_component(_name ${_program} NAME_WE)
+    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -I${_include} -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1
+      -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
+    set_tests_properties(guard.${_name} PROPERTIES LABELS guard)
+  endforeach()
+endif()
+
 # Two translation units that use everything make one program; the headers stay quiet under stricter warnings.
 add_executable(test_odr odr/first.cpp odr/second.cpp)
 target_link_libraries(test_odr PRIVATE dfb_developer)

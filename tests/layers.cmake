@@ -4,11 +4,11 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp fwd.hpp comm/compression_gains.hpp detail/fifo.hpp detail/hidden_tiles.hpp detail/small_bytes.hpp testing/reference.hpp)
-set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp exec.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp comm/progress.hpp
+set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp processors.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp comm/progress.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
 set(level_2 levels.hpp detail/background_pixels.hpp wire_codes.hpp detail/image_gate.hpp comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
-            comm/transport.hpp tbb_executor.hpp detail/blend_kernels.hpp detail/sort_kernels.hpp)
-set(level_3 wire_format.hpp comm/flow_control.hpp comm/reduction.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
+            comm/transport.hpp exec.hpp detail/blend_kernels.hpp detail/sort_kernels.hpp)
+set(level_3 wire_format.hpp tbb_executor.hpp comm/flow_control.hpp comm/reduction.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
 set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
             testing/transport_conformance.hpp image.hpp render/world.hpp)
@@ -34,7 +34,7 @@ set(door_of_tbb tbb_executor.hpp)
 # Who must not see whom, however many includes are in between: pixels and operations know nothing of messages and
 # threads; messages know nothing of pixels (that one follows from the levels, too, as long as they stay so).
 set(pixels_and_operations "^(image|levels|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|dither|deep_tile|compositing|fragment_compositor|tile_op|pixel_op|ops/.*)\\.hpp$")
-set(messages_and_threads "^(comm/.*|exec|tbb_executor|frame|detail/.*|display_wall|distributed_framebuffer)\\.hpp$")
+set(messages_and_threads "^(comm/.*|processors|exec|tbb_executor|frame|detail/.*|display_wall|distributed_framebuffer)\\.hpp$")
 set(kernels "^detail/(blend_kernels|sort_kernels|fifo|background_pixels)\\.hpp$") # loops over numbers and a container, whoever uses them
 set(messages "^comm/.*\\.hpp$")
 set(pixels "^(image|levels|tile|tile_layout|fragment|dependency_tracker|channels|moments|double_double|dither|deep_tile|compositing|fragment_compositor|tile_op|pixel_op|ops/.*|render/.*)\\.hpp$")

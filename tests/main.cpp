@@ -1,7 +1,6 @@
-#define CATCH_CONFIG_RUNNER
-#include "catch.hpp"
+#include "run_tests.hpp"
 
 int main(int argc, char** argv)
 {
-    return Catch::Session().run(argc, argv);
+    return runTests(argc, argv);
 }

@@ -167,12 +167,11 @@ void checkPicture(const FrameBuffer& fb, const std::string& what, const std::vec
     check(wrong == 0, what + ": values that are wrong", std::to_string(wrong));
 }
 
-dfb::FrameBufferConfig configWith(dfb::Progress progress)
+dfb::FrameBufferConfig smallConfig()
 {
     dfb::FrameBufferConfig config;
     config.width = 200;
     config.height = 150;
-    config.progress = progress;
     config.executor = std::make_shared<dfb::ThreadExecutor>(2);
     return config;
 }
@@ -181,8 +180,10 @@ dfb::FrameBufferConfig configWith(dfb::Progress progress)
 void renderAll(MPI_Comm communicator, dfb::Progress progress)
 {
     const std::string name = progress == dfb::Progress::Thread ? "with a thread" : "without a thread";
+    dfb::MessengerOptions options;
+    options.progress = progress;
     {
-        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>> fb(communicator, configWith(progress));
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>> fb(communicator, smallConfig(), options);
         const auto sum = fb.allReduce({1, fb.rank()}, decltype(fb)::Reduce::Sum);
         check(sum[0] == fb.size() && sum[1] == fb.size() * (fb.size() - 1) / 2, "allReduce() " + name);
         for (int frame = 0; frame < 3; ++frame) {
@@ -191,7 +192,7 @@ void renderAll(MPI_Comm communicator, dfb::Progress progress)
             checkPicture(fb, "renderImageParallel() " + name, {red, 0, 0, 255});
         }
     }
-    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>> fb(communicator, configWith(progress));
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>> fb(communicator, smallConfig(), options);
     const float z = static_cast<float>(fb.rank());
     const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{-100, -100, z}, {100, 100, z + 0.5f}}}});
     const dfb::PerspectiveCamera camera({0, 0, -10}, {0, 0, 0}, {0, 1, 0}, 30);

@@ -151,9 +151,9 @@ int main(int argc, char** argv)
         if (everywhere || mpi.rank() == last)
             failing = call;
         const std::string text = transportErrorOf(what, [&] {
-            auto its = config;
-            its.sharedMemory = shared;
-            FrameBuffer fb(mpi.communicator(), its);
+            dfb::MessengerOptions options;
+            options.sharedMemory = shared;
+            FrameBuffer fb(mpi.communicator(), config, options);
         });
         failing = nullptr;
         return std::make_pair(what, text);
@@ -171,7 +171,7 @@ int main(int argc, char** argv)
             check(has(text, who + expected(call)), what, text);
         }
         const auto [what, text] = make("memory", everywhere, false);
-        check(has(text, who + "std::bad_alloc"), what, text);
+        check(has(text, who + "no memory for "), what, text);
     }
     struct Failing {
         const char* what;

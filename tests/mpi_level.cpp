@@ -1,47 +1,62 @@
-// What the constructor says of MPI that is not initialised, of a thread level that is too low, and of MPI that is over; and
-// that Progress::Caller works from MPI_THREAD_FUNNELED on. MPI can be initialised once a process:
-//   mpirun -n 2 mpi_level single|funneled|serialized
+// A program that has initialised MPI at any thread level gets its images with default settings: rank by rank a progress
+// thread moves messages, or, below MPI_THREAD_MULTIPLE, the caller does, and then no other thread calls MPI. And what
+// the constructor says where Progress::Thread can not be had, and of MPI that is not there. MPI can be initialised once
+// a process:
+//   mpirun -n 2 mpi_level single|funneled|serialized|multiple
+//   mpirun -n 2 mpi_level mixed      rank 0 with MPI_Init, the others at MPI_THREAD_MULTIPLE
 // Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
 #include <mpi.h>
 
-#include <cstdio>
+#include <atomic>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <functional>
 #include <memory>
 #include <string>
+#include <thread>
 #include <vector>
 
 namespace {
 
-using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>>;
+using Messenger = dfb::Messenger<dfb::MpiTransport>;
+using Single = dfb::BasicImageParallel<16>;
+using FrameBuffer = dfb::DistributedFrameBuffer<Single>;
 
 int failures = 0;
 
-void check(bool fine, const char* what, const std::string& text)
+void check(bool fine, const std::string& what, const std::string& text = "")
 {
     if (fine)
         return;
     ++failures;
-    std::fprintf(stderr, "mpi_level: %s: %s\n", what, text.c_str());
+    std::fprintf(stderr, "mpi_level: %s: %s\n", what.c_str(), text.c_str());
 }
 
 bool has(const std::string& text, const char* part) { return text.find(part) != std::string::npos; }
 
-dfb::FrameBufferConfig configWith(dfb::Progress progress)
+std::thread::id mainThread;
+std::atomic<int> callsElsewhere{0}; // of MPI, by other threads than that
+
+void noteCall() { callsElsewhere += std::this_thread::get_id() != mainThread; }
+
+dfb::FrameBufferConfig smallConfig()
 {
     dfb::FrameBufferConfig config;
     config.width = 50;
     config.height = 40;
-    config.progress = progress;
-    config.executor = std::make_shared<dfb::ThreadExecutor>(2);
+    config.executor = std::make_shared<dfb::ThreadExecutor>(2); // other threads, also where there is one core
     return config;
 }
 
 std::string transportErrorOf(dfb::Progress progress)
 {
     try {
-        FrameBuffer fb(MPI_COMM_WORLD, configWith(progress));
+        dfb::MessengerOptions options;
+        options.progress = progress;
+        Messenger messenger(MPI_COMM_WORLD, options);
     } catch (const dfb::TransportError& e) {
         return e.what();
     } catch (const std::exception& e) {
@@ -50,69 +65,235 @@ std::string transportErrorOf(dfb::Progress progress)
     return "no exception";
 }
 
+// Green and blue of tile `index` in frame `frame`, in 8 bits.
+std::uint8_t greenOf(int frame) { return static_cast<std::uint8_t>(51 * frame); }
+std::uint8_t blueOf(int index) { return static_cast<std::uint8_t>(51 * (index % 6)); }
+
+template <class Fb>
+dfb::FrameReport renderTiles(Fb& fb, int frame)
+{
+    return dfb::renderImageParallel(fb, [&](auto& tile) {
+        tile.fill({0, greenOf(frame) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+    });
+}
+
+// `origin`: where the image is in the framebuffer's.
+void checkImage(const dfb::Image& image, const dfb::TileLayout& layout, int frame, const std::string& what,
+                int originX = 0)
+{
+    int wrong = 0;
+    for (int y = 0; y < image.height(); ++y)
+        for (int x = 0; x < image.width(); ++x) {
+            const std::uint8_t* p = image.rgba8() + 4 * (image.width() * y + x);
+            wrong += p[1] != greenOf(frame) || p[2] != blueOf(layout.tileAt((originX + x) / 16, y / 16)) || p[3] != 255;
+        }
+    check(wrong == 0, what + ": pixels that are wrong", std::to_string(wrong));
+}
+
+void frames(const dfb::FrameBufferConfig& config, dfb::Progress expected, const std::string& what)
+{
+    FrameBuffer fb(MPI_COMM_WORLD, config);
+    for (int frame = 0; frame < 3; ++frame) {
+        const dfb::FrameReport report = renderTiles(fb, frame);
+        check(report.progress == expected, what + ": who moved the messages");
+        if (fb.isDisplayRank())
+            checkImage(fb.image(), fb.layout(), frame, what);
+        // No more is needed of this rank: others get on while it waits in MPI for them.
+        MPI_Barrier(MPI_COMM_WORLD);
+    }
+}
+
+// What a camera must have.
+struct Flat {
+    dfb::Region project(const dfb::Box3& bounds, int, int) const
+    {
+        return {static_cast<int>(bounds.lower.x), static_cast<int>(bounds.lower.y), static_cast<int>(bounds.upper.x),
+                static_cast<int>(bounds.upper.y)};
+    }
+};
+
+// A wall, and beside its framebuffer another on the same messenger, with bricks that all ranks have.
+void wallAndSharedWorld()
+{
+    const auto messenger = std::make_shared<Messenger>(MPI_COMM_WORLD);
+    const int last = messenger->size() - 1;
+    const dfb::WallLayout layout{2, 1, 40, 30, 0, 0, {last, 0}};
+    dfb::DisplayWall<> wall(messenger, layout, dfb::OutputFormat::RGBA8);
+    dfb::DistributedFrameBuffer<Single, dfb::ToWall<>> fb(messenger, wall.frameBufferConfig(), {&wall});
+    dfb::FrameBufferConfig config;
+    config.width = 64;
+    config.height = 32;
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> bricks(messenger, config);
+    const dfb::World both({{3, {{0, 0, 0}, {32, 32, 1}}}, {9, {{32, 0, 0}, {64, 32, 1}}}});
+    const dfb::SharedWorld world(bricks, both);
+    dfb::RoundRobinBricks inTurn;
+    for (int frame = 0; frame < 3; ++frame) {
+        const dfb::FrameReport report = renderTiles(fb, frame);
+        wall.finish(report.frame);
+        for (int d = 0; d < 2; ++d)
+            if (layout.ranks[static_cast<std::size_t>(d)] == messenger->rank())
+                checkImage(wall.image(d), fb.layout(), frame, "display " + std::to_string(d), 40 * d);
+
+        dfb::renderMixedParallel(bricks, world, Flat(), inTurn, [&](const dfb::Brick& brick, auto& tile) {
+            const dfb::Region inside = dfb::intersection(tile.region, Flat().project(brick.bounds, 64, 32));
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                if (x < inside.x0 || x >= inside.x1 || y < inside.y0 || y >= inside.y1)
+                    return;
+                rgba[0] = static_cast<float>(brick.id) / 255;
+                rgba[1] = greenOf(frame) / 255.0f;
+                rgba[3] = depth = 1;
+            });
+        });
+        int wrong = 0;
+        for (std::size_t i = 0; bricks.isDisplayRank() && i < bricks.image().pixelCount(); ++i) {
+            const std::uint8_t* p = bricks.image().rgba8() + 4 * i;
+            wrong += p[0] != (i % 64 < 32 ? 3 : 9) || p[1] != greenOf(frame);
+        }
+        check(wrong == 0, "bricks of a shared world: pixels that are wrong", std::to_string(wrong));
+    }
+}
+
+std::string invalidArgumentOf(const std::function<void()>& call)
+{
+    std::string text = "no exception";
+    std::thread([&] {
+        try {
+            call();
+        } catch (const dfb::InvalidArgument& e) {
+            text = e.what();
+        } catch (const std::exception& e) {
+            text = std::string("another exception: ") + e.what();
+        }
+    }).join();
+    return text;
+}
+
+// What waits for messages on a thread that may not move them says so; it would wait for ever.
+void otherThread()
+{
+    const char* const owner = "belong to the thread that initialised";
+    FrameBuffer fb(MPI_COMM_WORLD, smallConfig());
+    const std::string begin = invalidArgumentOf([&] { fb.begin(); });
+    check(has(begin, owner), "begin() on another thread", begin);
+    const std::string reduce = invalidArgumentOf([&] { fb.allReduce({1}, FrameBuffer::Reduce::Sum); });
+    check(has(reduce, owner), "allReduce() on another thread", reduce);
+    auto frame = dfb::startImageParallel(fb, dfb::WorkDistribution::Owned, [](auto& tile) {
+        tile.fill({0, greenOf(2) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+    });
+    const std::string end = invalidArgumentOf([&] { frame.end(); });
+    check(has(end, owner), "end() on another thread", end);
+    frame.end();
+    if (fb.isDisplayRank())
+        checkImage(fb.image(), fb.layout(), 2, "after end() on another thread");
+}
+
+// A renderer that polls, with owners far behind: workers have to wait in setTile(), and may have to poll.
+void smallPool()
+{
+    auto config = smallConfig();
+    config.messagePoolBytes = 1;
+    config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
+    FrameBuffer fb(MPI_COMM_WORLD, config);
+    std::vector<int> mine;
+    for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
+        mine.push_back(tile);
+    for (int frame = 0; frame < 3; ++frame) {
+        dfb::renderImageParallel(fb, mine, [&](auto& tile) {
+            tile.fill({0, greenOf(frame) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
+            fb.poll();
+        });
+        if (fb.isDisplayRank())
+            checkImage(fb.image(), fb.layout(), frame, "a small pool");
+    }
+}
+
 } // namespace
+
+// In place of MPI's own: all that the library does once it is there.
+extern "C" {
+
+int MPI_Isend(const void* data, int count, MPI_Datatype type, int to, int tag, MPI_Comm comm, MPI_Request* request)
+{
+    noteCall();
+    return PMPI_Isend(data, count, type, to, tag, comm, request);
+}
+
+int MPI_Irecv(void* data, int count, MPI_Datatype type, int from, int tag, MPI_Comm comm, MPI_Request* request)
+{
+    noteCall();
+    return PMPI_Irecv(data, count, type, from, tag, comm, request);
+}
+
+int MPI_Testsome(int count, MPI_Request requests[], int* done, int indices[], MPI_Status statuses[])
+{
+    noteCall();
+    return PMPI_Testsome(count, requests, done, indices, statuses);
+}
+
+int MPI_Testall(int count, MPI_Request requests[], int* done, MPI_Status statuses[])
+{
+    noteCall();
+    return PMPI_Testall(count, requests, done, statuses);
+}
+
+int MPI_Test(MPI_Request* request, int* done, MPI_Status* status)
+{
+    noteCall();
+    return PMPI_Test(request, done, status);
+}
+
+} // extern "C"
 
 int main(int argc, char** argv)
 {
-    const std::string argument = argc > 1 ? argv[1] : "";
-    const bool single = argument == "single";
-    for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
+    mainThread = std::this_thread::get_id();
+    std::string asked = argc > 1 ? argv[1] : "";
+    const bool isMixed = asked == "mixed"; // then what is collective is for all ranks or none
+    if (isMixed) {
+        const char* rank = std::getenv("PMI_RANK") ? std::getenv("PMI_RANK") : std::getenv("OMPI_COMM_WORLD_RANK");
+        asked = rank && std::atoi(rank) == 0 ? "single" : "multiple";
+    }
+    for (const auto progress : {dfb::Progress::Auto, dfb::Progress::Thread, dfb::Progress::Caller}) {
         const std::string text = transportErrorOf(progress);
         check(has(text, "transport failure") && has(text, "not initialised"), "before MPI_Init", text);
     }
 
-    const int wanted = single                     ? MPI_THREAD_SINGLE
-                       : argument == "serialized" ? MPI_THREAD_SERIALIZED
-                                                  : MPI_THREAD_FUNNELED;
-    const char* name = single                     ? "MPI_THREAD_SINGLE"
-                       : argument == "serialized" ? "MPI_THREAD_SERIALIZED"
-                                                  : "MPI_THREAD_FUNNELED";
-    int level = 0;
-    MPI_Init_thread(&argc, &argv, wanted, &level);
-    if (level != wanted) {
-        std::printf("mpi_level: this MPI gives another level than asked for: nothing to test\n");
-        MPI_Finalize();
-        return failures;
-    }
-    const std::string thread = transportErrorOf(dfb::Progress::Thread);
-    check(has(thread, "transport failure") && has(thread, name)
-              && has(thread, "MPI_THREAD_MULTIPLE"),
-          "Progress::Thread", thread);
-    if (single) {
-        const std::string caller = transportErrorOf(dfb::Progress::Caller);
-        check(has(caller, "transport failure") && has(caller, "MPI_THREAD_SINGLE") && has(caller, "MPI_THREAD_FUNNELED"),
-              "Progress::Caller", caller);
+    int wanted = MPI_THREAD_SINGLE, level = 0;
+    if (asked == "single") {
+        MPI_Init(&argc, &argv);
+        MPI_Query_thread(&level);
     } else {
-        try {
-            auto config = configWith(dfb::Progress::Caller);
-            config.messagePoolBytes = 1; // so that workers have to wait in setTile(), and may have to poll
-            config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
-            FrameBuffer fb(MPI_COMM_WORLD, config);
-            std::vector<int> mine;
-            for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
-                mine.push_back(tile);
-            for (int frame = 0; frame < 3; ++frame) {
-                dfb::renderImageParallel(fb, mine, [&](auto& tile) {
-                    tile.fill({0, frame * 0.2f, tile.tile % 6 * 0.2f, 1});
-                    fb.poll();
-                });
-                if (!fb.isDisplayRank())
-                    continue;
-                int wrong = 0;
-                for (int y = 0; y < 40; ++y)
-                    for (int x = 0; x < 50; ++x) {
-                        const std::uint8_t* p = fb.image().rgba8() + 4 * (50 * y + x);
-                        wrong += p[1] != 51 * frame || p[2] != fb.layout().tileAt(x / 16, y / 16) % 6 * 51 || p[3] != 255;
-                    }
-                check(wrong == 0, "pixels that are wrong", std::to_string(wrong));
-            }
-        } catch (const std::exception& e) {
-            check(false, "Progress::Caller", e.what());
-        }
+        wanted = asked == "funneled"     ? MPI_THREAD_FUNNELED
+                 : asked == "serialized" ? MPI_THREAD_SERIALIZED
+                                         : MPI_THREAD_MULTIPLE;
+        MPI_Init_thread(&argc, &argv, wanted, &level);
     }
+    if (level != wanted)
+        std::printf("mpi_level: this MPI gives another level than asked for: level %d is what is tested\n", level);
+    const auto expected = level == MPI_THREAD_MULTIPLE ? dfb::Progress::Thread : dfb::Progress::Caller;
+    try {
+        if (!isMixed && level < MPI_THREAD_MULTIPLE) {
+            const std::string text = transportErrorOf(dfb::Progress::Thread);
+            check(has(text, "transport failure") && has(text, dfb::detail::mpiLevelName(level))
+                      && has(text, "MPI_THREAD_MULTIPLE"),
+                  "Progress::Thread", text);
+        }
+        frames({50, 40}, expected, "default settings");
+        frames(smallConfig(), expected, "two workers");
+        wallAndSharedWorld();
+        smallPool();
+        if (!isMixed && level < MPI_THREAD_SERIALIZED)
+            otherThread();
+    } catch (const std::exception& e) {
+        check(false, "an exception", e.what());
+    }
+    if (level < MPI_THREAD_SERIALIZED)
+        check(callsElsewhere == 0, "calls of MPI by other threads", std::to_string(callsElsewhere));
+    else if (level == MPI_THREAD_MULTIPLE)
+        check(callsElsewhere > 0, "no call of MPI by a progress thread");
 
     MPI_Finalize();
-    const std::string after = transportErrorOf(dfb::Progress::Caller);
+    const std::string after = transportErrorOf(dfb::Progress::Auto);
     check(has(after, "finalised"), "after MPI_Finalize", after);
     return failures;
 }

@@ -1,7 +1,6 @@
 // Runs the tests on every rank. A passing rank other than 0 says nothing; a failing one always does, with its number
 // before each line; the exit code is the largest over the ranks.
-#define CATCH_CONFIG_RUNNER
-#include "catch.hpp"
+#include "run_tests.hpp"
 
 #include <mpi.h>
 
@@ -72,7 +71,7 @@ int main(int argc, char** argv)
     }
     RankOutput output(rank);
     std::streambuf* before = std::cout.rdbuf(&output);
-    const int failed = Catch::Session().run(argc, argv);
+    const int failed = runTests(argc, argv);
     std::cout.rdbuf(before);
     const int result = largest(std::min(failed, 255));
     MPI_Finalize();

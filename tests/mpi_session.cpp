@@ -1,5 +1,6 @@
 // What MpiSession does at the beginning and the end of MPI. As MPI can be initialised once a process, a run each:
 //   mpirun -n 3 mpi_session multiple     mpirun -n 3 mpi_session funneled
+//   mpirun -n 3 mpi_session highest      without a level: what the MPI library has, if that is a low one, too
 //   mpirun -n 3 mpi_session lower        the MPI library has a lower thread level than is asked for
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
@@ -161,9 +162,15 @@ int main(int argc, char** argv)
     const std::string what = argc > 1 ? argv[1] : "multiple";
     if (what == "multiple" || what == "funneled") {
         wholeLife(argc, argv, what == "multiple" ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED);
+    } else if (what == "highest") {
+        lowered = true;
+        dfb::MpiSession mpi(argc, argv);
+        check(mpi.level() == MPI_THREAD_FUNNELED, "level", std::to_string(mpi.level()));
+        dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(mpi.communicator(), {64, 64});
+        emptyFrame(fb);
     } else if (what == "lower") {
         lowered = true;
-        const std::string text = transportErrorOf([&] { dfb::MpiSession mpi(argc, argv); });
+        const std::string text = transportErrorOf([&] { dfb::MpiSession mpi(argc, argv, MPI_THREAD_MULTIPLE); });
         check(has(text, "MPI_THREAD_FUNNELED at most") && has(text, "MPI_THREAD_MULTIPLE was"), "the error", text);
         check(isFinalized(), "MPI is not finalised");
     } else if (what == "finalised") {

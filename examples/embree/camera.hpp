@@ -6,6 +6,7 @@
 
 #include <dfb/render/cameras.hpp>
 
+#include <optional>
 #include <variant>
 #include <vector>
 
@@ -16,10 +17,10 @@ enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
 // What the user chooses about the view; angles in degrees, lengths in units of the largest extent of what there is to
 // see.
 struct View {
-    float azimuth = 30;     // around the y axis, from +z towards +x
-    float elevation = 20;   // above the xz plane
-    float fieldOfView = 35; // full vertical angle
-    float distance = 2.3f;  // from the centre of what there is to see
+    float azimuth = 30;            // around the y axis, from +z towards +x
+    float elevation = 20;          // above the xz plane
+    float fieldOfView = 35;        // full vertical angle
+    std::optional<float> distance; // from the centre of what there is to see; none: so that all of it is in the image
     CameraKind kind = CameraKind::Perspective;
     float aperture = 0.05f;  // radius of the lens
     float focus = 0;         // distance of what is sharp; 0: the centre
@@ -43,11 +44,44 @@ struct Camera {
     }
 };
 
+namespace detail {
+inline constexpr double degree = 3.14159265358979323846 / 180.0;
+}
+
+// From the centre of the focus to the camera, in world space.
+inline double cameraDistance(const Focus& focus, const View& view, int width, int height)
+{
+    const double unit = static_cast<double>(focus.box.largestExtent());
+    if (view.distance)
+        return static_cast<double>(*view.distance) * unit;
+    // The ball touches the sides of the smaller angle of view, but for a margin.
+    double angle = 0.5 * static_cast<double>(view.fieldOfView) * detail::degree;
+    double radius = static_cast<double>(focus.radius);
+    const auto narrowTo = [&](double aspect) { angle = std::atan(std::tan(angle) * std::min(1.0, aspect)); };
+    const double aspect = static_cast<double>(width) / height;
+    switch (view.kind) {
+    case CameraKind::Perspective:
+    case CameraKind::MotionBlur: narrowTo(aspect); break;
+    case CameraKind::DepthOfField: // seen from the lens's rim: room for how far that is from the middle
+        narrowTo(aspect);
+        radius += static_cast<double>(view.aperture) * unit;
+        break;
+    case CameraKind::Stereo: // likewise from an eye, which has half of the image
+        narrowTo(0.5 * aspect);
+        radius += 0.5 * static_cast<double>(view.separation) * unit;
+        break;
+    case CameraKind::Dome: // its circle is as wide as it is high
+        angle = std::min(angle, 0.5 * static_cast<double>(view.domeAngle) * detail::degree);
+        break;
+    }
+    return std::min(1.02 * radius / std::sin(angle), 1000 * unit); // farther away distances have too few digits
+}
+
 // The camera of frame `frame` of `frameCount`: a full turn around the centre of `focus` in `frameCount` frames.
 // y is up.
-inline Camera orbitCamera(const Box& focus, const View& view, int frame, int frameCount, int width, int height)
+inline Camera orbitCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
 {
-    const double degree = 3.14159265358979323846 / 180.0;
+    using detail::degree;
     const double azimuth = (static_cast<double>(view.azimuth) + 360.0 * frame / std::max(1, frameCount)) * degree;
     const double elevation = std::clamp(static_cast<double>(view.elevation), -89.9, 89.9) * degree;
     const Vec3d outward(std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
@@ -55,7 +89,7 @@ inline Camera orbitCamera(const Box& focus, const View& view, int frame, int fra
     const Vec3d forward = outward * -1.0;
     const Vec3d right = normalize(cross(forward, Vec3d(0, 1, 0)));
     Camera camera;
-    camera.origin = Vec3(Vec3d(focus.center()) + outward * static_cast<double>(view.distance * focus.largestExtent()));
+    camera.origin = Vec3(Vec3d(focus.box.center()) + outward * cameraDistance(focus, view, width, height));
     camera.forward = Vec3(forward);
     camera.right = Vec3(right);
     camera.up = Vec3(cross(right, forward));
@@ -67,13 +101,14 @@ inline Camera orbitCamera(const Box& focus, const View& view, int frame, int fra
 // A camera of any kind at one frame: its rays, and for the library, where boxes project to.
 class FrameCamera {
 public:
-    FrameCamera(const Box& focus, const View& view, int frame, int frameCount, int width, int height)
+    FrameCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
         : pose_(orbitCamera(focus, view, frame, frameCount, width, height)), width_(width), height_(height),
           pinhole_(dfb::PerspectiveCamera::along(of(pose_.origin), of(pose_.forward), of(pose_.up), view.fieldOfView))
     {
-        const float unit = focus.largestExtent();
+        const float unit = focus.box.largestExtent();
         const auto orOne = [](float v) { return v > 0 ? v : 1.0f; }; // of a scene without extent
-        const float sharp = orOne(view.focus > 0 ? view.focus * unit : view.distance * unit);
+        const float sharp =
+            orOne(view.focus > 0 ? view.focus * unit : static_cast<float>(cameraDistance(focus, view, width, height)));
         const dfb::Vec3 eye = of(pose_.origin), forward = of(pose_.forward), up = of(pose_.up);
         switch (view.kind) {
         case CameraKind::Perspective: break;
@@ -81,8 +116,8 @@ public:
             lens_ = dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
             break;
         case CameraKind::MotionBlur:
-            lens_ =
-                dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.center()), {0, 1, 0}, view.shutter);
+            lens_ = dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.box.center()), {0, 1, 0},
+                                         view.shutter);
             break;
         case CameraKind::Stereo:
             lens_ = dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);

@@ -18,18 +18,13 @@ namespace example {
 
 class Loaders {
 public:
-    using Numbers = std::vector<std::int64_t>;
     using Bytes = std::vector<std::byte>;
-    // Collective: the least over the ranks of each number; and the bytes of each rank, by rank.
-    using Reduce = std::function<Numbers(const Numbers&)>;
+    // Collective: the bytes of each rank, by rank.
     using Gather = std::function<std::vector<Bytes>(const Bytes&)>;
 
     // A rank by itself.
     Loaders() = default;
-    Loaders(int rank, int size, Reduce least, Gather gather)
-        : rank_(rank), size_(size), least_(std::move(least)), gather_(std::move(gather))
-    {
-    }
+    Loaders(int rank, int size, Gather gather) : rank_(rank), size_(size), gather_(std::move(gather)) {}
 
     int rank() const { return rank_; }
     int size() const { return size_; }
@@ -48,29 +43,40 @@ public:
     std::uint64_t bytesRead() const { return *bytesRead_; }
     const std::shared_ptr<std::uint64_t>& readCounter() const { return bytesRead_; }
 
-    // Collective: calls `step`, which returns `count` floats, on every rank; returns the least of each over the ranks.
-    // If it throws on any rank, all throw std::runtime_error with the text of the lowest of those.
-    template <class Step>
-    std::vector<float> leastOf(std::size_t count, const Step& step) const
+    // Collective: calls `step`, which returns a std::vector<T>, on every rank; returns those of all, by rank. If it
+    // throws on any rank, all throw std::runtime_error with the text of the lowest of those.
+    template <class T, class Step>
+    std::vector<T> gatherOf(const Step& step) const
     {
-        Numbers numbers(count + 1, size_);
-        std::string error;
+        static_assert(std::is_trivially_copyable_v<T>);
+        if (size_ == 1)
+            return step();
+        Bytes own(1); // 1: what follows is an error
+        const auto add = [&own](const void* data, std::size_t size) {
+            const auto* first = static_cast<const std::byte*>(data);
+            own.insert(own.end(), first, first + size);
+        };
         try {
-            const std::vector<float> values = step();
-            for (std::size_t i = 0; i < count; ++i)
-                numbers[i + 1] = inOrder(values.at(i));
+            const std::vector<T> values = step();
+            add(values.data(), values.size() * sizeof(T));
         } catch (const std::exception& e) {
-            error = textOf(e);
-            numbers[0] = rank_;
+            const std::string text = e.what();
+            own.assign(1, std::byte{1});
+            add(text.data(), text.size());
         }
-        if (size_ > 1)
-            numbers = least_(numbers);
-        if (numbers[0] < size_)
-            throw std::runtime_error(size_ > 1 ? textOfRank(static_cast<std::size_t>(numbers[0]), error) : error);
-        std::vector<float> values(count);
-        for (std::size_t i = 0; i < count; ++i)
-            values[i] = ofOrder(numbers[i + 1]);
-        return values;
+        const std::vector<Bytes> ofRanks = gather_(own);
+        for (const Bytes& bytes : ofRanks)
+            if (bytes.front() != std::byte{0})
+                throw std::runtime_error(
+                    std::string(reinterpret_cast<const char*>(bytes.data()) + 1, bytes.size() - 1));
+        std::vector<T> all;
+        for (const Bytes& bytes : ofRanks) {
+            const std::size_t count = (bytes.size() - 1) / sizeof(T), before = all.size();
+            all.resize(before + count);
+            if (count > 0)
+                std::memcpy(static_cast<void*>(all.data() + before), bytes.data() + 1, count * sizeof(T));
+        }
+        return all;
     }
 
     // Collective: what `make` returns on rank 0, which alone calls it, on all ranks. If it throws, all throw
@@ -82,19 +88,14 @@ public:
         if (size_ == 1)
             return make();
         T value;
-        std::string error;
         Bytes bytes;
-        if (rank_ == 0) {
-            try {
+        gatherOf<char>([&] { // whether rank 0 has it
+            if (rank_ == 0) {
                 value = make();
                 arraysOf(value, [&](const auto&... arrays) { (pack(arrays, bytes), ...); });
-            } catch (const std::exception& e) {
-                error = textOf(e);
             }
-        }
-        error = textOfRank(0, error);
-        if (!error.empty())
-            throw std::runtime_error(error);
+            return std::vector<char>();
+        });
         share(bytes);
         if (rank_ != 0) {
             const std::byte* at = bytes.data();
@@ -103,34 +104,26 @@ public:
         return value;
     }
 
+    // Collective: the lines of rank 0, which have no line ends, on all ranks.
+    std::vector<std::string> linesOfFirst(const std::vector<std::string>& lines) const
+    {
+        const std::vector<char> text = gatherOf<char>([&] {
+            std::vector<char> own;
+            for (std::size_t i = 0; i < lines.size() && rank_ == 0; ++i) {
+                own.insert(own.end(), lines[i].begin(), lines[i].end());
+                own.push_back('\n');
+            }
+            return own;
+        });
+        std::vector<std::string> all;
+        for (auto begin = text.begin(), end = begin; begin != text.end(); begin = end + 1) {
+            end = std::find(begin, text.end(), '\n');
+            all.emplace_back(begin, end);
+        }
+        return all;
+    }
+
 private:
-    // Integers in the order of the floats.
-    static std::int64_t inOrder(float value)
-    {
-        std::int32_t bits = 0;
-        std::memcpy(&bits, &value, sizeof bits);
-        return bits < 0 ? bits ^ 0x7fffffff : bits;
-    }
-    static float ofOrder(std::int64_t number)
-    {
-        const auto bits = static_cast<std::int32_t>(number < 0 ? number ^ 0x7fffffff : number);
-        float value = 0;
-        std::memcpy(&value, &bits, sizeof value);
-        return value;
-    }
-
-    static std::string textOf(const std::exception& e)
-    {
-        return std::string(e.what()).empty() ? "loading failed" : e.what();
-    }
-
-    std::string textOfRank(std::size_t rank, const std::string& own) const
-    {
-        const auto* first = reinterpret_cast<const std::byte*>(own.data());
-        const Bytes text = gather_(Bytes(first, first + own.size()))[rank];
-        return std::string(reinterpret_cast<const char*>(text.data()), text.size());
-    }
-
     // Rank 0's bytes to all, in parts, so that nobody holds them twice.
     void share(Bytes& bytes) const
     {
@@ -175,7 +168,6 @@ private:
     }
 
     int rank_ = 0, size_ = 1;
-    Reduce least_;
     Gather gather_;
     std::shared_ptr<std::uint64_t> bytesRead_ = std::make_shared<std::uint64_t>(0);
 };

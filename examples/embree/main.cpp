@@ -23,14 +23,6 @@
 namespace example {
 namespace {
 
-// Threads of each of `ranksHere` ranks on this machine.
-int threadsFor(const Options& o, int ranksHere)
-{
-    if (o.threads > 0)
-        return o.threads;
-    return std::max(1, static_cast<int>(std::thread::hardware_concurrency()) / std::max(1, ranksHere));
-}
-
 // Lets oneTBB have `threads` workers in this process also where there are fewer cores.
 class WorkerLimit {
 public:
@@ -50,12 +42,11 @@ private:
 
 int runInThreads(const Options& o, int ranks)
 {
-    const int threads = threadsFor(o, ranks);
-    const WorkerLimit limit(threads * ranks);
+    const WorkerLimit limit(std::max(1, o.threads) * ranks);
     std::mutex mutex;
     int code = 0;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
-        const int mine = runInproc(communicator, o, threads);
+        const int mine = runInproc(communicator, o, o.threads);
         const std::lock_guard<std::mutex> lock(mutex);
         code = std::max(code, mine);
     });
@@ -87,14 +78,8 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
         if (!parsed.options) {
             code = rank == 0 ? report(parsed) : parsed.exitCode;
         } else {
-            MPI_Comm here = MPI_COMM_NULL;
-            int ranksHere = 1;
-            MPI_Comm_split_type(MPI_COMM_WORLD, MPI_COMM_TYPE_SHARED, 0, MPI_INFO_NULL, &here);
-            MPI_Comm_size(here, &ranksHere);
-            MPI_Comm_free(&here);
-            const int threads = threadsFor(*parsed.options, ranksHere);
-            const WorkerLimit limit(threads);
-            code = runMpi(MPI_COMM_WORLD, *parsed.options, threads);
+            const WorkerLimit limit(parsed.options->threads);
+            code = runMpi(MPI_COMM_WORLD, *parsed.options, parsed.options->threads);
         }
     } catch (const dfb::InvalidArgument& e) { // this and the next are the same on all ranks
         if (rank == 0)

@@ -1,9 +1,12 @@
 // Mesh: triangles with shared vertices.
 #pragma once
 
+#include "text.hpp"
 #include "vec.hpp"
 
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstdint>
 #include <fstream>
 #include <stdexcept>
@@ -17,14 +20,15 @@ using Triangle = std::array<std::uint32_t, 3>;
 struct Mesh {
     std::vector<Vec3> positions;
     std::vector<Triangle> triangles;
+    std::vector<Vec3> colors{}; // of each vertex, linear RGB; or none
 };
 
 // For Loaders::fromFirst(): all that a mesh is made of. Does not compile if there is anything else in it.
 template <class Function>
 void arraysOf(Mesh& mesh, const Function& function)
 {
-    auto& [positions, triangles] = mesh;
-    function(positions, triangles);
+    auto& [positions, triangles, colors] = mesh;
+    function(positions, triangles, colors);
 }
 
 // The whole file. Throws std::runtime_error if it cannot be read or is empty.
@@ -44,27 +48,54 @@ inline std::string readFile(const std::string& path)
 
 namespace detail {
 
-// Fans a polygon; throws on an index that is no vertex.
-inline void addPolygon(Mesh& mesh, const std::vector<std::int64_t>& polygon, const std::string& where)
+// Fans a polygon; throws on an index that is no vertex. `where` gives the beginning of the error, as below.
+template <class Where>
+void addPolygon(Mesh& mesh, const std::vector<std::int64_t>& polygon, const Where& where)
 {
     if (polygon.size() < 3)
-        throw std::runtime_error(where + ": a face of " + std::to_string(polygon.size())
+        throw std::runtime_error(where() + ": a face of " + std::to_string(polygon.size())
                                  + " vertices, expected 3 or more");
     for (const std::int64_t index : polygon)
         if (index < 0 || index >= static_cast<std::int64_t>(mesh.positions.size()))
-            throw std::runtime_error(where + ": a face with vertex " + std::to_string(index) + ", expected 0 to "
+            throw std::runtime_error(where() + ": a face with vertex " + std::to_string(index) + ", expected 0 to "
                                      + std::to_string(static_cast<std::int64_t>(mesh.positions.size()) - 1));
     for (std::size_t i = 2; i < polygon.size(); ++i)
         mesh.triangles.push_back({static_cast<std::uint32_t>(polygon[0]), static_cast<std::uint32_t>(polygon[i - 1]),
                                   static_cast<std::uint32_t>(polygon[i])});
 }
 
-inline void addVertex(Mesh& mesh, const Vec3& p, const std::string& where)
+template <class Where>
+void addVertex(Mesh& mesh, const Vec3& p, const Where& where)
 {
     if (!isUsable(p))
-        throw std::runtime_error(where + ": vertex " + std::to_string(mesh.positions.size())
-                                 + ": expected finite coordinates below 1e15");
+        throw std::runtime_error(where() + ": expected finite coordinates below 1e15");
     mesh.positions.push_back(p);
+}
+
+// From sRGB, each channel in [0, 1].
+inline Vec3 linearOf(const Vec3& srgb)
+{
+    const auto linear = [](float v) { return v <= 0.04045f ? v / 12.92f : std::pow((v + 0.055f) / 1.055f, 2.4f); };
+    return {linear(srgb.x), linear(srgb.y), linear(srgb.z)};
+}
+
+// Of the colours of vertices as they are in a file, in sRGB, makes those of a mesh. Where some are missing or are no
+// colours, all are left out.
+inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
+{
+    const auto isColor = [](const Vec3& c) {
+        return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= 1 && c.y <= 1 && c.z <= 1;
+    };
+    if (mesh.colors.empty())
+        return;
+    if (mesh.colors.size() == mesh.positions.size() && std::all_of(mesh.colors.begin(), mesh.colors.end(), isColor)) {
+        for (Vec3& color : mesh.colors)
+            color = linearOf(color);
+        return;
+    }
+    mesh.colors.clear();
+    if (notes)
+        notes->push_back(name + ": the colours of vertices are left out: not all vertices have one from 0 to 1");
 }
 
 } // namespace detail

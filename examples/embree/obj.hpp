@@ -1,108 +1,64 @@
-// OBJ: the reader that makes a mesh from an OBJ file, by tinyobjloader.
+// OBJ: the reader that makes a mesh from an OBJ file.
+//
+// It is our own: tinyobjloader 2.0 takes what is no number, or is not there, for 0, cuts indices to 32 bits, and tells
+// neither lines nor the colours of vertices to who wants to check them.
 #pragma once
 
 #include "mesh.hpp"
-
-#include <tiny_obj_loader.h>
-
-#include <charconv>
-#include <sstream>
-#include <string_view>
+#include "text.hpp"
 
 namespace example {
 
-namespace detail {
-
-// The next word of a line.
-inline std::string_view nextObjWord(std::string_view& line)
+// The lines v, with or without a colour, and f; all else is skipped, polygons become fans. Throws std::runtime_error
+// with `name`, the line, what was expected and what was found. `notes` gets what was left out, if not null.
+inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
 {
-    const char* space = " \t";
-    line.remove_prefix(std::min(line.find_first_not_of(space), line.size()));
-    const std::string_view word = line.substr(0, line.find_first_of(space));
-    line.remove_prefix(word.size());
-    return word;
-}
-
-// Takes a number, which may have a sign, from the front of a word. False if there is none or it is too large.
-template <class Number>
-bool takeObjNumber(std::string_view& word, Number& value)
-{
-    word.remove_prefix(word.size() > 1 && word[0] == '+' && word[1] != '-');
-    const auto result = std::from_chars(word.data(), word.data() + word.size(), value);
-    word.remove_prefix(static_cast<std::size_t>(result.ptr - word.data()));
-    return result.ec == std::errc();
-}
-
-// tinyobjloader takes what is no number, or is not there, for 0, and cuts indices to 32 bits; so vertices and faces are
-// looked at first. Lines end as they do there.
-inline void checkObjLines(std::string_view bytes, const std::string& name)
-{
-    std::size_t lineNumber = 0;
-    while (!bytes.empty()) {
-        const std::size_t end = std::min(bytes.find_first_of("\r\n"), bytes.size());
-        std::string_view line = bytes.substr(0, end);
-        bytes.remove_prefix(std::min(end + (bytes.substr(end, 2) == "\r\n" ? 2 : 1), bytes.size()));
-        ++lineNumber;
-        const auto fail = [&](const char* expected) {
-            throw std::runtime_error(name + ": line " + std::to_string(lineNumber) + ": expected " + expected);
-        };
-        const std::string_view kind = nextObjWord(line);
-        if (kind == "v" && !line.empty()) {
-            for (int i = 0; i < 3; ++i) {
-                double value = 0;
-                std::string_view word = nextObjWord(line);
-                if (!takeObjNumber(word, value) || !word.empty() || !std::isfinite(value))
-                    fail("'v x y z' with finite numbers");
+    Mesh mesh;
+    std::vector<std::int64_t> polygon;
+    TextLines lines(bytes);
+    const auto where = [&] { return name + ": line " + std::to_string(lines.number()); };
+    const auto fail = [&](const std::string& why) { throw std::runtime_error(where() + ": " + why); };
+    while (!lines.atEnd()) {
+        std::string_view line = lines.next();
+        line = line.substr(0, line.find('#'));
+        const std::string_view kind = nextWord(line);
+        if (kind == "v") {
+            double v[7] = {};
+            int count = 0;
+            for (; count < 7; ++count) { // up to one more than with a colour
+                const std::string_view word = nextWord(line);
+                const bool isNumber = parseNumber(word, v[count]);
+                if (count < 3 && !(isNumber && std::isfinite(v[count])))
+                    fail("expected 'v x y z' with finite numbers, got '" + std::string(word) + "'");
+                if (!isNumber)
+                    break;
             }
+            const auto at = [&v](int i) { return static_cast<float>(v[i]); };
+            detail::addVertex(mesh, {at(0), at(1), at(2)}, where);
+            if (count == 6)
+                mesh.colors.emplace_back(at(3), at(4), at(5));
         } else if (kind == "f") {
-            for (std::string_view word = nextObjWord(line); !word.empty(); word = nextObjWord(line)) {
-                int index = 0;
-                if (!takeObjNumber(word, index)
-                    || !(word.empty() || (word[0] == '/' && word.find_first_not_of("/+-0123456789") == word.npos)))
-                    fail("'f' with indices as in i, i/j, i//k or i/j/k");
+            const std::int64_t vertices = static_cast<std::int64_t>(mesh.positions.size());
+            polygon.clear();
+            for (std::string_view word = nextWord(line); !word.empty(); word = nextWord(line)) {
+                std::string_view rest = word;
+                std::int64_t index = 0; // from 1, or backwards from -1
+                if (!takeNumber(rest, index)
+                    || !(rest.empty() || (rest[0] == '/' && rest.find_first_not_of("/+-0123456789") == rest.npos)))
+                    fail("expected 'f' with indices as in i, i/j, i//k or i/j/k, got '" + std::string(word) + "'");
+                if (index == 0 || index > vertices || index < -vertices)
+                    fail("a face with vertex " + std::to_string(index) + ", expected 1 to " + std::to_string(vertices)
+                         + ", or -1 to -" + std::to_string(vertices));
+                polygon.push_back(index > 0 ? index - 1 : vertices + index);
             }
+            detail::addPolygon(mesh, polygon, where);
         }
     }
-}
-
-} // namespace detail
-
-// The lines v and f; all else is skipped, polygons become fans. Throws std::runtime_error
-// with `name`, what was expected and what was found.
-inline Mesh parseObj(const std::string& bytes, const std::string& name)
-{
-    detail::checkObjLines(bytes, name);
-    struct State {
-        Mesh mesh;
-        std::string name;
-        std::vector<std::int64_t> polygon;
-    } state;
-    state.name = name;
-
-    tinyobj::callback_t callback;
-    callback.vertex_cb = [](void* user, float x, float y, float z, float) {
-        State& s = *static_cast<State*>(user);
-        detail::addVertex(s.mesh, {x, y, z}, s.name);
-    };
-    callback.index_cb = [](void* user, tinyobj::index_t* indices, int count) {
-        State& s = *static_cast<State*>(user);
-        s.polygon.clear();
-        for (int i = 0; i < count; ++i) { // from 1, or backwards from -1
-            const std::int64_t index = indices[i].vertex_index;
-            s.polygon.push_back(index > 0   ? index - 1
-                                : index < 0 ? static_cast<std::int64_t>(s.mesh.positions.size()) + index
-                                            : -1);
-        }
-        detail::addPolygon(s.mesh, s.polygon, s.name + ": after triangle " + std::to_string(s.mesh.triangles.size()));
-    };
-    std::istringstream stream(bytes);
-    std::string warning, error;
-    if (!tinyobj::LoadObjWithCallback(stream, callback, &state, nullptr, &warning, &error))
-        throw std::runtime_error(name + ": " + (error.empty() ? "not an OBJ file" : error));
-    if (state.mesh.triangles.empty())
-        throw std::runtime_error(name + ": expected vertices and faces, got "
-                                 + std::to_string(state.mesh.positions.size()) + " vertices and no faces");
-    return std::move(state.mesh);
+    if (mesh.triangles.empty())
+        throw std::runtime_error(name + ": expected vertices and faces, got " + std::to_string(mesh.positions.size())
+                                 + " vertices and no faces");
+    detail::finishColors(mesh, name, notes);
+    return mesh;
 }
 
 } // namespace example

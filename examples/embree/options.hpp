@@ -33,6 +33,7 @@ enum class OwnerMap { Lattice, Linear, Hash };
 struct Options {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files
     bool fit = true;
+    int xyzFrame = 0; // of .xyz files; 0: the first
     Mode mode = Mode::Data;
     int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;    // 0: one per rank
@@ -42,12 +43,12 @@ struct Options {
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
     int deep = 0;                                    // segments per pixel and brick; 0: a fragment of one
-    dfb::WireFormat wire = dfb::WireFormat::Float32, wireDepth = dfb::WireFormat::Float32;
+    dfb::WireFormat wire = dfb::WireFormat::Float32;
     double errorBudget = 0;     // 0: `wire`
     float minTransmittance = 0; // 0: off
     bool verify = false;
     int inFlight = 1; // frames that may be open at once
-    int threads = 0;  // per rank; 0: as many as the machine has
+    int threads = 0;  // per rank; 0: its part of the processors
     Compression compression = Compression::None;
     bool sharedMemory = true;
     int peerTimeout = dfb::defaultPeerTimeoutMs / 1000; // seconds; 0: off
@@ -250,6 +251,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--no-fit", noFit,
                  "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
 
+    app.add_option("--xyz-frame", options.xyzFrame, "Which frame of an .xyz file that has several, from 1; default 1")
+        ->check(detail::number(1, 2147483647))
+        ->option_text("N");
+
     const char* how = "Distribution";
     words("--mode", options.mode, {"data", "image", "mixed"},
           "data: each rank holds some bricks of the scene; image: each rank holds all and renders some "
@@ -273,13 +278,13 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(how);
     app.add_option(
            "--interleave", options.interleave,
-           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1. Pixels whose "
-           "order is undefined are counted, unless --deep has segments enough")
+           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1")
         ->check(detail::number(1, 4096))
         ->option_text("C")
         ->group(how);
     app.add_option("--deep", options.deep,
-                   "Deep fragments: the most segments per pixel and brick; default 0: a single fragment")
+                   "Deep fragments: the most segments per pixel and brick. With fewer than --interleave the order may "
+                   "be undefined at some pixels, which are counted; default: that many; 0 without: a single fragment")
         ->check(detail::number(0, 65535))
         ->option_text("K")
         ->group(how);
@@ -292,7 +297,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("N")
         ->group(how);
     app.add_option("--threads", options.threads,
-                   "Threads per rank; default 0: the hardware threads of the machine, divided among its ranks")
+                   "Threads per rank; default 0: the processors that it may run on, divided among the ranks that may, too")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(how);
@@ -300,9 +305,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--no-shared-memory", noSharedMemory,
                  "Send all messages through MPI, also those between ranks of one node")
         ->group(how);
-    app.add_option("--peer-timeout", options.peerTimeout,
-                   "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, "
-                   "as for a debugger; default 300")
+    app.add_option(
+           "--peer-timeout", options.peerTimeout,
+           "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, "
+           "as for a debugger; default 300")
         ->check(detail::number(0, most))
         ->option_text("SECONDS")
         ->group(how);
@@ -312,16 +318,13 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(how);
     words("--wire", options.wire, {"float32", "float16", "unorm16", "unorm8"},
           "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
-          "tiles stay float32; default float32")
+          "tiles stay float32, as do depth and what --aux writes; default float32")
         ->group(how);
     app.add_option("--error-budget", options.errorBudget,
-                   "Take the cheapest of these formats that is sure to change no pixel by more than this, before it is "
-                   "converted for output; default 0: --wire says")
+                   "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
+                   "this, before it is converted for output; default 0: --wire says")
         ->check(detail::number(0, 1))
         ->option_text("E")
-        ->group(how);
-    words("--wire-depth", options.wireDepth, {"float32", "float16"},
-          "Format of the depth of tiles on their way; default float32")
         ->group(how);
     app.add_option("--min-transmittance", options.minTransmittance,
                    "Leave out what is behind bricks that let less than this part of the light through; default 0")
@@ -329,7 +332,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("T")
         ->group(how);
     app.add_flag("--verify", options.verify,
-                 "Check each finished tile against an exact reference of what it was made of; slow")
+                 "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
+                 "was made of; slow")
         ->group(how);
     words("--owner-map", options.ownerMap, {"lattice", "linear", "hash"}, "Which rank owns which tile; default lattice")
         ->group(how);
@@ -434,7 +438,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("DEG")
         ->group(picture);
     app.add_option("--camera-distance", options.view.distance,
-                   "From the centre of what there is to see, in units of its largest extent; default 2.3")
+                   "From the centre of what there is to see, in units of its largest extent; default: so far that all "
+                   "of it is in the image, from every side")
         ->check(detail::number(0, 1000))
         ->option_text("D")
         ->group(picture);
@@ -442,9 +447,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1))
         ->option_text("A")
         ->group(picture);
-    app.add_option("--early-termination", options.earlyTermination,
-                   "End a ray within a brick when less than this part of the light gets through, 0 to 1; default 0: "
-                   "never. The image then depends on the bricks")
+    app.add_option(
+           "--early-termination", options.earlyTermination,
+           "End a ray within a brick when less than this part of the light gets through, 0 to 1. The image then "
+           "depends on the bricks, and no pixel is off by more than this part of the brightest colour; default "
+           "0: when nothing does")
         ->check(detail::number(0, 1))
         ->option_text("T")
         ->group(picture);
@@ -506,6 +513,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     try {
         app.parse(argc, argv);
         options.fit = !noFit;
+        if (options.interleave > 1 && app.count("--deep") == 0)
+            options.deep = options.interleave; // as many pieces as a brick can have on a ray
         options.sharedMemory = !noSharedMemory;
         if (app.count("--size") > 0)
             detail::parseSize("--size", size, 65536, options.width, options.height);

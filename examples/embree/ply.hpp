@@ -23,6 +23,7 @@ struct PlyProperty {
     PlyType type = PlyType::Float32;
     bool isList = false;
     PlyType countType = PlyType::UInt8;
+    int channel = -1; // 0, 1 or 2: it is red, green or blue
 };
 
 struct PlyElement {
@@ -34,7 +35,9 @@ struct PlyElement {
 // A cursor over the bytes of a PLY file: the header line by line, then numbers.
 class PlyReader {
 public:
-    PlyReader(std::string_view bytes, const std::string& name) : bytes_(bytes), name_(name) {}
+    PlyReader(std::string_view bytes, const std::string& name, Notes* notes) : bytes_(bytes), name_(name), notes_(notes)
+    {
+    }
 
     Mesh read()
     {
@@ -56,6 +59,7 @@ public:
                  + " bytes");
         if (mesh.triangles.empty())
             fail("it has no faces");
+        finishColors(mesh, name_, notes_);
         return mesh;
     }
 
@@ -115,6 +119,7 @@ private:
                 property.type = typeOf(words[words.size() - 2]);
                 if (property.isList)
                     property.countType = typeOf(words[2]);
+                property.channel = channelOf(property);
                 elements_.back().properties.push_back(property);
             } else {
                 fail("unexpected header line that begins with '" + words[0] + "'");
@@ -129,8 +134,9 @@ private:
     {
         bool seenVertex = false;
         for (const PlyElement& element : elements_) {
-            int coordinates = 0, indexLists = 0;
+            int coordinates = 0, indexLists = 0, colors = 0;
             for (const PlyProperty& p : element.properties) {
+                colors += p.channel >= 0;
                 coordinates += !p.isList && (p.name == "x" || p.name == "y" || p.name == "z");
                 indexLists += p.isList && isIndexList(p);
             }
@@ -138,10 +144,23 @@ private:
                 fail("expected one element vertex with x, y and z");
             if (element.name == "face" && (indexLists != 1 || !seenVertex))
                 fail("expected an element face after the vertices with one list of vertex indices");
+            if (element.name == "face" && colors > 0 && notes_)
+                notes_->push_back(name_ + ": the colours of faces are left out; those of vertices would be used");
             seenVertex = seenVertex || element.name == "vertex";
         }
         if (!seenVertex)
             fail("it has no element vertex");
+    }
+
+    // 0, 1 or 2 if the property is red, green or blue, else -1.
+    static int channelOf(const PlyProperty& p)
+    {
+        static const std::array<const char*, 3> names{"red", "green", "blue"};
+        for (int i = 0; i < 3 && !p.isList; ++i)
+            if (p.name == names[static_cast<std::size_t>(i)]
+                || p.name == std::string("diffuse_") + names[static_cast<std::size_t>(i)])
+                return i;
+        return -1;
     }
 
     static bool isIndexList(const PlyProperty& p) { return p.name == "vertex_indices" || p.name == "vertex_index"; }
@@ -164,12 +183,17 @@ private:
 
     void readRow(const PlyElement& element, std::uint64_t row, Mesh& mesh, bool isVertex, bool isFace)
     {
-        Vec3 p;
+        Vec3 p, color;
+        unsigned channels = 0; // a bit for each
         for (const PlyProperty& property : element.properties) {
             if (!property.isList) {
                 const double value = number(property.type, element, row);
                 if (isVertex && property.name.size() == 1 && property.name[0] >= 'x' && property.name[0] <= 'z')
                     p[property.name[0] - 'x'] = static_cast<float>(value);
+                if (isVertex && property.channel >= 0) {
+                    color[property.channel] = static_cast<float>(value / largestOf(property.type));
+                    channels |= 1u << property.channel;
+                }
                 continue;
             }
             const double count = number(property.countType, element, row);
@@ -182,10 +206,19 @@ private:
                 polygon_.push_back(canBe ? static_cast<std::int64_t>(index) : -1);
             }
             if (isFace && isIndexList(property))
-                addPolygon(mesh, polygon_, name_ + ": face " + std::to_string(row));
+                addPolygon(mesh, polygon_, [&] { return name_ + ": face " + std::to_string(row); });
         }
         if (isVertex)
-            addVertex(mesh, p, name_);
+            addVertex(mesh, p, [&] { return name_ + ": vertex " + std::to_string(row); });
+        if (channels == 7)
+            mesh.colors.push_back(color);
+    }
+
+    // Which value of a channel is all of it.
+    static double largestOf(PlyType type)
+    {
+        static const std::array<double, 8> all{127, 255, 32767, 65535, 255, 255, 1, 1}; // wide integers as of bytes
+        return all[static_cast<std::size_t>(type)];
     }
 
     void skipSpace()
@@ -201,14 +234,15 @@ private:
         };
         if (format_ == Format::Ascii) {
             skipSpace();
-            double value = 0;
-            const auto result = std::from_chars(bytes_.data() + at_, bytes_.data() + bytes_.size(), value);
             if (at_ == bytes_.size())
                 fail("it ends early," + where());
-            at_ = static_cast<std::size_t>(result.ptr - bytes_.data());
+            double value = 0;
+            std::string_view rest = bytes_.substr(at_);
+            const bool isNumber = takeNumber(rest, value);
+            at_ = bytes_.size() - rest.size();
             const bool ended =
                 at_ == bytes_.size() || bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
-            if (result.ec != std::errc() || !ended)
+            if (!isNumber || !ended)
                 fail("expected a number," + where());
             return value;
         }
@@ -243,6 +277,7 @@ private:
 
     std::string_view bytes_;
     std::string name_;
+    Notes* notes_;
     std::size_t at_ = 0;
     Format format_ = Format::Ascii;
     std::vector<PlyElement> elements_;
@@ -251,9 +286,13 @@ private:
 
 } // namespace detail
 
-// ASCII or binary of either byte order; properties and elements that are not positions and faces are skipped,
-// polygons become fans. Throws std::runtime_error
-// with `name`, what was expected and what was found.
-inline Mesh parsePly(std::string_view bytes, const std::string& name) { return detail::PlyReader(bytes, name).read(); }
+// ASCII or binary of either byte order. The colours of vertices (red, green, blue) are taken as sRGB, integers as a
+// part of the type's largest; other properties and elements that are not positions and faces are skipped, polygons
+// become fans. Throws std::runtime_error with `name`, what was expected and what was found. `notes` gets what was left
+// out, if not null.
+inline Mesh parsePly(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
+{
+    return detail::PlyReader(bytes, name, notes).read();
+}
 
 } // namespace example

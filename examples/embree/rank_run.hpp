@@ -69,11 +69,8 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.dither = o.dither;
     config.depth = !o.depth.empty();
     config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
-    config.wire.depth = o.wireDepth;
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
-    config.sharedMemory = o.sharedMemory;
-    config.peerTimeoutMs = 1000 * o.peerTimeout;
     config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
     config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                       : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
@@ -93,6 +90,14 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
 #endif
     return config;
+}
+
+inline dfb::MessengerOptions messengerOptionsOf(const Options& o)
+{
+    dfb::MessengerOptions options;
+    options.sharedMemory = o.sharedMemory;
+    options.peerTimeoutMs = 1000 * o.peerTimeout;
+    return options;
 }
 
 inline dfb::World worldOf(const RankScene& scene, const RenderSettings& settings)
@@ -160,9 +165,10 @@ class RankRun {
 
 public:
     RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
-        : o_(o), threads_(threads), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator))
+        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o))),
+          threads_(threads > 0 ? threads : messenger_->threadShare())
     {
-        dfb::FrameBufferConfig config = configOf(o, threads);
+        dfb::FrameBufferConfig config = configOf(o, threads_);
         PixelOp pixelOp{};
         if constexpr (hasWall) {
             // Of what a wall shows no rank has the whole.
@@ -195,6 +201,9 @@ public:
         clock_.enter(Phase::Load);
         if (!onAllRanks([&] { load(); }))
             return exitFailed;
+        for (const std::string& note : scene_->notes)
+            if (fb_->isDisplayRank())
+                std::fprintf(stderr, "dfb_render: %s\n", note.c_str());
         settings_ = renderSettings(o_);
         params_.passes = o_.spp;
         params_.maxLayers = static_cast<int>(scene_->bounds.size()) * std::max(1, o_.deep);
@@ -245,10 +254,8 @@ private:
 
     void load()
     {
-        const Loaders loaders(
-            fb_->rank(), fb_->size(),
-            [this](const Loaders::Numbers& numbers) { return fb_->allReduce(numbers, Reduce::Min); },
-            [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); });
+        const Loaders loaders(fb_->rank(), fb_->size(),
+                              [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); });
         scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
         bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
     }
@@ -495,8 +502,10 @@ private:
             numbers.insert(numbers.end(), {f.renderNs, f.compositingNs, f.writeNs, f.tiles, f.work});
         const auto ofRanks = gathered(numbers);
         const dfb::testing::ErrorReport checked = verification_.report();
-        const auto verified = fb_->allReduce(
-            {checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes}, Reduce::Sum);
+        const auto verified =
+            fb_->allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
+                            checked.others, checked.wrongOthers},
+                           Reduce::Sum);
         return onAllRanks([&] {
             if (!fb_->isDisplayRank())
                 return;
@@ -507,6 +516,9 @@ private:
             if (o_.verify)
                 std::printf("%lld of %lld values are not the exact result rounded\n",
                             static_cast<long long>(verified[0] - verified[1]), static_cast<long long>(verified[0]));
+            if (o_.verify && verified[2] > 0)
+                std::printf("%lld of %lld values of depth and auxiliary channels are wrong\n",
+                            static_cast<long long>(verified[3]), static_cast<long long>(verified[2]));
         });
     }
 
@@ -579,7 +591,7 @@ private:
             std::printf("order undefined at %llu pixels; merging changed none by more than %.3g\n",
                         static_cast<unsigned long long>(last.orderUndefinedPixels), last.mergeErrorBound);
         if (last.wireErrorBound > 0)
-            std::printf("tiles travelled as %s: no pixel is off by more than %.3g\n", last.wireColor.c_str(),
+            std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n", last.wireColor.c_str(),
                         last.wireErrorBound);
         sayWritten();
     }
@@ -607,8 +619,8 @@ private:
 
     PhaseClock clock_;
     Options o_;
-    int threads_;
     std::shared_ptr<dfb::Messenger<Transport>> messenger_;
+    int threads_;
     std::unique_ptr<Wall> wall_; // outlives the framebuffer that sends to it
     std::unique_ptr<FrameBuffer> fb_;
     std::unique_ptr<RankScene> scene_;

@@ -34,7 +34,7 @@ inline Scene makeScene(const Options& options, int brickCount, const Loaders& lo
         return demoScene(options.seed);
     Scene scene;
     for (const std::string& path : options.scene)
-        addFile(scene, path, options.fit, loaders);
+        addFile(scene, path, options.fit, options.xyzFrame, loaders);
     return scene;
 }
 
@@ -44,6 +44,7 @@ struct RankScene {
     std::vector<Box> bounds;             // of all bricks, by brick id; in image mode one, the whole scene
     // For each of brickIds one per cell: a brick has one, or with --interleave several that are apart.
     std::vector<std::vector<Renderer>> renderers;
+    Notes notes; // for the user, the same on all ranks
 
     const std::vector<Renderer>& of(std::uint32_t brickId) const
     {
@@ -68,7 +69,11 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
     const Scene scene = makeScene(options, sceneBricks, loaders);
     const RenderSettings settings = renderSettings(options);
-    RankScene result{SceneInfo(scene), {}, {}, {}};
+    RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
+    if (options.path > 0 && !scene.volumes.empty())
+        result.notes.push_back(scene.meshes.empty() && scene.spheres.empty()
+                                   ? "there is nothing to see: --path leaves volumes out, and there are no surfaces"
+                                   : "--path leaves volumes out");
     const float ghosts = ghostReach(result.info, settings);
     std::vector<Box> cells{scene.bounds};
     if (!isImage)

@@ -30,18 +30,18 @@ struct RenderSettings {
     bool shadows = false;       // of the light, as far as that
     int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
     float opacity = 0.6f;       // of a surface or sphere
-    float earlyTermination = 0; // a ray ends when less than this passes through it; 0: never
+    float earlyTermination = 0; // a ray ends when less than this passes through it; 0: when nothing does
     View view;
 };
 
 // What a renderer needs to know of the whole scene.
 struct SceneInfo {
     Box bounds;
-    Box focus;      // where the camera looks
+    Focus focus;    // where the camera looks
     float step = 0; // between the samples of a ray, in world space: half a voxel of the finest volume
 
     explicit SceneInfo(const Scene& scene)
-        : bounds(scene.bounds), focus(scene.focus), step(scene.bounds.largestExtent())
+        : bounds(scene.bounds), focus(scene.focus()), step(scene.bounds.largestExtent())
     {
         for (const VolumeObject& volume : scene.volumes)
             step = std::min(step, 0.5f * volume.placement.size());
@@ -66,7 +66,7 @@ public:
     // Throws std::runtime_error if Embree does. A brick from loadBrick().
     Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings)
         : settings_(settings), scene_(scene), cell_(brick.cell),
-          surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres))
+          surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres)), mostHits_(mostHits(settings))
     {
         volumes_.reserve(brick.volumes.size());
         for (BrickVolume& volume : brick.volumes)
@@ -182,6 +182,20 @@ private:
         Vec3 inverseStep;
     };
 
+    // How many hits end a ray.
+    static std::size_t mostHits(const RenderSettings& settings)
+    {
+        if (settings.pathBounces > 0)
+            return 1;
+        double through = 1; // reckoned as in Accumulator
+        for (std::size_t hits = 1; hits <= 1000; ++hits) {
+            through *= 1 - static_cast<double>(settings.opacity);
+            if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
+                return hits;
+        }
+        return std::numeric_limits<std::size_t>::max();
+    }
+
     // One function for all tile types and so one machine code for all bricks.
     std::int64_t render(const Target& to, int frameIndex) const
     {
@@ -296,7 +310,7 @@ private:
             const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
             direction = cosineDirection(normal, key, bounce);
             const Vec3 origin = point + normal * least;
-            surfaces_.intersect(origin, direction, hits);
+            surfaces_.intersect(origin, direction, hits, 1);
             ++cost;
             if (hits.empty()) {
                 const float sky = 0.9f + 0.5f * direction.y; // brighter above
@@ -335,7 +349,9 @@ private:
         if (!clip(reach, origin, inverse, enter, leave))
             return sum;
         sum.cost = 1;
-        surfaces_.intersect(origin, direction, hits);
+        surfaces_.intersect(origin, direction, hits, mostHits_);
+        if (hits.size() == mostHits_)
+            leave = std::min(leave, hits.back().t);
         if (settings_.pathBounces > 0) {
             if (hits.empty())
                 return sum;
@@ -362,8 +378,10 @@ private:
         }
 
         auto hit = hits.begin();
+        const double least = static_cast<double>(settings_.earlyTermination);
+        const auto isDone = [&] { return sum.through <= 0 || sum.through < least; };
         const auto addHits = [&](float before) {
-            for (; hit != hits.end() && hit->t <= before; ++hit) {
+            for (; hit != hits.end() && hit->t <= before && !isDone(); ++hit) {
                 const Vec3 point = pointAt(origin, direction, hit->t);
                 const bool inShadow = settings_.shadows && settings_.opacity > 0 && isInShadow(point, light);
                 Vec3 c = (inShadow ? hit->color * light.ambient : light.shade(hit->color, hit->normal, direction))
@@ -377,8 +395,7 @@ private:
                 sum.add(hit->t, c.x, c.y, c.z, settings_.opacity);
             }
         };
-        const double least = static_cast<double>(settings_.earlyTermination);
-        for (;;) {
+        while (!isDone()) {
             int k = none;
             for (const VolumeRay& ray : rays)
                 k = std::min(k, ray.next < ray.end ? ray.next : none);
@@ -405,12 +422,12 @@ private:
                 const TransferFunction::Entry entry = volume.shade(voxel, direction, light);
                 if (entry.alpha > 0) {
                     addHits(t);
+                    if (isDone())
+                        break;
                     sum.albedo = sum.albedo + Vec3(entry.r, entry.g, entry.b) * static_cast<float>(sum.through);
                     sum.add(t, entry.r, entry.g, entry.b, entry.alpha);
                 }
             }
-            if (sum.through < least)
-                return sum;
         }
         addHits(std::numeric_limits<float>::infinity());
         return sum;
@@ -420,6 +437,7 @@ private:
     SceneInfo scene_;
     Box cell_;
     Surfaces surfaces_;
+    std::size_t mostHits_;
     std::vector<VolumeSampler> volumes_;
 };
 

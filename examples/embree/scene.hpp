@@ -9,10 +9,12 @@
 #include "loaders.hpp"
 #include "obj.hpp"
 #include "ply.hpp"
+#include "shading.hpp"
 #include "spheres.hpp"
 #include "volume.hpp"
 
 #include <cstdint>
+#include <cstdio>
 #include <string>
 #include <utility>
 #include <vector>
@@ -74,7 +76,7 @@ struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
     std::vector<Vec3> normals;
-    Vec3 color;
+    Vec3 color; // where vertices have none of their own
 };
 
 struct SphereObject {
@@ -87,16 +89,26 @@ struct Scene {
     std::vector<MeshObject> meshes;
     std::vector<SphereObject> spheres;
     Box bounds;
-    Box focus;            // of what there is to see, for the camera
     Index3 grid{0, 0, 0}; // of the cells, x fastest; zero: by bisection
+    Notes notes;          // for the user
 
     void add(VolumeSource source, bool fit)
     {
         VolumeObject object(std::move(source), fit);
         grow(object.bounds());
-        const Box visible = object.source.visible ? *object.source.visible : visibleBounds(object.source);
-        focus.grow(object.placement.toWorld(visible.lo));
-        focus.grow(object.placement.toWorld(visible.hi));
+        const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
+        const float slack = static_cast<float>(visible.slack) * object.placement.size();
+        lookAt([&](const auto& take) {
+            for (const Vec3& p : visible.points)
+                take(object.placement.toWorld(p), slack);
+            if (visible.points.empty()) // the whole
+                for (int i = 0; i < 8; ++i)
+                    take({i & 1 ? object.bounds().hi.x : object.bounds().lo.x,
+                          i & 2 ? object.bounds().hi.y : object.bounds().lo.y,
+                          i & 4 ? object.bounds().hi.z : object.bounds().lo.z},
+                         0);
+        });
+        noteOn(object.source, visible.points.empty());
         volumes.push_back(std::move(object));
     }
     void add(Mesh mesh, bool fit)
@@ -112,12 +124,11 @@ struct Scene {
             {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
         MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
         object.normals = vertexNormals(object.mesh);
-        box = Box();
-        for (const Triangle& triangle : object.mesh.triangles)
-            for (const std::uint32_t index : triangle)
-                box.grow(object.mesh.positions[index]);
-        focus.grow(box);
-        grow(box);
+        grow(lookAt([&](const auto& take) {
+            for (const Triangle& triangle : object.mesh.triangles)
+                for (const std::uint32_t index : triangle)
+                    take(object.mesh.positions[index], 0);
+        }));
         meshes.push_back(std::move(object));
     }
     void add(std::vector<Sphere> set, bool fit)
@@ -130,15 +141,63 @@ struct Scene {
             sphere.center = placement.toWorld(sphere.center);
             sphere.radius *= placement.size();
         }
-        box = Box();
-        for (const Sphere& sphere : set)
-            box.grow(sphere.center, sphere.radius);
-        focus.grow(box);
-        grow(box);
+        grow(lookAt([&](const auto& take) {
+            for (const Sphere& sphere : set)
+                take(sphere.center, sphere.radius);
+        }));
         spheres.push_back({nextGeometry_++, std::move(set)});
     }
 
+    // What there is to see, for the camera.
+    Focus focus() const
+    {
+        Focus all{seen_, 0};
+        for (const auto& [center, radius] : balls_)
+            all.radius = std::max(all.radius, length(center - seen_.center()) + radius);
+        return all;
+    }
+
 private:
+    // `mayBeEmpty`: nothing was seen at a glance.
+    void noteOn(const VolumeSource& source, bool mayBeEmpty)
+    {
+        const VolumeInfo& info = source.info;
+        if (info.notFinite > 0)
+            notes.push_back(source.name + ": voxels that are not finite: " + std::to_string(info.notFinite)
+                            + "; they count as " + textOf(info.minimum));
+        if (!mayBeEmpty)
+            return;
+        const auto [lo, hi] = source.range ? *source.range : rangeOf(source);
+        const auto value = [&info](float v) { return (v - info.minimum) / (info.maximum - info.minimum); };
+        if (!TransferFunction(1).isTransparent(value(lo), value(hi)))
+            return;
+        notes.push_back(source.name + ": there is nothing to see: "
+                        + (lo == hi ? "all voxels are " + textOf(lo)
+                                    : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
+    }
+    static std::string textOf(float value)
+    {
+        char text[32];
+        std::snprintf(text, sizeof text, "%g", static_cast<double>(value));
+        return text;
+    }
+
+    // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
+    template <class ForEach>
+    Box lookAt(const ForEach& forEach)
+    {
+        Box box;
+        forEach([&](const Vec3& center, float radius) { box.grow(center, radius); });
+        const Vec3 middle = box.center();
+        float reach = 0;
+        forEach([&](const Vec3& center, float radius) { reach = std::max(reach, length(center - middle) + radius); });
+        if (!box.empty()) {
+            seen_.grow(box);
+            balls_.emplace_back(middle, reach);
+        }
+        return box;
+    }
+
     // The bounds are a little larger than what they hold, so that nothing lies on the outer faces, of which the
     // upper ones belong to no cell.
     void grow(const Box& box)
@@ -149,15 +208,17 @@ private:
         bounds = tight_.padded(1e-5f * std::max({tight_.largestExtent(), far, 1e-6f}));
     }
 
-    Box tight_;
+    Box tight_, seen_;
+    std::vector<std::pair<Vec3, float>> balls_; // of each object, around all there is to see of it
     std::uint32_t nextGeometry_ = 0;
 };
 
 // Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
 // of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
 // texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
-// whole of it until its bricks are loaded. Throws std::runtime_error that names the file, the same on all ranks.
-inline void addFile(Scene& scene, const std::string& path, bool fit, const Loaders& loaders = {})
+// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file,
+// the same on all ranks.
+inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     const auto bytes = [&] {
@@ -165,14 +226,22 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, const Loade
         *loaders.readCounter() += all.size();
         return all;
     };
+    const auto parsed = [&](auto kind, const auto& parse) {
+        Notes notes;
+        auto object = loaders.fromFirst<decltype(kind)>([&] { return parse(&notes); });
+        for (std::string& note : loaders.linesOfFirst(notes))
+            scene.notes.push_back(std::move(note));
+        return object;
+    };
     if (ending == ".raw")
         scene.add(openVolume(path, loaders), fit);
     else if (ending == ".ply")
-        scene.add(loaders.fromFirst<Mesh>([&] { return parsePly(bytes(), path); }), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit);
     else if (ending == ".obj")
-        scene.add(loaders.fromFirst<Mesh>([&] { return parseObj(bytes(), path); }), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit);
     else if (ending == ".xyz")
-        scene.add(loaders.fromFirst<std::vector<Sphere>>([&] { return parseXyz(bytes(), path); }), fit);
+        scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
+                  fit);
     else
         throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
 }
@@ -319,6 +388,8 @@ inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
                 index = static_cast<std::uint32_t>(part.mesh.positions.size());
                 part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
                 part.normals.push_back(object.normals[triangle[k]]);
+                if (!object.mesh.colors.empty())
+                    part.mesh.colors.push_back(object.mesh.colors[triangle[k]]);
             }
             renamed[k] = index;
         }

@@ -68,17 +68,21 @@ public:
 
     bool empty() const { return scene_ == nullptr; }
 
-    // All hits of the ray whose point is in the brick's cell, front to back. From any thread.
-    void intersect(const Vec3& origin, const Vec3& direction, std::vector<Hit>& hits) const
+    // The first `most` hits of the ray whose point is in the brick's cell, front to back; by default all. From any
+    // thread.
+    void intersect(const Vec3& origin, const Vec3& direction, std::vector<Hit>& hits,
+                   std::size_t most = std::numeric_limits<std::size_t>::max()) const
     {
         hits.clear();
-        if (empty())
+        if (empty() || most == 0)
             return;
         Query query;
         query.origin = origin;
         query.direction = direction;
         query.cell = &cell_;
         query.hits = &hits;
+        query.most = most;
+        query.mayEnd = meshes_.empty();
         RTCRayHit ray{};
         ray.ray = rayOf(origin, direction, std::numeric_limits<float>::infinity());
         ray.hit.geomID = RTC_INVALID_GEOMETRY_ID;
@@ -92,15 +96,6 @@ public:
         rtcInitIntersectContext(&query.context);
         rtcIntersect1(scene_.get(), &query.context, &ray);
 #endif
-        std::sort(hits.begin(), hits.end(), [](const Hit& a, const Hit& b) {
-            return a.t != b.t                 ? a.t < b.t
-                   : a.geometry != b.geometry ? a.geometry < b.geometry
-                                              : a.primitive < b.primitive;
-        });
-        // A point on an edge belongs to two triangles but is seen once.
-        hits.erase(std::unique(hits.begin(), hits.end(),
-                               [](const Hit& a, const Hit& b) { return a.t == b.t && a.geometry == b.geometry; }),
-                   hits.end());
     }
 
     // Whether anything is on the ray between two distances, in the cell or not. From any thread.
@@ -152,15 +147,44 @@ private:
         Context context;
         Vec3 origin, direction;
         const Box* cell = nullptr;
-        std::vector<Hit>* hits = nullptr;
+        std::vector<Hit>* hits = nullptr; // front to back
+        std::size_t most = 0;
+        // Embree need not look behind the last of `most` hits. Not with triangles: their distances, which Embree then
+        // compares with it, are not ours where they are seen edge-on.
+        bool mayEnd = false;
         double from = 0, to = 0; // of occluded()
 
-        void keep(double distance, const Hit& hit) const
+        // Takes the hit if it is in the cell and one of the first `most` so far.
+        void keep(double distance, Hit hit) const
         {
-            Hit kept = hit;
-            kept.t = static_cast<float>(distance);
-            if (kept.t > 0 && cell->contains(pointAt(origin, direction, kept.t)))
-                hits->push_back(kept);
+            hit.t = static_cast<float>(distance);
+            if (!(hit.t > 0) || (isFull() && hits->back().t < hit.t)
+                || !cell->contains(pointAt(origin, direction, hit.t)))
+                return;
+            // Embree goes roughly front to back, so the place is near the end.
+            auto at = hits->end();
+            while (at != hits->begin() && isBefore(hit, at[-1]))
+                --at;
+            // A point on an edge belongs to two triangles but is seen once, as a point of the first.
+            if (at != hits->begin() && isSamePoint(hit, at[-1]))
+                return;
+            if (at != hits->end() && isSamePoint(hit, *at)) {
+                *at = hit;
+            } else if (!isFull()) {
+                hits->insert(at, hit);
+            } else if (at != hits->end()) {
+                std::move_backward(at, hits->end() - 1, hits->end());
+                *at = hit;
+            }
+        }
+        bool isFull() const { return hits->size() == most; }
+
+        static bool isSamePoint(const Hit& a, const Hit& b) { return a.t == b.t && a.geometry == b.geometry; }
+        static bool isBefore(const Hit& a, const Hit& b)
+        {
+            return a.t != b.t                 ? a.t < b.t
+                   : a.geometry != b.geometry ? a.geometry < b.geometry
+                                              : a.primitive < b.primitive;
         }
     };
 
@@ -218,6 +242,15 @@ private:
         return dot(a + ab * u + ac * v - o, d) / dot(d, d);
     }
 
+    static Vec3 colorAt(const BrickMesh& part, const Triangle& triangle, double u, double v)
+    {
+        const std::vector<Vec3>& colors = part.mesh.colors;
+        if (colors.empty())
+            return part.color;
+        return Vec3(Vec3d(colors[triangle[0]]) * (1 - u - v) + Vec3d(colors[triangle[1]]) * u
+                    + Vec3d(colors[triangle[2]]) * v);
+    }
+
     // Notes the hit and rejects it, so that Embree goes on to the next one.
     static void onTriangle(const RTCFilterFunctionNArguments* arguments)
     {
@@ -237,7 +270,7 @@ private:
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];
         hit.normal = Vec3(normalize(normal));
-        hit.color = part.color;
+        hit.color = colorAt(part, triangle, u, v);
         query.keep(distance, hit);
     }
 
@@ -288,7 +321,7 @@ private:
         bounds.upper_z = sphere.center.z + radius;
     }
 
-    // Only where the ray enters; tells Embree nothing, so that it goes on.
+    // Only where the ray enters; tells Embree of no hit, so that it goes on.
     static void onSphere(const RTCIntersectFunctionNArguments* arguments)
     {
         if (arguments->valid[0] == 0)
@@ -310,6 +343,10 @@ private:
         hit.normal = Vec3(normalize(d * t - toCenter));
         hit.color = sphere.color;
         query.keep(t, hit);
+        if (query.mayEnd && query.isFull()) { // with room for the rounding of Embree's boxes
+            float& farthest = RTCRayN_tfar(RTCRayHitN_RayN(arguments->rayhit, arguments->N), arguments->N, 0);
+            farthest = std::min(farthest, 1.00001f * query.hits->back().t);
+        }
     }
 
     Box cell_;

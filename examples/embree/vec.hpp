@@ -140,6 +140,12 @@ inline Box intersection(const Box& a, const Box& b)
     return box;
 }
 
+// What a camera looks at.
+struct Focus {
+    Box box;
+    float radius = 0; // of the ball around the box's centre that holds all there is to see
+};
+
 // splitmix64: a hash of 64 bits to 64 bits.
 inline std::uint64_t hash64(std::uint64_t x)
 {

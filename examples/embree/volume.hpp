@@ -49,15 +49,25 @@ struct VolumeInfo {
     Index3 dims{};
     VoxelType type = VoxelType::UInt8;
     float minimum = 0, maximum = 255; // mapped to 0 and 1
+    std::uint64_t notFinite = 0;      // voxels, which count as the minimum
 };
 
 // Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
 using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* out)>;
 
+// Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
+struct VisibleVoxels {
+    std::vector<Vec3> points; // the ends of rows, in voxels
+    int slack = 0;            // how many voxels beyond these the lattice leaves out
+};
+
 struct VolumeSource {
     VolumeInfo info;
     std::function<RowReader()> open; // each call gives a reader of its own
-    std::optional<Box> visible;      // visibleBounds(), if they are known
+    std::string name;                // of the file
+    // If they are known; the second only if there are no visible points.
+    std::optional<VisibleVoxels> visible;
+    std::optional<std::array<float, 2>> range;
 };
 
 // ---- files -----------------------------------------------------------------------------------------------------
@@ -106,10 +116,11 @@ inline VolumeInfo parseVolumeName(const std::string& path)
 
 namespace detail {
 
-// Widens [lo, hi] to the finite values of `count` voxels.
+// Widens [lo, hi] to the finite values of `count` voxels. Returns how many are not finite.
 template <class T>
-void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
+std::size_t growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
 {
+    std::size_t notFinite = 0;
     for (std::size_t i = 0; i < count; ++i) {
         T value;
         std::memcpy(&value, bytes + i * sizeof(T), sizeof(T));
@@ -117,8 +128,11 @@ void growRange(const std::byte* bytes, std::size_t count, float& lo, float& hi)
         if (std::isfinite(f)) {
             lo = std::min(lo, f);
             hi = std::max(hi, f);
+        } else {
+            ++notFinite;
         }
     }
+    return notFinite;
 }
 
 } // namespace detail
@@ -142,12 +156,37 @@ inline VolumeInfo checkVolume(std::istream& stream, const std::string& path)
     return info;
 }
 
-// The least and the greatest of the finite values of voxels [begin, end), in file order; infinity and minus infinity
-// if there are none. Adds what it reads to `bytesRead`.
-inline std::pair<float, float> rangeOf(std::istream& stream, const std::string& path, VoxelType type,
-                                       std::uint64_t begin, std::uint64_t end, std::uint64_t& bytesRead)
-{
+// The least and the greatest of the finite values of some voxels; infinity and minus infinity if there are none.
+struct VoxelRange {
     float lo = std::numeric_limits<float>::infinity(), hi = -lo;
+    std::uint64_t notFinite = 0;
+
+    void grow(VoxelType type, const std::byte* bytes, std::size_t count)
+    {
+        if (type == VoxelType::UInt8)
+            detail::growRange<std::uint8_t>(bytes, count, lo, hi);
+        else if (type == VoxelType::UInt16)
+            detail::growRange<std::uint16_t>(bytes, count, lo, hi);
+        else
+            notFinite += detail::growRange<float>(bytes, count, lo, hi);
+    }
+    static VoxelRange of(const std::vector<VoxelRange>& ranges)
+    {
+        VoxelRange all;
+        for (const VoxelRange& range : ranges) {
+            all.lo = std::min(all.lo, range.lo);
+            all.hi = std::max(all.hi, range.hi);
+            all.notFinite += range.notFinite;
+        }
+        return all;
+    }
+};
+
+// Of voxels [begin, end), in file order. Adds what it reads to `bytesRead`.
+inline VoxelRange scanVoxels(std::istream& stream, const std::string& path, VoxelType type, std::uint64_t begin,
+                             std::uint64_t end, std::uint64_t& bytesRead)
+{
+    VoxelRange range;
     const std::size_t size = voxelBytes(type), most = std::size_t{1} << 20;
     std::vector<std::byte> chunk;
     stream.seekg(static_cast<std::streamoff>(begin * size));
@@ -156,16 +195,11 @@ inline std::pair<float, float> rangeOf(std::istream& stream, const std::string& 
         chunk.resize(count * size);
         if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(chunk.size())))
             throw std::runtime_error(path + ": reading failed after " + std::to_string(begin * size) + " bytes");
-        if (type == VoxelType::UInt8)
-            detail::growRange<std::uint8_t>(chunk.data(), count, lo, hi);
-        else if (type == VoxelType::UInt16)
-            detail::growRange<std::uint16_t>(chunk.data(), count, lo, hi);
-        else
-            detail::growRange<float>(chunk.data(), count, lo, hi);
+        range.grow(type, chunk.data(), count);
         begin += count;
         bytesRead += chunk.size();
     }
-    return {lo, hi};
+    return range;
 }
 
 // Collective: checkVolume() of this rank's own stream, and the range, of which each rank looks at a share of the
@@ -173,17 +207,18 @@ inline std::pair<float, float> rangeOf(std::istream& stream, const std::string& 
 inline VolumeInfo describeVolume(std::istream& stream, const std::string& path, const Loaders& loaders = {})
 {
     VolumeInfo info;
-    const std::vector<float> range = loaders.leastOf(2, [&] {
+    const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
         info = checkVolume(stream, path);
         if (info.type == VoxelType::UInt8)
-            return std::vector<float>{0, -255};
+            return std::vector<VoxelRange>{{0, 255, 0}};
         const auto [begin, end] =
             loaders.shareOf(static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
                             * static_cast<std::uint64_t>(info.dims[2]));
-        const auto [lo, hi] = rangeOf(stream, path, info.type, begin, end, *loaders.readCounter());
-        return std::vector<float>{lo, -hi};
-    });
-    const float lo = range[0], hi = -range[1];
+        return std::vector<VoxelRange>{
+            scanVoxels(stream, path, info.type, begin, end, *loaders.readCounter())};
+    }));
+    const float lo = range.lo, hi = range.hi;
+    info.notFinite = range.notFinite;
     if (lo > hi)
         throw std::runtime_error(path + ": not one of its voxels is finite");
     info.minimum = lo < 0 && hi > 0 ? 0 : lo;
@@ -226,13 +261,11 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
     };
 }
 
-// The box, in voxels, of what stands out from the background, as far as a lattice of about 64^3 of its voxels shows
-// it: to point a camera. The whole domain if nothing does. Collective: each rank reads a share of the rows. Throws
-// std::runtime_error, the same on all ranks.
-inline Box visibleBounds(const VolumeSource& source, const Loaders& loaders = {})
+// Collective: each rank reads a share of the rows. Throws std::runtime_error, the same on all ranks.
+inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& loaders = {})
 {
     const VolumeInfo& info = source.info;
-    const float threshold = 0.1f;
+    const float threshold = info.minimum + 0.1f * (info.maximum - info.minimum);
     std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
     const auto value = [&](int x) {
         const auto as = [&](auto voxel) {
@@ -244,39 +277,52 @@ inline Box visibleBounds(const VolumeSource& source, const Loaders& loaders = {}
                                                 : as(float{});
     };
     const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
-    const auto rows = [&](std::size_t axis) { return 1 + (info.dims[axis] - 1) / stride(axis); };
-    const float none = std::numeric_limits<float>::infinity();
-    const std::vector<float> sides = loaders.leastOf(6, [&] {
+    const auto rows = [&](std::size_t axis) {
+        return static_cast<std::uint64_t>(1 + (info.dims[axis] - 1) / stride(axis));
+    };
+    VisibleVoxels visible;
+    visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
+    visible.points = loaders.gatherOf<Vec3>([&] {
         const RowReader read = source.open();
-        std::vector<float> least(6, none); // of the coordinates, and of their negatives
-        const auto [begin, end] =
-            loaders.shareOf(static_cast<std::uint64_t>(rows(1)) * static_cast<std::uint64_t>(rows(2)));
+        std::vector<Vec3> points;
+        const auto [begin, end] = loaders.shareOf(rows(1) * rows(2));
         for (std::uint64_t i = begin; i < end; ++i) {
-            const int y = static_cast<int>(i % static_cast<std::uint64_t>(rows(1))) * stride(1);
-            const int z = static_cast<int>(i / static_cast<std::uint64_t>(rows(1))) * stride(2);
+            const int y = static_cast<int>(i % rows(1)) * stride(1), z = static_cast<int>(i / rows(1)) * stride(2);
             read(0, info.dims[0], y, z, row.data());
+            int first = -1, last = -1;
             for (int x = 0; x < info.dims[0]; x += stride(0))
-                if ((value(x) - info.minimum) > threshold * (info.maximum - info.minimum)) {
-                    const std::array<float, 3> p{static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)};
-                    for (std::size_t axis = 0; axis < 3; ++axis) {
-                        least[axis] = std::min(least[axis], p[axis]);
-                        least[axis + 3] = std::min(least[axis + 3], -p[axis]);
-                    }
+                if (value(x) > threshold) {
+                    first = first < 0 ? x : first;
+                    last = x;
                 }
+            for (const int x : {first, last})
+                if (x >= 0)
+                    points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
         }
-        return least;
+        return points;
     });
-    Box box;
-    if (sides[0] < none) {
-        box.grow({sides[0], sides[1], sides[2]});
-        box.grow({-sides[3], -sides[4], -sides[5]});
-    }
-    if (box.empty()) {
-        box.grow({0, 0, 0});
-        box.grow({static_cast<float>(info.dims[0] - 1), static_cast<float>(info.dims[1] - 1),
-                  static_cast<float>(info.dims[2] - 1)});
-    }
-    return box;
+    return visible;
+}
+
+// Collective: the least and the greatest of all voxels, of which each rank reads a share. Throws std::runtime_error,
+// the same on all ranks.
+inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& loaders = {})
+{
+    const VoxelRange all = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
+        const VolumeInfo& info = source.info;
+        const RowReader read = source.open();
+        const std::size_t count = static_cast<std::size_t>(info.dims[0]);
+        std::vector<std::byte> row(count * voxelBytes(info.type));
+        VoxelRange range;
+        const auto rows = static_cast<std::uint64_t>(info.dims[1]);
+        const auto [begin, end] = loaders.shareOf(rows * static_cast<std::uint64_t>(info.dims[2]));
+        for (std::uint64_t i = begin; i < end; ++i) {
+            read(0, info.dims[0], static_cast<int>(i % rows), static_cast<int>(i / rows), row.data());
+            range.grow(info.type, row.data(), count);
+        }
+        return std::vector<VoxelRange>{range};
+    }));
+    return {all.lo, all.hi};
 }
 
 // Collective: the ranks share what has to be known of the whole volume. Throws std::runtime_error, the same on all
@@ -291,11 +337,14 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
         return stream; // one that is not open is a stream that cannot be read
     };
     VolumeSource source;
+    source.name = path;
     source.info = describeVolume(*open(), path, loaders);
     source.open = [open, path, info = source.info, counter = loaders.readCounter()] {
         return rowReader(open(), path, info, counter);
     };
-    source.visible = visibleBounds(source, loaders);
+    source.visible = visibleVoxels(source, loaders);
+    if (source.visible->points.empty())
+        source.range = rangeOf(source, loaders);
     return source;
 }
 

@@ -9,6 +9,7 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
 #include <memory>
 #include <mutex>
 #include <new>
@@ -16,6 +17,20 @@
 #include <vector>
 
 namespace dfb {
+
+// There is no memory for what was asked for: what() says how many bytes that were, and what for.
+class OutOfMemory final : public std::bad_alloc {
+public:
+    // No more than 150 characters of the purpose are kept: there may be no memory for a text either.
+    OutOfMemory(std::size_t byteCount, const char* purpose) noexcept
+    {
+        std::snprintf(text_, sizeof text_, "no memory for %zu bytes: %.150s", byteCount, purpose);
+    }
+    const char* what() const noexcept override { return text_; }
+
+private:
+    char text_[200];
+};
 
 // Where a block goes when its Buffer ends. From any thread.
 class BlockOwner {
@@ -114,7 +129,7 @@ public:
                     ::operator delete (block, std::align_val_t{alignment});
     }
 
-    // A block of at least `byteCount` bytes, not cleared. Throws std::bad_alloc.
+    // A block of at least `byteCount` bytes, not cleared. Throws OutOfMemory.
     Buffer acquire(std::size_t byteCount)
     {
         const int c = classOf(byteCount);
@@ -136,7 +151,7 @@ public:
         if (!block && shared)
             block = shared->take(bytesOf(c));
         if (!block)
-            block = static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
+            block = fromSystem(c);
         return Buffer(shared_from_this(), block, byteCount, c);
     }
 
@@ -198,8 +213,20 @@ private:
         while (c < classCount && bytesOf(c) < byteCount)
             ++c;
         if (c == classCount)
-            throw std::bad_alloc();
+            throw OutOfMemory(byteCount, "a block");
         return c;
+    }
+
+    std::byte* fromSystem(int c)
+    {
+        try {
+            return static_cast<std::byte*>(::operator new (bytesOf(c), std::align_val_t{alignment}));
+        } catch (const std::bad_alloc&) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            --classes_[static_cast<std::size_t>(c)].blocks;
+            heldBytes_ -= bytesOf(c);
+            throw OutOfMemory(bytesOf(c), "a block");
+        }
     }
 
     // A block that was lent and is back, or null. Does not look for it for long.

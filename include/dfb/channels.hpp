@@ -9,17 +9,29 @@ namespace dfb {
 
 // A set of channels, one bit each. Unless a tile operation says otherwise, the inputs of a pixel are blended front to
 // back, and channel by channel as said here; a mean over passes is one of the blended passes.
+//
+// A pixel of an input is there if its colour or alpha is not 0. Else nothing of it counts, whatever its other channels
+// hold. One with colour and alpha 0 is emission: the colour adds, hides nothing, and gives no depth, position or id.
+//
+// Other is DepthComposite, and any operation that says activeByDepth (tile_op.hpp): there a pixel is there if its depth
+// is below +infinity, and gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
 // Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
 inline constexpr ChannelMask depthChannel = 2;
 // Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they
 // come out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
+//
+// Position and ids are those of the front input: of the inputs with alpha > 0 the first in the order in which they are
+// blended, be that by (depth, source, part) or the order that OrderedBlend is told; an id is that of the first that has
+// one. Of several passes the one counts where that input is nearest, of equally near ones, or where inputs have no
+// depth, the first. For that depth travels if the image has one of these channels, even if it has no depth; with a
+// single pass, and an operation that needs none for itself, it does not.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
-inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the input that gives the depth
-inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the nearest input with alpha > 0 that has one
+inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the front input; else 0
+inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the front input that has one; else noId
 inline constexpr ChannelMask instanceIdChannel = 64;  // the same
 // How far back the input reaches, 1 float in the units of depth: the interval [depth, far] holds all that was blended
 // into the pixel. It is compared, never blended and no part of an image.
@@ -37,6 +49,8 @@ namespace detail {
 
 inline constexpr int channelCount = 8;
 inline constexpr int channelWords[channelCount] = {4, 1, 3, 3, 3, 1, 1, 1}; // of 4 bytes
+inline constexpr const char* channelNames[channelCount] = {"colour",   "depth",        "normal",      "albedo",
+                                                           "position", "primitive id", "instance id", "far depth"};
 enum Channel : std::size_t { Color, Depth, Normal, Albedo, Position, PrimitiveId, InstanceId, Far };
 
 constexpr bool hasChannel(ChannelMask channels, std::size_t channel) noexcept { return (channels >> channel) & 1; }

@@ -23,18 +23,28 @@
 
 namespace dfb {
 
-// An id, and the depth of the layer that it comes from.
-struct NearestId {
+// An id, and the depth of the layer that it comes from; 0 where layers have none.
+struct FrontId {
     std::uint32_t id = noId;
-    float depth = std::numeric_limits<float>::infinity();
+    float depth = 0;
+
+    bool isThere() const noexcept { return id != noId; }
+};
+
+// The same for a position. No depth of a layer is NaN.
+struct FrontPosition {
+    float at[3] = {0, 0, 0};
+    float depth = std::numeric_limits<float>::quiet_NaN();
+
+    bool isThere() const noexcept { return depth == depth; }
 };
 
 // The auxiliary channels of a row of pixels, or of a tile's pixels; of each only if it is wanted. See channels.hpp.
 struct AuxPixels {
     std::vector<double> normal, albedo; // 3 a pixel, premultiplied
     std::vector<double> weight;         // of those two: the alpha without the background
-    std::vector<float> position;        // 3 a pixel
-    std::vector<NearestId> primitiveId, instanceId;
+    std::vector<FrontPosition> position;
+    std::vector<FrontId> primitiveId, instanceId;
 
     void reset(std::size_t pixels, ChannelMask wanted)
     {
@@ -42,7 +52,7 @@ struct AuxPixels {
         normal.assign(count(normalChannel, 3), 0.0);
         albedo.assign(count(albedoChannel, 3), 0.0);
         weight.assign(count(normalChannel | albedoChannel, 1), 0.0);
-        position.assign(count(positionChannel, 3), 0.0f);
+        position.assign(count(positionChannel, 1), {});
         primitiveId.assign(count(primitiveIdChannel, 1), {});
         instanceId.assign(count(instanceIdChannel, 1), {});
     }
@@ -59,7 +69,6 @@ struct CompositeRow {
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
-    bool countTies = false;                // equal depths make a pixel undefined
     double minTransmittance = 0;           // what lets less through counts as opaque
     bool wantsDepth = true;                // else `depth` is empty
     bool wantsGaps = true;                 // else what no layer covers need not be cleared
@@ -77,7 +86,7 @@ struct CompositeRow {
         depth.resize(wantsDepth ? pixels : 0);
         aux.reset(pixels, wanted);
         reach.assign(wanted & farChannel ? pixels : 0, -std::numeric_limits<float>::infinity());
-        isUndefined.assign(wanted & farChannel || countTies ? pixels : 0, 0);
+        isUndefined.assign(wanted & farChannel ? pixels : 0, 0);
     }
 
     // Pixels [x, x + count): nothing yet.
@@ -155,9 +164,11 @@ inline bool closeOpaque(CompositeRow& row, int x, int count)
 }
 
 // The same for the auxiliary channels that `row` has; to be called before over(), of which it needs what was there
-// before. `aux`: of the first pixel.
-inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux)
+// before. `aux`: of the first pixel. `anyAlpha`: pixels with alpha 0 have position and ids as well.
+inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux,
+                    bool anyAlpha = false)
 {
+    const auto counts = [&](int i) { return anyAlpha || layer.color[4 * i + 3] > 0.0f; };
     const auto first = static_cast<std::size_t>(x);
     const auto blend = [&](std::vector<double>& to, const std::byte* plane) {
         if (to.empty() || !plane)
@@ -169,28 +180,25 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     };
     blend(row.aux.normal, aux.at[detail::Normal]);
     blend(row.aux.albedo, aux.at[detail::Albedo]);
-    const auto isNearest = [&](int i) { // of those whose alpha counts
-        return layer.color[4 * i + 3] > 0.0f && layer.depth
-               && layer.depth[i] < row.depth[first + static_cast<std::size_t>(i)];
-    };
+    const auto depthOf = [&](int i) { return layer.depth ? layer.depth[i] : 0.0f; };
     if (!row.aux.position.empty() && aux.at[detail::Position]) {
         const float* from = detail::floatsOf(aux.at[detail::Position]);
+        FrontPosition* to = row.aux.position.data() + first;
         for (int i = 0; i < count; ++i)
-            if (isNearest(i))
-                std::copy_n(from + 3 * i, 3, row.aux.position.data() + 3 * (first + static_cast<std::size_t>(i)));
+            if (!to[i].isThere() && counts(i))
+                to[i] = {{from[3 * i], from[3 * i + 1], from[3 * i + 2]}, depthOf(i)};
     }
-    const auto takeId = [&](std::vector<NearestId>& to, const std::byte* plane) {
-        if (to.empty() || !plane)
+    const auto takeIds = [&](std::vector<FrontId>& ids, const std::byte* plane) {
+        if (ids.empty() || !plane)
             return;
         const std::uint32_t* from = detail::idsOf(plane);
-        for (int i = 0; i < count; ++i) {
-            NearestId& id = to[first + static_cast<std::size_t>(i)];
-            if (id.id == noId && from[i] != noId && layer.color[4 * i + 3] > 0.0f)
-                id = {from[i], layer.depth ? layer.depth[i] : 0.0f};
-        }
+        FrontId* to = ids.data() + first;
+        for (int i = 0; i < count; ++i)
+            if (!to[i].isThere() && from[i] != noId && counts(i))
+                to[i] = {from[i], depthOf(i)};
     };
-    takeId(row.aux.primitiveId, aux.at[detail::PrimitiveId]);
-    takeId(row.aux.instanceId, aux.at[detail::InstanceId]);
+    takeIds(row.aux.primitiveId, aux.at[detail::PrimitiveId]);
+    takeIds(row.aux.instanceId, aux.at[detail::InstanceId]);
     if (row.reach.empty() || !aux.at[detail::Far] || !layer.depth)
         return;
     const float* farDepth = detail::floatsOf(aux.at[detail::Far]);
@@ -343,19 +351,6 @@ inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vec
         order[k] = static_cast<int>(orders[k][3]);
 }
 
-// Marks pixels [begin, end), in which the layers have this order, where some have equal depths.
-inline void countTies(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
-                      const std::vector<int>& order)
-{
-    for (std::size_t i = 1; i < order.size(); ++i)
-        for (int p = begin; p < end; ++p) {
-            const float depth = layers[static_cast<std::size_t>(order[i])].depth[p];
-            if (depth == layers[static_cast<std::size_t>(order[i - 1])].depth[p]
-                && depth < std::numeric_limits<float>::infinity())
-                row.isUndefined[static_cast<std::size_t>(x + p)] = 1;
-        }
-}
-
 // Layers 0, 1, 2 and so on.
 inline void resetOrder(std::vector<int>& order, std::size_t count)
 {
@@ -380,7 +375,7 @@ inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vec
                              std::vector<int>& order)
 {
     const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(SortNetwork::mostLayers)
-                         && !layers.front().aux && row.rgbaLow.empty() && !row.countTies;
+                         && !layers.front().aux && row.rgbaLow.empty();
     // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
     for (int begin = 0; begin < count;) {
         int end = firstOutOfOrder(layers, order, begin, count);
@@ -394,8 +389,6 @@ inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vec
             sortAt(begin, layers, order);
             end = firstOutOfOrder(layers, order, begin + 1, count);
         }
-        if (row.countTies)
-            countTies(row, x, begin, end, layers, order);
         blend(row, x, begin, end, layers, order);
         begin = end;
     }
@@ -421,27 +414,22 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
 }
 
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well: something is there.
+// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids: something is
+// there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     row.clear(x, count);
     for (int i = 0; i < count; ++i) {
         const Layer* nearest = nullptr;
-        bool isTie = false;
-        for (const Layer& layer : layers) {
-            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i])) {
+        for (const Layer& layer : layers)
+            if (!nearest || (layer.depth && layer.depth[i] < nearest->depth[i]))
                 nearest = &layer;
-                isTie = false;
-            } else {
-                isTie = isTie || (layer.depth && layer.depth[i] == nearest->depth[i]);
-            }
-        }
-        if (row.countTies && isTie)
-            row.isUndefined[static_cast<std::size_t>(x + i)] = 1;
         const Layer l = nearest->from(i);
         if (l.aux)
-            overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)));
+            overAux(row, x + i, 1, l, l.aux->from(static_cast<std::size_t>(i)), true);
         over(row, x + i, 1, l);
+        if (row.wantsDepth && l.depth)
+            row.depth[static_cast<std::size_t>(x + i)] = *l.depth;
     }
 }
 

@@ -18,6 +18,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <string_view>
@@ -73,13 +74,13 @@ template <class Transport = MpiTransport>
 class DisplayWall final : private detail::MessageHandler {
 public:
     // Collective, in the same order as the framebuffers of the messenger. `format`: of the displays' images. Throws
-    // InvalidArgument on all ranks if the layout is none, or is not the same on all.
+    // InvalidArgument on all ranks if the layout is none, is not the same on all, or some rank has no memory for it.
     DisplayWall(std::shared_ptr<Messenger<Transport>> messenger, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20)
         : layout_(layout), format_(format), pool_(messenger->pool())
     {
         if (!executor)
-            executor = std::make_shared<ThreadExecutor>();
+            executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
         const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
         detail::MessageHandler& self = *this;
         messaging_ = std::make_unique<detail::Messaging<Transport>>(std::move(messenger), std::move(executor),
@@ -88,15 +89,18 @@ public:
         detail::Agreement mine{true, describe(), messaging_->rank()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
             mine = {false, wrong};
+        else
+            try {
+                takeMemory();
+            } catch (const std::exception& e) { // the others must not wait for this rank
+                mine = {false, "rank " + std::to_string(messaging_->rank()) + ": " + e.what()};
+            }
         const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
         if (!all.fine) {
             messaging_->stop();
             messaging_.reset();
             throw InvalidArgument(all.text);
         }
-        for (int d = 0; d < layout_.displayCount(); ++d)
-            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank())
-                shown_.emplace(d, Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0));
     }
 
     DisplayWall(const DisplayWall&) = delete;
@@ -123,6 +127,7 @@ public:
     // allReduce() does. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
+        messaging_->requireProgress();
         messaging_->messenger().expectMessages(true);
         bool complete = true;
         std::string missing;
@@ -143,6 +148,8 @@ public:
         if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
             for (auto& [display, picture] : *done->second)
                 std::swap(shown_.at(display), picture.image);
+        if (all.fine)
+            shownFrame_ = frame;
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
         last_ = frame;
         if (isMalformed(missing) && frame >= errorFrame_)
@@ -156,7 +163,9 @@ public:
         }
     }
 
-    // What this rank's display shows: the last finished frame. Throws InvalidArgument if another rank drives it.
+    // What this rank's display shows: the last frame that was finished well, which stays until the next one is. Empty
+    // before the first. Throws InvalidArgument if another rank drives it. By the thread that calls finish(), as the
+    // next.
     const Image& image(int display) const
     {
         const auto found = shown_.find(display);
@@ -164,6 +173,9 @@ public:
             throw InvalidArgument("display " + std::to_string(display) + " is not driven by this rank");
         return found->second;
     }
+
+    // Which frame all displays show, as in FrameReport::frame; the same on all ranks. -1 before the first.
+    std::int64_t imageFrame() const noexcept { return shownFrame_; }
 
     // Called by ToWall, from any thread.
     void put(const PixelTile& tile)
@@ -245,6 +257,19 @@ private:
         return "";
     }
 
+    // The displays of this rank, with nothing to show, and memory for the images that each of them will have, which it
+    // leaves in the pool.
+    void takeMemory()
+    {
+        std::vector<Image> images;
+        for (int d = 0; d < layout_.displayCount(); ++d)
+            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank()) {
+                shown_.emplace(d, Image());
+                for (int i = 0; i < 2; ++i)
+                    images.emplace_back(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0);
+            }
+    }
+
     void incoming(int source, const detail::MessageHeader& header, Buffer&& message) override
     {
         const std::size_t byteCount = message.size();
@@ -268,6 +293,11 @@ private:
                 refuse(source, e.info(), header.number);
             else // it may have been one that finish() waits for
                 messaging_->giveUp(source, e.info());
+        } catch (const std::bad_alloc& e) { // for more frames than one
+            ErrorInfo info;
+            info.kind = ErrorKind::Transport;
+            info.message = e.what();
+            messaging_->giveUp(source, info);
         }
     }
 
@@ -415,7 +445,8 @@ private:
     WallLayout layout_;
     OutputFormat format_;
     std::shared_ptr<MemoryPool> pool_;
-    std::map<int, Image> shown_; // of this rank's displays; made with the wall, changed in finish()
+    std::map<int, Image> shown_; // of this rank's displays; changed in finish(), as the next
+    std::int64_t shownFrame_ = -1;
 
     std::mutex mutex_;
     std::map<std::int64_t, std::shared_ptr<Pictures>> coming_; // by frame; under mutex_, but for the pixels

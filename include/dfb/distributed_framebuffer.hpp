@@ -83,16 +83,14 @@ public:
         // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
 
-        // Only with FrameParams::declared: each rank says once which inputs of generation 1 it will send, in each pass;
-        // children that these announce need no declaration; it may say so after it sent some. A rank without any calls
-        // it with none. An input that turns out empty must be sent all the same; it costs a header. Waits for nothing.
-        // Throws InvalidArgument for a tile outside the image, or if no declaration is wanted (see declarationKey).
+        // Only with FrameParams::declared: each rank says once in each frame which inputs of generation 1 it will send,
+        // in each pass; children that these announce need no declaration; it may say so after it sent some. A rank
+        // without any calls it with none. An input that turns out empty must be sent all the same; it costs a header.
+        // A rank that declares what it declared last sends nothing for it, but for its part of a reduction; otherwise
+        // it tells the owners that it touches or touched, as far as it is news to them. Waits for nothing. Throws
+        // InvalidArgument, with nothing declared, for a tile outside the image, a second time in a frame, and in a
+        // frame that was not begun so; without it, the frame fails in end().
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
-        bool wantsDeclaration() const noexcept { return engine_->wantsDeclaration(); }
-
-        // For a rendering loop to keep what it has declared its inputs from: it stays there as long as the declaration
-        // holds (see FrameParams::declarationKey) and is empty in the first frame of each.
-        std::any& declaredFrom() const noexcept { return engine_->declaredFrom(); }
 
         // For a rendering loop to keep memory in that it needs in each frame: what it leaves there, a later frame finds
         // there, unless another loop has come between.
@@ -121,6 +119,24 @@ public:
         // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
         bool failed() const noexcept { return engine_->failed(); }
 
+        // Calls body(), as what a loop of your own does between begin() and end(), or one tile of it. An exception of
+        // it goes to abort() and no further, so that end() throws FrameError with its text on all ranks, this one
+        // included: whoever calls this calls end() as well, whatever becomes of it. False if there was one. From any
+        // thread, on one rank or all; waits for no other rank. Without it an exception that ends the frame's scope
+        // tells the other ranks only that the frame was left.
+        template <class Body>
+        bool guard(const Body& body)
+        {
+            return guardAbout(body, nullptr);
+        }
+        // The same for body() that renders `tile`: the error names it, and with FrameParams::allowPartial the frame
+        // goes on without it alone. Its number is looked at when there is an exception.
+        template <class Body>
+        bool guard(const Body& body, const TileHeader& tile)
+        {
+            return guardAbout(body, &tile);
+        }
+
         // Makes the frame fail on all ranks, with the text of this exception; with FrameParams::allowPartial it goes on
         // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
         // will name it. From any thread.
@@ -134,9 +150,11 @@ public:
         // Collective; for several framebuffers, in the same order on all ranks. Waits until all tiles of all ranks are
         // finished and the image is complete on the display rank, or the frame has failed. Throws FrameError, the same
         // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
-        // begin the next.
+        // begin the next. Throws InvalidArgument on a thread that may not call MPI (see Progress): the frame is still
+        // open then.
         FrameReport end()
         {
+            engine_->requireProgress();
             isOpen_ = false;
             const FrameReport report = engine_->end();
             fb_->lastEnded_ = engine_;
@@ -144,6 +162,18 @@ public:
         }
 
     private:
+        template <class Body>
+        bool guardAbout(const Body& body, const TileHeader* tile)
+        {
+            try {
+                body();
+                return true;
+            } catch (...) {
+                abort(std::current_exception(), tile ? tile->tile : -1);
+                return false;
+            }
+        }
+
         friend class DistributedFrameBuffer;
         Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
         DistributedFrameBuffer* fb_;
@@ -155,11 +185,15 @@ public:
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
-        : DistributedFrameBuffer(
-            std::make_shared<Messenger<Transport>>(
-                communicator, MessengerOptions{config.progress, config.checksums, config.sharedMemory,
-                                               config.peerTimeoutMs, config.onPeerLost}),
-            config, std::move(pixelOp)) // not moved: the options may be made of it afterwards
+        : DistributedFrameBuffer(communicator, std::move(config), MessengerOptions(), std::move(pixelOp))
+    {
+    }
+
+    // The same with a messenger made with these options, for this framebuffer alone.
+    DistributedFrameBuffer(const Communicator& communicator, Config config, MessengerOptions options,
+                           PixelOp pixelOp = {})
+        : DistributedFrameBuffer(std::make_shared<Messenger<Transport>>(communicator, std::move(options)),
+                                 std::move(config), std::move(pixelOp))
     {
     }
 
@@ -167,7 +201,7 @@ public:
     DistributedFrameBuffer(std::shared_ptr<Messenger<Transport>> messenger, Config config, PixelOp pixelOp = {})
     {
         if (!config.executor)
-            config.executor = std::make_shared<ThreadExecutor>();
+            config.executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
         try {
             for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
                 engines_.push_back(std::make_unique<Engine>(messenger, config, pixelOp, slot));
@@ -195,11 +229,17 @@ public:
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well; valid until as many begin() as there may be
-    // frames in flight. Empty elsewhere.
+    // On the display rank: the image of the last frame that ended well or partial. It is there until that frame's
+    // memory is needed again: until as many begin() after the frame's own as there may be frames in flight. After that,
+    // and before the first such frame, it is empty, as it always is elsewhere. By the thread that begins and ends
+    // frames, as the next two.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
-    // On the display rank: false if the last frame ended without that tile, see FrameParams::allowPartial.
+    // Which frame image() is of, as in FrameReport::frame; -1 if it is empty.
+    std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
+
+    // On the display rank: whether image() has that tile. It has all of a frame that ended well, see
+    // FrameParams::allowPartial.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // With Progress::Caller, moves messages, unless on a thread that may not be in MPI; with an executor that has no

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/detail/fifo.hpp>
+#include <dfb/processors.hpp>
 #include <dfb/version.hpp>
 
 #include <atomic>
@@ -121,13 +122,12 @@ private:
 // A fixed number of threads. The destructor runs what was submitted, then joins.
 class ThreadExecutor final : public Executor {
 public:
-    // `threadCount` workers; 0: one per hardware thread.
+    // `threadCount` workers; 0: one for each processor that the calling thread may run on. Where several ranks share
+    // them, that is too many: see Messenger::threadShare().
     explicit ThreadExecutor(int threadCount = 0)
     {
         if (threadCount <= 0)
-            threadCount = static_cast<int>(std::thread::hardware_concurrency());
-        if (threadCount <= 0)
-            threadCount = 1;
+            threadCount = Processors::ofThisThread().count();
         threads_.reserve(static_cast<std::size_t>(threadCount));
         for (int i = 0; i < threadCount; ++i)
             threads_.emplace_back([this] { work(); });

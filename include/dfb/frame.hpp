@@ -3,7 +3,6 @@
 
 #include <dfb/channels.hpp>
 #include <dfb/comm/compression.hpp>
-#include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
@@ -13,7 +12,6 @@
 #include <array>
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <memory>
 #include <optional>
 #include <vector>
@@ -34,8 +32,8 @@ enum class CompressionMode : std::uint8_t {
          // messages become smaller by it, as each rank finds out by itself
 };
 
-// What a framebuffer is made with. Everything but executor, progress, sharedMemory, peerTimeoutMs and onPeerLost must
-// be the same on all ranks, as must the types of its operations, which is checked when it is made.
+// What a framebuffer is made with; how its messages travel is said by the MessengerOptions. Everything but the executor
+// must be the same on all ranks, as must the types of its operations, which is checked when it is made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
@@ -47,7 +45,8 @@ struct FrameBufferConfig {
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
     std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
     CompressionMode compression = CompressionMode::Always;
-    // How exactly inputs travel: a WireFormat, an ErrorBudget, or all of it. Finished tiles travel in `format`.
+    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or all of it; what else they have travels as
+    // it is. Finished tiles travel in `format`.
     WirePrecision wire{};
     // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
     // left out. That changes it by no more than this times the largest colour.
@@ -56,18 +55,9 @@ struct FrameBufferConfig {
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
     std::size_t messagePoolBytes = std::size_t{64} << 20;
-    // Null: a ThreadExecutor with one thread per core. A CallerExecutor makes no threads.
+    // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see Messenger::threadShare().
+    // A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
-    // Of the messenger; a framebuffer that is given one goes by that one's.
-    Progress progress = Progress::Thread;
-    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
-    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
-    // 0, or 100 and more: a rank of which nothing has been heard for so long, in a frame or a call that waits for all
-    // ranks, is lost, and the job ends with an error that names it, or onPeerLost says what else; see MessengerOptions.
-    // And what is waited for, at most, that a message which could not be read may have been; in a frame without a
-    // time-out 0 is no limit.
-    int peerTimeoutMs = defaultPeerTimeoutMs;
-    std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.
@@ -79,21 +69,23 @@ using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 // What a frame begins with; the same on all ranks, which is checked in the verdict.
 struct FrameParams {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
-    int passes = 1;                              // samples a pixel, each a pass
+    // Samples a pixel, each a pass. With a tile operation that keepsState they are those that follow the last frame's,
+    // see accumulationId; with any other, from 0 on.
+    int passes = 1;
     // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile
     // operation that keepsState may a tile have none or not begin with sample 0.
     SamplePlan samples;
     // For an ErrorBudget: no pixel has more inputs than this in a pass; 0: not known, taken for 65536. Loops that know
     // better say so themselves.
     int maxLayers = 0;
-    std::uint64_t accumulationId = 0; // for operations that keepState: another one makes them forget
+    // For tile operations that keepState (Progressive): frames with the same id accumulate, and the image is the mean
+    // of all their samples, whatever they show. Take another one when camera, scene or background change: then the
+    // samples of each tile begin with 0 again. They do so too after a frame that failed or was partial, and without
+    // `samples` after a frame with them.
+    std::uint64_t accumulationId = 0;
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
-    // True: each rank says with Frame::declare() what it will send, and owners count on that.
+    // True: each rank says with Frame::declare() what it will send, and owners count on that. Loops set it themselves.
     bool declared = false;
-    // Not 0 and the same as in the last frame, which succeeded: what was declared then still holds, and declare() must
-    // not be called, nor is it looked up again which tiles the bricks project to. Change it when bricks or camera
-    // change.
-    std::uint64_t declarationKey = 0;
     // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
     // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
     // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks.
@@ -129,6 +121,10 @@ struct FrameReport {
     double renderMs = 0;              // begin() to the call of end(), this rank
     double compositingOverheadMs = 0; // the call of end() to its return, this rank
     double renderMsMax = 0;           // all: the longest renderMs
+    // This rank: who moved its messages. Caller: the calls of its user. Thread: a thread of the library's own, or,
+    // where ranks are threads, whoever sent them.
+    Progress progress = Progress::Thread;
+    int threads = 1; // this rank: workers of its executor
     // All: message bytes to other ranks, without the transport's own, and what owners have put into the image of the
     // display rank themselves.
     std::int64_t bytesSent = 0;
@@ -141,7 +137,9 @@ struct FrameReport {
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained
-    double wireErrorBound = 0; // all: how far a pixel may be off for WirePrecision and minTransmittance, from what came
+    // All: how far colour and alpha of a pixel may be off for WirePrecision and minTransmittance, from what came. Neither
+    // changes depth, positions and ids.
+    double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: sums of what Frame::addFigure() was given, by key

@@ -11,6 +11,9 @@
 #include <algorithm>
 #include <array>
 #include <cstdint>
+#include <cstdio>
+#include <new>
+#include <numeric>
 #include <string>
 
 namespace dfb {
@@ -43,6 +46,17 @@ enum class OutputFormat : std::uint32_t {
     SRGBA8, // 8 bits a channel, colour through the sRGB curve (IEC 61966-2-1), alpha linear
     RGBA32F // 32-bit float, linear
 };
+
+inline const char* nameOf(OutputFormat format) noexcept
+{
+    switch (format) {
+    case OutputFormat::None: return "None";
+    case OutputFormat::RGBA8: return "RGBA8";
+    case OutputFormat::SRGBA8: return "SRGBA8";
+    case OutputFormat::RGBA32F: return "RGBA32F";
+    }
+    return "unknown";
+}
 
 inline std::size_t bytesPerPixel(OutputFormat format) noexcept
 {
@@ -94,16 +108,27 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
 class Image {
 public:
     Image() = default;
-    // `channels`: beside the colour.
+    // `channels`: beside the colour. Throws OutOfMemory, with the bytes of the whole image.
     Image(MemoryPool& pool, int width, int height, OutputFormat format, ChannelMask channels)
         : width_(width), height_(height), format_(format)
     {
         if (format == OutputFormat::None)
             return;
-        planes_[detail::Color] = pool.acquire(pixelCount() * bytesPerPixel(format));
+        std::array<std::size_t, detail::channelCount> bytes{}; // of a pixel
+        bytes[detail::Color] = bytesPerPixel(format);
         for (std::size_t c = detail::Depth; c < detail::channelCount; ++c)
-            if (detail::hasChannel(channels, c))
-                planes_[c] = pool.acquire(pixelCount() * 4 * static_cast<std::size_t>(detail::channelWords[c]));
+            bytes[c] = detail::hasChannel(channels, c) ? 4 * static_cast<std::size_t>(detail::channelWords[c]) : 0;
+        try {
+            for (std::size_t c = 0; c < detail::channelCount; ++c)
+                if (bytes[c] > 0)
+                    planes_[c] = pool.acquire(pixelCount() * bytes[c]);
+        } catch (const std::bad_alloc&) {
+            const std::size_t pixelBytes = std::accumulate(bytes.begin(), bytes.end(), std::size_t{0});
+            char text[150];
+            std::snprintf(text, sizeof text, "an image of %dx%d pixels of %zu bytes (%s%s)", width, height, pixelBytes,
+                          nameOf(format), pixelBytes > bytes[detail::Color] ? " and more channels" : "");
+            throw OutOfMemory(pixelCount() * pixelBytes, text);
+        }
     }
 
     int width() const noexcept { return width_; }
@@ -161,7 +186,8 @@ private:
     {
         if (!condition || empty())
             throw InvalidArgument(std::string("this image has no ") + what
-                                  + " (only the display rank has an image, in the format it was configured for)");
+                                  + " (only the display rank has an image, in the format it was configured for, and "
+                                    "after a frame that ended well)");
     }
 
     const std::byte* plane(detail::Channel channel, const char* what) const

@@ -12,14 +12,21 @@
 // Optional:
 //   static constexpr int tileSize;               pixels a side, 8 to 256; default 64
 //   static constexpr ChannelMask neededChannels; what must travel even if the output does not have it;
-//                                                default: all of `channels`
+//                                                default: all of `channels`. Depth travels as well where positions
+//                                                or ids of several passes are compared, see channels.hpp
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
+//   static constexpr bool activeByDepth = true;  a pixel of an input is there if it has a depth below +infinity,
+//                                                whatever its colour; depth must be among neededChannels. Else it is
+//                                                there if one of its four colour channels is not 0, whatever its
+//                                                depth. Only what is there travels and comes to add()
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
 //   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
 //                                                isComplete() does not wait for them: nobody need render them
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
-//                                                in a frame, and the image keeps its pixels
+//                                                in a frame, and the image keeps its pixels. TileInfo says which
+//                                                samples come; those of a tile without inputs before, in frames that
+//                                                it was not asked in, are TileInfo::emptySamples
 //   static constexpr bool emptyIsBackground = true;   out of inputs without any pixel it makes the background: then it
 //                                                need not be asked, and nothing travels
 //   void report(TileReport&) const;              after finish(): figures of the tile
@@ -47,9 +54,9 @@ struct TileInfo {
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
+    int emptySamples = 0;                        // those before it, if there was nothing in any: they are background
     std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
     float minTransmittance = 0;                  // what lets less through counts as opaque
-    bool depthIsRounded = false;                 // equal depths need not have been equal
     ChannelMask wanted = 0;                      // what the image has beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
 };
@@ -153,10 +160,14 @@ public:
     std::int64_t writtenPixels() const noexcept { return writtenPixels_; }
 
     // What setRow() has made of a row; null if the colour is not wanted.
-    const std::byte* colorRow(int y) const noexcept
+    const std::byte* colorRow(int y) const noexcept { return rowOf(detail::Color, bytesPerPixel(format_), y); }
+    // The same of depth, and of the auxiliary channels.
+    const float* depthRow(int y) const noexcept { return detail::floatsOf(rowOf(detail::Depth, y)); }
+    AuxRow auxRow(int y) const noexcept
     {
-        const std::byte* first = to_.at[detail::Color];
-        return first ? first + static_cast<std::size_t>(y) * stride_ * bytesPerPixel(format_) : nullptr;
+        return {detail::floatsOf(rowOf(detail::Normal, y)), detail::floatsOf(rowOf(detail::Albedo, y)),
+                detail::floatsOf(rowOf(detail::Position, y)), detail::idsOf(rowOf(detail::PrimitiveId, y)),
+                detail::idsOf(rowOf(detail::InstanceId, y))};
     }
 
     // For 8-bit formats, after setRow(): another level for value i in [0, 4 * width()) of row y.
@@ -167,6 +178,16 @@ public:
     }
 
 private:
+    const std::byte* rowOf(std::size_t channel, std::size_t pixelBytes, int y) const noexcept
+    {
+        const std::byte* first = to_.at[channel];
+        return first ? first + static_cast<std::size_t>(y) * stride_ * pixelBytes : nullptr;
+    }
+    const std::byte* rowOf(std::size_t channel, int y) const noexcept
+    {
+        return rowOf(channel, 4 * static_cast<std::size_t>(detail::channelWords[channel]), y);
+    }
+
     std::size_t pixelAt(int x, int y) const
     {
         return static_cast<std::size_t>(y) * stride_ + static_cast<std::size_t>(x);
@@ -204,10 +225,8 @@ private:
 
 // What a TileOp says of a tile that it has finished, if it has a member report().
 struct TileReport {
-    double error = -1; // how far the tile's pixels may be off, in units of colour; < 0: not known
-    // Whose inputs overlap in depth, so that no order of them is right, or have equal depths that were rounded, so that
-    // it is not known.
-    std::int64_t orderUndefinedPixels = 0;
+    double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
+    std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
 };
 
 struct NoFrameData {};
@@ -279,6 +298,13 @@ struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<
 };
 
 template <class T, class = void>
+struct ActiveByDepth : std::false_type {
+};
+template <class T>
+struct ActiveByDepth<T, std::void_t<decltype(T::activeByDepth)>> : std::bool_constant<T::activeByDepth> {
+};
+
+template <class T, class = void>
 struct EmptyIsBackground : std::false_type {
 };
 template <class T>
@@ -336,6 +362,9 @@ constexpr bool checkTileOp()
                   "or void newFrame(const TileInfo&, const FrameData&)");
     static_assert(HasAdd<T>::value, "dfb: TileOp must provide void add(Fragment&&)");
     static_assert(HasFinish<T>::value, "dfb: TileOp must provide void finish(FinishedTile&)");
+    if constexpr (ActiveByDepth<T>::value)
+        static_assert((T::channels & NeededChannelsOf<T>::value & depthChannel) != 0,
+                      "dfb: a TileOp with activeByDepth must have depthChannel in channels and neededChannels");
     return is_tile_op_v<T>;
 }
 

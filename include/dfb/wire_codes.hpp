@@ -37,28 +37,10 @@ inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) no
     return (a & mask) | (b & ~mask);
 }
 
-// To the nearest binary16, ties to even; what is too large is infinity. NaN stays one.
-inline std::uint16_t toHalf(float value) noexcept
-{
-    const std::uint32_t bits = bitsOf(value), sign = bits >> 16 & 0x8000u, magnitude = bits & 0x7fffffffu;
-    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
-    const std::uint32_t small = bitsOf(floatOf(magnitude) + 0.5f) - 0x3f000000u;
-    const std::uint32_t normal = (magnitude + 0xc8000fffu + (magnitude >> 13 & 1u)) >> 13;
-    const std::uint32_t large = choose(magnitude > 0x7f800000u, 0x7e00u, 0x7c00u);
-    const std::uint32_t finite = choose(magnitude < 0x38800000u, small, normal);
-    return static_cast<std::uint16_t>(sign | choose(magnitude >= 0x47800000u, large, finite));
-}
-
-inline float fromHalf(std::uint16_t half) noexcept
-{
-    const std::uint32_t sign = static_cast<std::uint32_t>(half & 0x8000u) << 16, rest = half & 0x7fffu;
-    const float finite = floatOf(rest << 13) * 0x1p112f; // exact
-    return floatOf(sign | choose(rest >= 0x7c00u, 0x7f800000u | rest << 13, bitsOf(finite)));
-}
-
-// The same for numbers from 0 to 65504, which takes less.
+// To the nearest binary16, ties to even, of numbers from 0 to 65504.
 inline std::uint16_t positiveToHalf(float value) noexcept
 {
+    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
     const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
     const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
     return static_cast<std::uint16_t>(choose(static_cast<std::int32_t>(bits) < 0x38800000, small, normal));
@@ -89,41 +71,9 @@ struct UnormCode {
 using Unorm16Code = UnormCode<std::uint16_t>;
 using Unorm8Code = UnormCode<std::uint8_t>;
 
-// How a depth travels.
-struct HalfDepth {
-    using Word = std::uint16_t;
-    Word of(float depth) const noexcept { return toHalf(depth); }
-    float depthOf(Word code) const noexcept { return fromHalf(code); }
-};
-// As a place between two depths, of which there are all but one code; that one is infinity.
-template <class Unsigned>
-struct UnormDepth {
-    using Word = Unsigned;
-    static constexpr std::uint32_t last = std::numeric_limits<Word>::max() - 1;
-    float first, range;
-
-    Word of(float depth) const noexcept
-    {
-        // Clamped as integers: bits of positive floats are in their order, and those of negative ones negative.
-        const auto place = static_cast<std::int32_t>(bitsOf((depth - first) / range));
-        const std::int32_t clamped = std::min(std::max(place, 0), 0x3f800000);
-        const std::uint32_t code =
-            nearestInteger(floatOf(static_cast<std::uint32_t>(clamped)) * static_cast<float>(last));
-        return static_cast<Word>(choose(bitsOf(depth) == 0x7f800000u, last + 1, code));
-    }
-    float depthOf(Word code) const noexcept
-    {
-        const float depth = first + range * (static_cast<float>(code) / static_cast<float>(last));
-        return floatOf(choose(code > last, 0x7f800000u, bitsOf(depth)));
-    }
-};
-
-using Unorm16Depth = UnormDepth<std::uint16_t>;
-using Unorm8Depth = UnormDepth<std::uint8_t>;
-
-// What the channels of a pixel are multiplied by.
+// What the channels of a pixel are multiplied by, and the least alpha that comes out of decoding.
 struct WireScales {
-    float color, alpha;
+    float color, alpha, leastAlpha = 0;
 };
 
 // Rows in plain C++. What bytes are made of or make goes through `words`: bytes could alias anything.
@@ -148,7 +98,7 @@ DFB_INLINE void encodePixels(const float* rgba, int count, const WireScales& by,
 template <class Code>
 DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
 {
-    const float scales[4] = {by.color, by.color, by.color, by.alpha};
+    const float scales[4] = {by.color, by.color, by.color, by.alpha}, least[4] = {0, 0, 0, by.leastAlpha};
     typename Code::Word words[wireBlock];
     std::uint16_t above = 0; // in its highest bit
     for (int first = 0; first < 4 * count; first += wireBlock) {
@@ -157,40 +107,12 @@ DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& b
                     sizeof words[0] * static_cast<std::size_t>(size));
         for (int i = 0; i < size; i += 4)
             for (int c = 0; c < 4; ++c)
-                rgba[first + i + c] = Code::valueOf(words[i + c]) * scales[c];
+                rgba[first + i + c] = std::max(Code::valueOf(words[i + c]) * scales[c], least[c]);
         if constexpr (std::is_same_v<Code, HalfCode>)
             for (int i = 0; i < size; ++i) // by itself, so that both are vectorized
                 above = static_cast<std::uint16_t>(above | words[i] | (words[i] + (0x7fff - Code::most)));
     }
     return above < 0x8000;
-}
-
-template <class Code>
-DFB_INLINE void encodeDepths(const float* depth, int count, const Code& code, std::byte* out) noexcept
-{
-    const Code local = code;
-    typename Code::Word words[wireBlock];
-    for (int first = 0; first < count; first += wireBlock) {
-        const int size = std::min(wireBlock, count - first);
-        for (int i = 0; i < size; ++i)
-            words[i] = local.of(depth[first + i]);
-        std::memcpy(out + sizeof words[0] * static_cast<std::size_t>(first), words,
-                    sizeof words[0] * static_cast<std::size_t>(size));
-    }
-}
-
-template <class Code>
-DFB_INLINE void decodeDepths(const std::byte* in, int count, const Code& code, float* depth) noexcept
-{
-    const Code local = code;
-    typename Code::Word words[wireBlock];
-    for (int first = 0; first < count; first += wireBlock) {
-        const int size = std::min(wireBlock, count - first);
-        std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
-                    sizeof words[0] * static_cast<std::size_t>(size));
-        for (int i = 0; i < size; ++i)
-            depth[first + i] = local.depthOf(words[i]);
-    }
 }
 
 // Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
@@ -209,9 +131,10 @@ DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) n
 // The same with AVX2 and F16C: as many at a time as there are whole blocks, and the rest as above.
 #if defined(DFB_HAS_AVX2_CLONES)
 constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
-DFB_AVX2_F16C inline __m256 wireVector(const WireScales& by) noexcept
+// Of two pixels.
+DFB_AVX2_F16C inline __m256 wireVector(float color, float alpha) noexcept
 {
-    return _mm256_setr_ps(by.color, by.color, by.color, by.alpha, by.color, by.color, by.color, by.alpha);
+    return _mm256_setr_ps(color, color, color, alpha, color, color, color, alpha);
 }
 #endif
 
@@ -221,7 +144,7 @@ DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const W
     constexpr std::size_t wordBytes = sizeof(typename Code::Word);
     int i = 0;
 #if defined(DFB_HAS_AVX2_CLONES)
-    const __m256 scales = wireVector(by), zero = _mm256_setzero_ps();
+    const __m256 scales = wireVector(by.color, by.alpha), zero = _mm256_setzero_ps();
     for (; i + 8 <= count; i += 8) {
         __m256 scaled[4];
         for (int part = 0; part < 4; ++part)
@@ -256,14 +179,15 @@ DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const
     int i = 0;
     bool inRange = true;
 #if defined(DFB_HAS_AVX2_CLONES)
-    const __m256 scales = wireVector(by);
+    const __m256 scales = wireVector(by.color, by.alpha), least = wireVector(0, by.leastAlpha);
     if constexpr (std::is_same_v<Code, HalfCode>) {
         __m128i largest[2] = {};
         for (; i + 4 <= count; i += 4) // two at a time would be slower for the comparison
             for (int part = 0; part < 2; ++part) {
                 const __m128i codes = _mm_loadu_si128(reinterpret_cast<const __m128i*>(in + 8 * i) + part);
                 largest[part] = _mm_max_epu16(largest[part], codes);
-                _mm256_storeu_ps(rgba + 4 * i + 8 * part, _mm256_mul_ps(_mm256_cvtph_ps(codes), scales));
+                _mm256_storeu_ps(rgba + 4 * i + 8 * part,
+                                 _mm256_max_ps(_mm256_mul_ps(_mm256_cvtph_ps(codes), scales), least));
             }
         const __m128i all = _mm_max_epu16(largest[0], largest[1]), most = _mm_set1_epi16(HalfCode::most);
         inRange = _mm_movemask_epi8(_mm_cmpeq_epi16(_mm_max_epu16(all, most), most)) == 0xffff;
@@ -272,37 +196,11 @@ DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const
             const auto* from = reinterpret_cast<const __m128i*>(in + 4 * wordBytes * static_cast<std::size_t>(i));
             const __m256i codes = wordBytes == 2 ? _mm256_cvtepu16_epi32(_mm_loadu_si128(from))
                                                  : _mm256_cvtepu8_epi32(_mm_loadl_epi64(from));
-            _mm256_storeu_ps(rgba + 4 * i, _mm256_mul_ps(_mm256_cvtepi32_ps(codes), scales));
+            _mm256_storeu_ps(rgba + 4 * i, _mm256_max_ps(_mm256_mul_ps(_mm256_cvtepi32_ps(codes), scales), least));
         }
     }
 #endif
     return decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i) && inRange;
-}
-
-template <class Code>
-DFB_AVX2_F16C inline void encodeDepthsAvx2(const float* depth, int count, const Code& code, std::byte* out) noexcept
-{
-    int i = 0;
-#if defined(DFB_HAS_AVX2_CLONES)
-    if constexpr (std::is_same_v<Code, HalfDepth>)
-        for (; i + 8 <= count; i += 8)
-            _mm_storeu_si128(reinterpret_cast<__m128i*>(out + 2 * static_cast<std::size_t>(i)),
-                             _mm256_cvtps_ph(_mm256_loadu_ps(depth + i), toNearest));
-#endif
-    encodeDepths(depth + i, count - i, code, out + sizeof(typename Code::Word) * static_cast<std::size_t>(i));
-}
-
-template <class Code>
-DFB_AVX2_F16C inline void decodeDepthsAvx2(const std::byte* in, int count, const Code& code, float* depth) noexcept
-{
-    int i = 0;
-#if defined(DFB_HAS_AVX2_CLONES)
-    if constexpr (std::is_same_v<Code, HalfDepth>)
-        for (; i + 8 <= count; i += 8)
-            _mm256_storeu_ps(depth + i, _mm256_cvtph_ps(_mm_loadu_si128(
-                                            reinterpret_cast<const __m128i*>(in + 2 * static_cast<std::size_t>(i)))));
-#endif
-    decodeDepths(in + sizeof(typename Code::Word) * static_cast<std::size_t>(i), count - i, code, depth + i);
 }
 
 DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept

@@ -1,5 +1,10 @@
-// Wire formats: how exactly colour and depth travel, what that costs in accuracy, and the choice of the cheapest that
-// keeps an error budget.
+// Wire formats: how exactly the colour of inputs travels, what that costs in accuracy, and the choice of the cheapest
+// that keeps an error budget.
+//
+// Which channels are rounded: colour and alpha, and the bound is for these. All others travel as they are. Depth,
+// positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0
+// counts for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with
+// their rounded alphas, so that the mean is off by what the weights are off.
 //
 // The bound. A pixel is C = sum_j T_j c_j, with T_j the product of 1 - a_i over the layers i in front of j, the last
 // layer being the background. Rounded, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones one
@@ -35,8 +40,8 @@ enum class WireFormat : std::uint8_t {
     Unorm8
 };
 
-// An error of the float image, before it is converted to its output format, that may be made: the greatest absolute
-// difference of a channel to what it would be with Float32.
+// An error of the float image's colour and alpha, before they are converted to the output format, that may be made: the
+// greatest absolute difference of one of the four to what it would be with Float32.
 struct ErrorBudget {
     double error = 0;
     float maxColor = 1; // see WirePrecision
@@ -54,16 +59,11 @@ struct WirePrecision {
     {
     }
 
-    // An alpha that is rounded to 0 no longer counts for the image's depth.
-    WireFormat color = WireFormat::Float32;
-    double budget = 0; // above 0: in place of `color`
+    WireFormat color = WireFormat::Float32; // and alpha
+    double budget = 0;                      // above 0: in place of `color`
     // Colours that occur, as a renderer would give them before it multiplies by alpha: each channel is within
     // [0, maxColor * alpha]. A tile of which that is not true, such as emission or HDR, travels as Float32.
     float maxColor = 1;
-    // Rounding keeps the order of depths, but may make different ones equal; pixels in which that could matter are
-    // counted in FrameReport::orderUndefinedPixels. The image's depth is rounded as well. Never chosen by the budget.
-    WireFormat depth = WireFormat::Float32;
-    float depthNear = 0, depthFar = 1; // of the Unorm formats; depths outside become these, infinity stays
 };
 
 namespace detail {
@@ -73,17 +73,18 @@ inline std::size_t bytesOf(WireFormat format) noexcept
     return format == WireFormat::Float32 ? 4 : format == WireFormat::Unorm8 ? 1 : 2;
 }
 
-// Converts colour and depth of one framebuffer's fragments.
+// What all fragments of a framebuffer have in common: which pixels they have, and how their colours are converted.
 class WireCoder {
 public:
     WireCoder() = default;
-    explicit WireCoder(const WirePrecision& precision)
-        : depth_(precision.depth), maxColor_(precision.maxColor), near_(precision.depthNear), far_(precision.depthFar),
+    // `activeByDepth`: of the tile operation.
+    explicit WireCoder(const WirePrecision& precision, bool activeByDepth = false)
+        : activeByDepth_(activeByDepth), maxColor_(precision.maxColor),
           scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
     {
     }
 
-    WireFormat depth() const noexcept { return depth_; }
+    bool activeByDepth() const noexcept { return activeByDepth_; }
 
     // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept
@@ -106,13 +107,15 @@ public:
         case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
         }
     }
-    // False if there is a code that encodeColor() does not make.
+    // An alpha of 0 becomes leastAlpha: it was above 0, as pixels of alpha 0 that are in range have no colour, and
+    // those do not travel; by depth they do, and stay as they are. False if there is a code that encodeColor() does not
+    // make.
     bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
     {
         const auto decode = [&](auto code, float colorScale, float alphaScale) {
             using Code = decltype(code);
             const auto pixels = static_cast<int>(count);
-            const WireScales by{colorScale, alphaScale};
+            const WireScales by{colorScale, alphaScale, activeByDepth_ ? 0.0f : leastAlpha};
             return cpuHasF16c() ? decodePixelsAvx2<Code>(in, pixels, by, rgba)
                                 : decodePixels<Code>(in, pixels, by, rgba);
         };
@@ -125,36 +128,12 @@ public:
         return true;
     }
 
-    // Not NaN. The order of two depths stays, or they become equal.
-    void encodeDepth(WireFormat format, const float* depth, int count, std::byte* out) const
-    {
-        const auto encode = [&](const auto& code) {
-            cpuHasF16c() ? encodeDepthsAvx2(depth, count, code, out) : encodeDepths(depth, count, code, out);
-        };
-        switch (format) {
-        case WireFormat::Float32: std::memcpy(out, depth, sizeof(float) * static_cast<std::size_t>(count)); return;
-        case WireFormat::Float16: encode(HalfDepth()); return;
-        case WireFormat::Unorm16: encode(Unorm16Depth{near_, far_ - near_}); return;
-        case WireFormat::Unorm8: encode(Unorm8Depth{near_, far_ - near_}); return;
-        }
-    }
-    void decodeDepth(WireFormat format, const std::byte* in, std::size_t count, float* depth) const
-    {
-        const auto decode = [&](const auto& code) {
-            const auto values = static_cast<int>(count);
-            cpuHasF16c() ? decodeDepthsAvx2(in, values, code, depth) : decodeDepths(in, values, code, depth);
-        };
-        switch (format) {
-        case WireFormat::Float32: std::memcpy(depth, in, sizeof(float) * count); return;
-        case WireFormat::Float16: decode(HalfDepth()); return;
-        case WireFormat::Unorm16: decode(Unorm16Depth{near_, far_ - near_}); return;
-        case WireFormat::Unorm8: decode(Unorm8Depth{near_, far_ - near_}); return;
-        }
-    }
+    // Not 0, less than the least alpha that has a code of its own, and nothing beside what may be off.
+    static constexpr float leastAlpha = 0x1p-100f;
 
 private:
-    WireFormat depth_ = WireFormat::Float32;
-    float maxColor_ = 1, near_ = 0, far_ = 1;
+    bool activeByDepth_ = false;
+    float maxColor_ = 1;
     float scale_ = 0x1p14f; // Float16: a power of two that brings maxColor to [2^14, 2^15]
 };
 

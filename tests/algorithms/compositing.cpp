@@ -5,3 +5,4 @@
 template algorithms::Result algorithms::inProcess<algorithms::AuxChannels>(int);
 template algorithms::Result algorithms::inProcess<algorithms::AuxImageParallel>(int);
 template algorithms::Result algorithms::inProcess<algorithms::Nearest>(int);
+template algorithms::Result algorithms::inProcess<algorithms::BlackInFront>(int);

@@ -17,18 +17,13 @@ using dfb::testing::Exact;
 
 // ---- auxiliary channels ----------------------------------------------------------------------------------------
 
-struct AuxSample {
-    std::array<float, 3> normal{}, albedo{}, position{};
-    std::uint32_t primitive = dfb::noId, instance = dfb::noId;
-};
-
 // What a sample of the scene has beside colour and depth.
-inline AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
+inline dfb::testing::AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample, int pass, int x, int y)
 {
     const std::uint64_t h = scene::mix(scene::mix(s.seed * 77 + sample.source) + static_cast<std::uint64_t>(pass) * 7919
                                        + static_cast<std::uint64_t>(y) * 65536 + static_cast<std::uint64_t>(x));
     const auto part = [h](int shift) { return static_cast<float>((h >> shift) & 0xff) / 128.0f - 1.0f; };
-    AuxSample a;
+    dfb::testing::AuxSample a;
     for (std::size_t c = 0; c < 3; ++c) {
         const int shift = static_cast<int>(8 * c);
         a.normal[c] = sample.rgba[3] * part(shift);
@@ -36,66 +31,9 @@ inline AuxSample auxOf(const scene::Scene& s, const dfb::testing::Sample& sample
         a.position[c] = 10.0f * part(shift + 8);
     }
     if (h % 3 != 0) // a volume has none
-        a.primitive = static_cast<std::uint32_t>(h >> 40);
-    a.instance = sample.source;
+        a.primitiveId = static_cast<std::uint32_t>(h >> 40);
+    a.instanceId = sample.source;
     return a;
-}
-
-struct AuxPixel {
-    std::array<Exact, 3> normal{}, albedo{};
-    Exact weight = 0;
-    float depth = std::numeric_limits<float>::infinity();
-    std::array<float, 3> position{};
-    std::uint32_t primitive = dfb::noId, instance = dfb::noId;
-};
-
-// Pixel by pixel, by the rules of channels.hpp.
-inline AuxPixel auxReference(const scene::Scene& s, int x, int y)
-{
-    AuxPixel p;
-    float primitiveDepth = 0, instanceDepth = 0;
-    for (int pass = 0; pass < s.passes; ++pass) {
-        std::vector<dfb::testing::Sample> samples;
-        for (const dfb::Brick& brick : s.bricks)
-            if (const auto sample = sampleOf(s, brick, pass, x, y))
-                samples.push_back(*sample);
-        std::sort(samples.begin(), samples.end(), [](const auto& a, const auto& b) {
-            return std::tie(a.depth, a.source) < std::tie(b.depth, b.source);
-        });
-        Exact through = 1;
-        bool hasPrimitive = false, hasInstance = false;
-        for (const auto& sample : samples) {
-            const AuxSample a = auxOf(s, sample, pass, x, y);
-            const float alpha = sample.rgba[3];
-            for (std::size_t c = 0; c < 3; ++c) {
-                p.normal[c] += through * static_cast<Exact>(a.normal[c]);
-                p.albedo[c] += through * static_cast<Exact>(a.albedo[c]);
-            }
-            p.weight += through * static_cast<Exact>(alpha);
-            through *= 1 - static_cast<Exact>(alpha);
-            if (!(alpha > 0))
-                continue;
-            if (sample.depth < p.depth) {
-                p.depth = sample.depth;
-                p.position = a.position;
-            }
-            if (a.primitive != dfb::noId && !hasPrimitive) {
-                hasPrimitive = true;
-                if (p.primitive == dfb::noId || sample.depth < primitiveDepth) {
-                    p.primitive = a.primitive;
-                    primitiveDepth = sample.depth;
-                }
-            }
-            if (!hasInstance) {
-                hasInstance = true;
-                if (p.instance == dfb::noId || sample.depth < instanceDepth) {
-                    p.instance = a.instance;
-                    instanceDepth = sample.depth;
-                }
-            }
-        }
-    }
-    return p;
 }
 
 template <class Tile>
@@ -105,40 +43,32 @@ void renderWithAux(const scene::Scene& s, const dfb::Brick& brick, Tile& tile)
     for (int y = tile.region.y0; y < tile.region.y1; ++y)
         for (int x = tile.region.x0; x < tile.region.x1; ++x)
             if (const auto sample = sampleOf(s, brick, tile.pass, x, y)) {
-                const AuxSample a = auxOf(s, *sample, tile.pass, x, y);
+                const dfb::testing::AuxSample a = auxOf(s, *sample, tile.pass, x, y);
                 const int i = (y - tile.region.y0) * Tile::size + x - tile.region.x0;
                 std::copy(a.normal.begin(), a.normal.end(), tile.normal + 3 * i);
                 std::copy(a.albedo.begin(), a.albedo.end(), tile.albedo + 3 * i);
                 std::copy(a.position.begin(), a.position.end(), tile.position + 3 * i);
-                tile.primitiveId[i] = a.primitive;
-                tile.instanceId[i] = a.instance;
+                tile.primitiveId[i] = a.primitiveId;
+                tile.instanceId[i] = a.instanceId;
             }
 }
 
-// Values of the image that are off.
+// Values of the auxiliary channels of an image that are off.
 inline std::size_t wrongAux(const scene::Scene& s, const dfb::Image& image)
 {
+    const auto expected =
+        referenceOf(s, [&](auto& sample, int pass, int x, int y) { sample.aux = auxOf(s, sample, pass, x, y); });
     std::size_t wrong = 0;
-    for (int y = 0; y < s.height; ++y)
-        for (int x = 0; x < s.width; ++x) {
-            const auto i =
-                static_cast<std::size_t>(y) * static_cast<std::size_t>(s.width) + static_cast<std::size_t>(x);
-            const AuxPixel p = auxReference(s, x, y);
-            for (std::size_t c = 0; c < 3; ++c) {
-                // Normals have either sign: what cancels is off by the rounding of what was summed.
-                const auto expected = [&](Exact sum) {
-                    return p.weight > 0 ? static_cast<double>(sum / p.weight) : 0.0;
-                };
-                const auto off = [](float got, double want) {
-                    return !(std::fabs(static_cast<double>(got) - want) <= 1e-12 + 0x1p-24 * std::fabs(want));
-                };
-                wrong += off(image.normal()[3 * i + c], expected(p.normal[c]));
-                wrong += off(image.albedo()[3 * i + c], expected(p.albedo[c]));
-                wrong += image.position()[3 * i + c] != p.position[c];
-            }
-            wrong += image.primitiveId()[i] != p.primitive;
-            wrong += image.instanceId()[i] != p.instance;
+    for (std::size_t i = 0; i < expected.size(); ++i) {
+        const dfb::testing::Pixel& p = expected[i];
+        for (std::size_t c = 0; c < 3; ++c) {
+            wrong += dfb::testing::isWrongMean(image.normal()[3 * i + c], p.normal[c], p);
+            wrong += dfb::testing::isWrongMean(image.albedo()[3 * i + c], p.albedo[c], p);
+            wrong += image.position()[3 * i + c] != p.position.value[c];
         }
+        wrong += image.primitiveId()[i] != p.primitiveId.value;
+        wrong += image.instanceId()[i] != p.instanceId.value;
+    }
     return wrong;
 }
 
@@ -147,7 +77,8 @@ inline std::uint64_t hashAux(const dfb::Image& image)
     const std::size_t n = image.pixelCount();
     return dfb::testing::hashOf(image.rgba32f(), 16 * n) ^ 3 * dfb::testing::hashOf(image.normal(), 12 * n)
            ^ 5 * dfb::testing::hashOf(image.albedo(), 12 * n) ^ 7 * dfb::testing::hashOf(image.position(), 12 * n)
-           ^ 9 * dfb::testing::hashOf(image.primitiveId(), 4 * n) ^ 11 * dfb::testing::hashOf(image.instanceId(), 4 * n);
+           ^ 9 * dfb::testing::hashOf(image.primitiveId(), 4 * n)
+           ^ 11 * dfb::testing::hashOf(image.instanceId(), 4 * n);
 }
 
 struct AuxChannels {
@@ -237,15 +168,11 @@ struct Nearest {
             for (int x = 0; x < s.width; ++x) {
                 std::vector<dfb::testing::Pixel> passes;
                 for (int pass = 0; pass < s.passes; ++pass) {
-                    std::vector<dfb::testing::Sample> nearest;
+                    std::vector<dfb::testing::Sample> samples;
                     for (const dfb::Brick& brick : s.bricks)
-                        if (const auto sample = sampleOf(s, brick, pass, x, y)) {
-                            const bool seen = std::any_of(sample->rgba.begin(), sample->rgba.end(),
-                                                          [](float v) { return v != 0.0f; });
-                            if (seen && (nearest.empty() || sample->depth < nearest[0].depth))
-                                nearest = {*sample};
-                        }
-                    passes.push_back(dfb::testing::composite(nearest, s.background));
+                        if (const auto sample = sampleOf(s, brick, pass, x, y))
+                            samples.push_back(*sample);
+                    passes.push_back(dfb::testing::nearest(samples, s.background));
                 }
                 expected.push_back(dfb::testing::mean(passes));
             }
@@ -257,10 +184,150 @@ struct Nearest {
     }
 };
 
+// ---- what has a depth is there, whatever its colour -------------------------------------------------------------
+
+// A surface of black pixels, some of alpha 0, with the ids 0 and none, before a white one. It covers all of some tiles,
+// all alike or not, and spans or single pixels of others; where it is not, it has the colour of a cleared image.
+struct BlackInFront {
+    static constexpr int width = 90, height = 40;
+    static constexpr std::uint32_t front = 20, back = 30;
+    using Op = dfb::BasicDepthComposite<16, dfb::allChannels & ~dfb::farChannel>;
+
+    struct Pixel {
+        std::array<float, 4> rgba{};
+        float depth = std::numeric_limits<float>::infinity();
+        std::array<float, 3> normal{}, position{};
+        std::uint32_t primitive = dfb::noId, instance = dfb::noId;
+    };
+
+    static Pixel pixelOf(std::uint32_t brick, int x, int y)
+    {
+        Pixel p;
+        const bool alike = y / 16 % 2 == 0;
+        if (brick == back) {
+            if (x % 5 != 4)
+                p = {{1, 1, 1, 1}, 2, {0, 0, 1}, {2, 0, 0}, 7, 8};
+            return p;
+        }
+        const bool covers[] = {false, true, x % 7 < 3, (x + y) % 2 == 0, true, x % 16 > 1};
+        if (!covers[x / 16]) {
+            p.rgba = {0.5f, 0.5f, 0.5f, 1};
+            return p;
+        }
+        p.rgba[3] = alike || y % 3 == 0 ? 0.0f : 1.0f;
+        p.depth = 1;
+        p.normal[0] = p.rgba[3];
+        p.position = {1, alike ? 0.0f : static_cast<float>(x), 0};
+        p.primitive = 0;
+        return p;
+    }
+
+    // Of a brick, each as large as the image.
+    struct Planes {
+        std::vector<float> color, depth, normal, albedo, position;
+        std::vector<std::uint32_t> primitive, instance;
+
+        explicit Planes(std::uint32_t brick)
+        {
+            for (int y = 0; y < height; ++y)
+                for (int x = 0; x < width; ++x) {
+                    const Pixel p = pixelOf(brick, x, y);
+                    color.insert(color.end(), p.rgba.begin(), p.rgba.end());
+                    depth.push_back(p.depth);
+                    normal.insert(normal.end(), p.normal.begin(), p.normal.end());
+                    position.insert(position.end(), p.position.begin(), p.position.end());
+                    primitive.push_back(p.primitive);
+                    instance.push_back(p.instance);
+                }
+            albedo.resize(normal.size());
+        }
+    };
+
+    static std::size_t wrongValues(const dfb::Image& image, const std::array<float, 4>& background)
+    {
+        std::size_t wrong = 0;
+        for (int y = 0; y < height; ++y)
+            for (int x = 0; x < width; ++x) {
+                Pixel p = pixelOf(front, x, y);
+                if (!std::isfinite(p.depth))
+                    p = pixelOf(back, x, y);
+                const auto i = static_cast<std::size_t>(y * width + x);
+                for (std::size_t c = 0; c < 4; ++c)
+                    wrong += image.rgba32f()[4 * i + c] != p.rgba[c] + (1 - p.rgba[3]) * background[c];
+                wrong += image.depth()[i] != p.depth;
+                for (std::size_t c = 0; c < 3; ++c) {
+                    wrong += image.normal()[3 * i + c] != p.normal[c];
+                    wrong += image.position()[3 * i + c] != p.position[c];
+                }
+                wrong += image.primitiveId()[i] != p.primitive;
+                wrong += image.instanceId()[i] != p.instance;
+            }
+        return wrong;
+    }
+
+    template <class TileOp, class Transport, class RenderBrick>
+    static void frame(const std::shared_ptr<dfb::Messenger<Transport>>& messenger, dfb::WireFormat format,
+                      const RenderBrick& renderBrick, Result& result)
+    {
+        scene::Scene s;
+        s.width = width, s.height = height;
+        for (const std::uint32_t id : {front, back})
+            s.bricks.push_back({id, {{0, 0, 0}, {width, height, 1}}});
+        auto config = configOf(s, 1);
+        config.wire = format;
+        config.aux = dfb::imageAuxChannels;
+        dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(messenger, config);
+        dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(), renderBrick,
+                                paramsOf(s));
+        if (!fb.isDisplayRank())
+            return;
+        const std::size_t wrong = wrongValues(fb.image(), s.background);
+        result.expect(wrong == 0, std::string(nameOf(format)) + ": " + std::to_string(wrong) + " values");
+        result.hash = result.hash * 31 + hashAux(fb.image());
+    }
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto render = [](const dfb::Brick& b, auto& tile) {
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
+                const Pixel p = pixelOf(b.id, x, y);
+                const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
+                std::copy(p.rgba.begin(), p.rgba.end(), rgba);
+                depth = p.depth;
+                std::copy(p.normal.begin(), p.normal.end(), tile.normal + 3 * i);
+                std::copy(p.position.begin(), p.position.end(), tile.position + 3 * i);
+                tile.primitiveId[i] = p.primitive;
+                tile.instanceId[i] = p.instance;
+            });
+        };
+        const Planes planes[] = {Planes(front), Planes(back)};
+        const auto find = dfb::inPlace([&](const dfb::Brick& b, auto& view) {
+            const Planes& from = planes[b.id == back];
+            const auto at = static_cast<std::size_t>(view.region.y0 * width + view.region.x0);
+            view.stride = width;
+            view.color = &from.color[4 * at], view.depth = &from.depth[at];
+            view.normal = &from.normal[3 * at], view.albedo = &from.albedo[3 * at];
+            view.position = &from.position[3 * at];
+            view.primitiveId = &from.primitive[at], view.instanceId = &from.instance[at];
+        });
+        for (const auto format :
+             {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
+            frame<Op>(messenger, format, render, result);
+            frame<Op>(messenger, format, find, result);
+            frame<dfb::Progressive<Op>>(messenger, format, render, result);
+        }
+        return result;
+    }
+};
+
 // In compositing.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<AuxChannels>(int);
 extern template Result inProcess<AuxImageParallel>(int);
 extern template Result inProcess<Nearest>(int);
+extern template Result inProcess<BlackInFront>(int);
 
 } // namespace algorithms
 
@@ -278,5 +345,10 @@ TEST_CASE("Auxiliary channels come out by their rules, image-parallel, and pixel
 TEST_CASE("DepthComposite keeps the nearest input of each pixel", "[compositing]")
 {
     everywhere<algorithms::Nearest>();
+}
+
+TEST_CASE("DepthComposite takes what has a depth, black or without an id as well", "[compositing]")
+{
+    everywhere<algorithms::BlackInFront>();
 }
 #endif

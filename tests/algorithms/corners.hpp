@@ -720,7 +720,7 @@ struct Corners {
         using namespace corners;
         using Blend = Trapped<dfb::BasicAlphaBlend<32>>;
         using Ordered = Trapped<dfb::BasicOrderedBlend<32>>;
-        using Nearest = Trapped<dfb::BasicDepthComposite<32>>;
+        using Depth = Trapped<dfb::BasicDepthComposite<32>>;
         using Whole = Trapped<dfb::BasicImageParallel<32>>;
         using Accumulated = Trapped<dfb::Progressive<dfb::BasicAlphaBlend<32>>>;
         using Deep = Trapped<dfb::BasicDeepBlend<32>>;
@@ -731,8 +731,8 @@ struct Corners {
         faults<Blend, dfb::NoPixelOp, Transport>(messenger, {Loop::Data, Loop::ByHand, Loop::Mixed},
                                                  BlendRule::SortByDepth, result, count);
         faults<Ordered, dfb::NoPixelOp, Transport>(messenger, {Loop::Ordered}, BlendRule::InOrder, result, count);
-        faults<Nearest, TrappedPixels<true>, Transport>(messenger, {Loop::Data, Loop::ByHand}, BlendRule::Nearest,
-                                                        result, count);
+        faults<Depth, TrappedPixels<true>, Transport>(messenger, {Loop::Data, Loop::ByHand}, BlendRule::Nearest, result,
+                                                      count);
         faults<Whole, TrappedPixels<false>, Transport>(messenger,
                                                        {Loop::ImageOwned, Loop::ImageRoundRobin, Loop::ImageDynamic},
                                                        BlendRule::SortByDepth, result, count);

@@ -80,10 +80,9 @@ struct Mixed {
                 renderedOnce(name + ", round robin");
             }
             dfb::MeasuredCostBricks owner;
-            dfb::FrameParams params = paramsOf(s);
-            params.declarationKey = static_cast<std::uint64_t>(copies);
             for (int frame = 0; frame < 3; ++frame) {
-                const auto report = dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, params);
+                const auto report =
+                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
                 owner.update(report);
                 check(report, name + ", by cost");
                 renderedOnce(name + ", by cost");

@@ -3,3 +3,4 @@
 #include "moving.hpp"
 
 template algorithms::Result algorithms::inProcess<algorithms::MovingBricks>(int);
+template algorithms::Result algorithms::inProcess<algorithms::ChangingDeclarations>(int);

@@ -4,3 +4,4 @@
 
 template algorithms::Result algorithms::inProcess<algorithms::PartialFrames>(int);
 template algorithms::Result algorithms::inProcess<algorithms::CancelledFrames>(int);
+template algorithms::Result algorithms::inProcess<algorithms::ImageOfFrame>(int);

@@ -84,7 +84,7 @@ struct PartialFrames {
             int lost = 0;
             while (dfb::intersection(box, fb.layout().region(lost)).empty())
                 ++lost;
-            constexpr int never = 20000, soon = 2000; // ms; enough for all but what is missing, on a busy machine
+            constexpr int never = 20000, soon = 1000; // ms; enough for all but what is missing, on a busy machine
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
                 params.timeoutMs = timeoutMs;
                 return dfb::renderDataParallel(fb, dfb::World(mine), scene::FlatCamera(), render, params, fails);
@@ -216,20 +216,94 @@ struct CancelledFrames {
     }
 };
 
+// Of which frame the image is, if there is one.
+struct ImageOfFrame {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 3);
+        for (const int inFlight : {1, 2}) {
+            auto config = configOf(s, 2);
+            config.framesInFlight = inFlight;
+            dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+            const bool isAlone = inFlight == 1; // then each frame has the memory of the last one
+            const auto expect = [&](std::int64_t frame, const std::string& when) {
+                const std::int64_t here = fb.isDisplayRank() ? frame : -1;
+                const std::string what = when + ", " + std::to_string(inFlight) + " in flight";
+                result.expect(fb.imageFrame() == here, what + ": the image is of " + std::to_string(fb.imageFrame()));
+                result.expect(fb.image().empty() == (here < 0), what + ": there is an image or not");
+                if (here >= 0) {
+                    const scene::Picture picture(fb.image(), {});
+                    result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": values");
+                    result.hash = picture.hash();
+                }
+            };
+            const auto isThere = [&](const std::string& when) {
+                const std::int64_t frame = renderLoop(fb, s, scene::Loop::Listing3).frame;
+                expect(frame, when);
+                return frame;
+            };
+            expect(-1, "before the first frame");
+            std::int64_t last = isThere("the first");
+            {
+                auto frame = fb.begin(paramsOf(s));
+                expect(isAlone ? -1 : last, "during a frame");
+                sendAll(fb, frame, s, false);
+                if (fb.rank() == fb.size() - 1) // when all but some inputs are there
+                    frame.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
+                sendAll(fb, frame, s, true);
+                const std::string outcome = scene::outcomeOf([&] { frame.end(); });
+                result.expect(scene::has(outcome, "on purpose"), outcome);
+                expect(isAlone ? -1 : last, "after one that failed");
+            }
+            last = isThere("the next");
+            auto wrong = paramsOf(s);
+            wrong.timeoutMs = -1;
+            result.expect(scene::has(scene::outcomeOf([&] { fb.begin(wrong); }), "InvalidArgument"), "no begin()");
+            expect(last, "after a begin() that was refused");
+            {
+                auto frame = fb.begin(paramsOf(s));
+                sendAll(fb, frame, s, false);
+            }
+            expect(isAlone ? -1 : last, "after one that was left");
+            auto partial = paramsOf(s);
+            partial.timeoutMs = 20000;
+            partial.allowPartial = true;
+            auto frame = fb.begin(partial);
+            sendAll(fb, frame, s, false);
+            sendAll(fb, frame, s, true);
+            if (fb.rank() == fb.size() - 1)
+                frame.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
+            const auto report = frame.end();
+            result.expect(report.failure && report.tilesIncomplete == 0, "a failure that costs no tile");
+            expect(report.frame, "after one that is partial");
+            isThere("the last");
+        }
+        return result;
+    }
+};
+
 // In partial.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<PartialFrames>(int);
 extern template Result inProcess<CancelledFrames>(int);
+extern template Result inProcess<ImageOfFrame>(int);
 
 } // namespace algorithms
 
 #if !defined(ALGORITHMS_WITHOUT_TESTS)
 TEST_CASE("A frame that may be partial has all tiles but those that lost something", "[partial]")
 {
-    everywhere<algorithms::PartialFrames>();
+    everywhereAtOnce<algorithms::PartialFrames>();
 }
 
 TEST_CASE("A frame can be cancelled by any rank and thread at any time, and the next is right", "[partial]")
 {
     everywhere<algorithms::CancelledFrames>();
+}
+
+TEST_CASE("There is an image of a frame that ended well, and none of one that failed", "[partial]")
+{
+    everywhere<algorithms::ImageOfFrame>();
 }
 #endif

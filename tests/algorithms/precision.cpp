@@ -3,4 +3,5 @@
 #include "precision.hpp"
 
 template algorithms::Result algorithms::inProcess<algorithms::Precision>(int);
+template algorithms::Result algorithms::inProcess<algorithms::OtherChannels>(int);
 template algorithms::Result algorithms::inProcess<algorithms::NoPrecision>(int);

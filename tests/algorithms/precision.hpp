@@ -4,8 +4,11 @@
 #include "everywhere.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <cstdint>
 #include <memory>
+#include <string>
 #include <vector>
 
 namespace algorithms {
@@ -91,10 +94,70 @@ struct Precision {
             worst =
                 std::max(worst, std::abs(static_cast<double>(lossy.first[i]) - static_cast<double>(emission.first[i])));
         result.expect(worst <= lossy.second.wireErrorBound + 0x1p-23, "emission");
-        dfb::WirePrecision depth;
-        depth.depth = dfb::WireFormat::Unorm8;
-        depth.depthFar = 1000;
-        result.expect(frame(depth, 0, 0, true).second.orderUndefinedPixels > 0, "no depths became equal");
+        return result;
+    }
+};
+
+// What travels beside the colour does not change with its format, however thin a layer is; and where all normals are
+// alike, their mean is that one.
+struct OtherChannels {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Op = dfb::BasicAlphaBlend<16, dfb::allChannels & ~dfb::farChannel>;
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        const std::array<float, 3> normal{0.6f, 0.0f, -0.8f};
+        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        std::vector<float> depth, position;
+        std::vector<std::uint32_t> ids;
+        for (const auto format :
+             {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
+            auto config = configOf(s, 1);
+            config.wire = format;
+            config.aux = dfb::imageAuxChannels;
+            dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(messenger, config);
+            dfb::renderDataParallel(
+                fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
+                [&](const dfb::Brick& b, auto& tile) {
+                    renderInRange(s, b, tile);
+                    tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+                        if (x % 3 == 0) // is rounded to 0, or not
+                            for (int c = 0; c < 4; ++c)
+                                rgba[c] *= x % 2 ? 0x1p-9f : 0x1p-45f;
+                        const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
+                        for (int c = 0; c < 3; ++c) {
+                            tile.normal[3 * i + c] = rgba[3] * normal[static_cast<std::size_t>(c)];
+                            tile.position[3 * i + c] = static_cast<float>(b.id) + static_cast<float>(c * x);
+                        }
+                        tile.primitiveId[i] = b.id % 2 ? b.id : dfb::noId;
+                        tile.instanceId[i] = b.id;
+                    });
+                },
+                paramsOf(s));
+            if (!fb.isDisplayRank())
+                continue;
+            const dfb::Image& image = fb.image();
+            const std::size_t n = image.pixelCount();
+            const std::vector<float> itsDepth(image.depth(), image.depth() + n),
+                itsPosition(image.position(), image.position() + 3 * n);
+            std::vector<std::uint32_t> itsIds(image.primitiveId(), image.primitiveId() + n);
+            itsIds.insert(itsIds.end(), image.instanceId(), image.instanceId() + n);
+            if (depth.empty()) {
+                depth = itsDepth, position = itsPosition, ids = itsIds;
+            }
+            const std::string name = nameOf(format);
+            result.expect(itsDepth == depth, name + ": depth");
+            result.expect(itsPosition == position, name + ": position");
+            result.expect(itsIds == ids, name + ": ids");
+            double worst = 0;
+            for (std::size_t i = 0; i < 3 * n; ++i)
+                if (std::isfinite(depth[i / 3]))
+                    worst = std::max(worst, std::abs(static_cast<double>(image.normal()[i] - normal[i % 3])));
+            // Products by alpha, the ratio of two alphas and the products by it are rounded to float.
+            result.expect(worst <= 4 * 0x1p-24, name + ": normals are off by " + std::to_string(worst));
+            result.hash = result.hash * 31 + dfb::testing::hashOf(image.normal(), 12 * n);
+        }
         return result;
     }
 };
@@ -122,7 +185,6 @@ struct NoPrecision {
         };
         refuses("error budget", [&](auto& c) { c.wire.budget = -1e-3; });
         refuses("error budget", [&](auto& c) { c.wire.maxColor = nan; });
-        refuses("error budget", [&](auto& c) { c.wire.depthFar = c.wire.depthNear; });
         refuses("least transmittance", [&](auto& c) { c.minTransmittance = nan; });
         if (size > 1)
             refuses("configured differently", [&, rank = rank](auto& c) {
@@ -135,6 +197,7 @@ struct NoPrecision {
 
 // In precision.cpp, so that the tests over MPI need not compile them again.
 extern template Result inProcess<Precision>(int);
+extern template Result inProcess<OtherChannels>(int);
 extern template Result inProcess<NoPrecision>(int);
 
 } // namespace algorithms
@@ -143,6 +206,11 @@ extern template Result inProcess<NoPrecision>(int);
 TEST_CASE("Lossy formats keep their bounds and budgets, the same on any ranks", "[precision]")
 {
     everywhere<algorithms::Precision>();
+}
+
+TEST_CASE("Depth, positions and ids are the same in any format, normals stay means", "[precision]")
+{
+    everywhere<algorithms::OtherChannels>();
 }
 
 TEST_CASE("A wire precision that can not be is refused on all ranks", "[precision]")

@@ -25,8 +25,14 @@ struct Wall {
         FrameBufferOf<TileOp, dfb::ToWall<Transport>, Transport> toWall(messenger, config, {&wall});
         config.format = format;
         FrameBufferOf<TileOp, dfb::NoPixelOp, Transport> single(messenger, config);
+        result.expect(wall.imageFrame() == -1, name + ": a frame before the first");
+        for (int d = 0; d < layout.displayCount(); ++d)
+            if (layout.ranks[static_cast<std::size_t>(d)] == single.rank())
+                result.expect(wall.image(d).empty(), name + ": an image before the first");
         for (int frame = 0; frame < 3; ++frame) {
-            wall.finish(render(toWall, frame).frame);
+            const std::int64_t number = render(toWall, frame).frame;
+            wall.finish(number);
+            result.expect(wall.imageFrame() == number && toWall.imageFrame() == -1, name + ": another frame");
             render(single, frame);
             result.expect(toWall.image().empty(), name + ": an image where there is to be none");
             // Rank 0 has the single image; all get it to compare.
@@ -140,7 +146,17 @@ struct WallProgressive {
             wall.finish(report.frame, 20000);
         };
         render(false);
+        const auto pixels = [&] {
+            std::vector<std::byte> all;
+            for (int d = 0; d < 2; ++d)
+                if (layout.ranks[static_cast<std::size_t>(d)] == fb.rank())
+                    all.insert(all.end(), wall.image(d).bytes(),
+                               wall.image(d).bytes() + wall.image(d).pixelCount() * 16);
+            return all;
+        };
+        const std::vector<std::byte> before = pixels();
         result.expect(scene::has(scene::outcomeOf([&] { render(true); }), "on purpose"), "the frame did not fail");
+        result.expect(wall.imageFrame() == 1 && pixels() == before, "a frame that failed is on the wall");
         sampler.reset();
         while (!sampler.done())
             render(false);

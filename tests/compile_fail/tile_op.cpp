@@ -11,6 +11,10 @@ struct Op {
     static constexpr dfb::ChannelMask channels = dfb::colorChannel;
 #endif
 
+#if defined(CASE_BY_DEPTH_WITHOUT_DEPTH) // expect: dfb: a TileOp with activeByDepth must have depthChannel
+    static constexpr bool activeByDepth = true;
+#endif
+
 #if defined(CASE_NO_NEW_FRAME) // expect: dfb: TileOp must provide void newFrame(const TileInfo&)
 #elif defined(CASE_WRONG_NEW_FRAME) // expect: dfb: TileOp must provide void newFrame(const TileInfo&)
     void newFrame(int);

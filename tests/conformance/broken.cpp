@@ -20,6 +20,8 @@
 #include <utility>
 #include <vector>
 
+namespace broken_cases {
+
 using namespace dfb;
 using std::chrono::milliseconds;
 using testing::ConformanceOptions;
@@ -282,3 +284,5 @@ TEST_CASE("Wrong answers are found")
     CHECK_FINDS(failuresOf(Defect::IsNeverQuiet), "what was sent needs no polls after quiet()",
                 "quiet() has not come true");
 }
+
+} // namespace broken_cases

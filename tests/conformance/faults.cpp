@@ -20,6 +20,8 @@
 #include <utility>
 #include <vector>
 
+namespace faults_cases {
+
 using namespace dfb;
 using testing::FaultDecision;
 using testing::FaultOptions;
@@ -437,3 +439,5 @@ TEST_CASE("What a transport need not have is passed on if the one below has it, 
     CHECK(right);
     CHECK(said == "rank 3 is lost");
 }
+
+} // namespace faults_cases

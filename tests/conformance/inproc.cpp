@@ -12,6 +12,8 @@
 #include <optional>
 #include <string>
 
+namespace inproc_cases {
+
 using namespace dfb;
 using testing::ConformanceOptions;
 using testing::FaultOptions;
@@ -174,3 +176,5 @@ TEST_CASE("A damaged message is found")
     CHECK(failedOnAll(text, 2));
     CHECK((contains(text, "changed") || contains(text, " bytes came")));
 }
+
+} // namespace inproc_cases

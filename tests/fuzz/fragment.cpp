@@ -1,7 +1,7 @@
 // decodeFragment: what it takes can be read to its last pixel, lies within its tile, and comes back the same when it is
 // encoded and decoded once more.
 //
-// An input: how the coder is set up, flags, then a FragmentHeader and the payload.
+// An input: flags, then a FragmentHeader and the payload.
 #include "fuzz.hpp"
 
 #include <dfb/detail/wire.hpp>
@@ -20,7 +20,7 @@ namespace d = dfb::detail;
 
 constexpr int side = 8;
 using Tile = dfb::Tile<dfb::allChannels, side>;
-enum Flags : std::uint8_t { HasCodec = 1, Compress = 2, NearDepth = 4, LargeColors = 8 };
+enum Flags : std::uint8_t { HasCodec = 1, Compress = 2, ByDepth = 4, LargeColors = 8 };
 constexpr int passes = 3;
 
 const dfb::Codec* codec()
@@ -33,14 +33,11 @@ const dfb::Codec* codec()
 #endif
 }
 
-d::WireCoder coderFor(std::uint8_t depthFormat, std::uint8_t flags)
+d::WireCoder coderFor(std::uint8_t flags)
 {
     dfb::WirePrecision precision;
-    precision.depth = static_cast<dfb::WireFormat>(depthFormat % 4);
-    precision.depthNear = flags & NearDepth ? 0.5f : -3;
-    precision.depthFar = 8;
     precision.maxColor = flags & LargeColors ? 40.0f : 1.0f;
-    return d::WireCoder(precision);
+    return d::WireCoder(precision, (flags & ByDepth) != 0);
 }
 
 const dfb::TileLayout& layout()
@@ -96,7 +93,12 @@ std::unique_ptr<Tile> tileOf(const dfb::Fragment& fragment)
     return tile;
 }
 
-bool isActive(const float* p) { return p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0; }
+bool isActive(const Tile& tile, int x, int y, bool byDepth)
+{
+    const float* p = tile.pixel(x, y);
+    return byDepth ? tile.depth[y * side + x] < std::numeric_limits<float>::infinity()
+                   : p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0;
+}
 
 // The same words; 0 and -0 are, which rounding may turn into each other.
 bool areAlike(const std::byte* a, const std::byte* b, std::size_t words)
@@ -109,7 +111,7 @@ bool areAlike(const std::byte* a, const std::byte* b, std::size_t words)
     return true;
 }
 
-bool areAlike(const Tile& a, const Tile& b, dfb::ChannelMask channels)
+bool areAlike(const Tile& a, const Tile& b, dfb::ChannelMask channels, bool byDepth)
 {
     const d::ConstPlanes as = a.planes(), bs = b.planes();
     for (int y = 0; y < a.region.height(); ++y)
@@ -117,7 +119,7 @@ bool areAlike(const Tile& a, const Tile& b, dfb::ChannelMask channels)
             for (std::size_t c = 0; c < d::channelCount; ++c) {
                 const std::size_t words = static_cast<std::size_t>(d::channelWords[c]),
                                   at = 4 * words * static_cast<std::size_t>(y * side + x);
-                if ((isActive(a.pixel(x, y)) || isActive(b.pixel(x, y))) && d::hasChannel(channels, c)
+                if ((isActive(a, x, y, byDepth) || isActive(b, x, y, byDepth)) && d::hasChannel(channels, c)
                     && !areAlike(as.at[c] + at, bs.at[c] + at, words))
                     return false;
             }
@@ -134,8 +136,8 @@ bool isSame(const dfb::TileHeader& a, const dfb::TileHeader& b)
 bool take(fuzz::Input in)
 {
     static const auto pool = dfb::MemoryPool::create(false);
-    const auto depthFormat = in.take<std::uint8_t>(), flags = in.take<std::uint8_t>();
-    const d::WireCoder coder = coderFor(depthFormat, flags);
+    const auto flags = in.take<std::uint8_t>();
+    const d::WireCoder coder = coderFor(flags);
     const dfb::Codec* with = flags & HasCodec ? codec() : nullptr;
 
     d::MessageHeader m;
@@ -169,6 +171,8 @@ bool take(fuzz::Input in)
     fuzz::require(fragment.hasDepth() == ((fragment.channels() & dfb::depthChannel) != 0) || fragment.empty(),
                   "depth is there if the mask says so");
     const auto tile = tileOf(fragment);
+    if (coder.activeByDepth() && !(fragment.channels() & dfb::depthChannel))
+        return true; // is refused for its channels
 
     d::InputFaults faults;
     dfb::Buffer again =
@@ -176,7 +180,7 @@ bool take(fuzz::Input in)
     const dfb::Fragment second = decode(*pool, std::move(again), with, coder);
     fuzz::require(isSame(header, second.header()), "the header comes back");
     fuzz::require(fragment.channels() == second.channels(), "the channels come back");
-    fuzz::require(areAlike(*tile, *tileOf(second), fragment.channels()), "the pixels come back");
+    fuzz::require(areAlike(*tile, *tileOf(second), fragment.channels(), coder.activeByDepth()), "the pixels come back");
     return true;
 }
 
@@ -193,15 +197,13 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     const auto pool = dfb::MemoryPool::create(false);
     std::vector<std::pair<std::string, std::string>> all;
     const auto add = [&](const std::string& name, const Tile& tile, dfb::ChannelMask channels, dfb::WireFormat color,
-                         dfb::WireFormat depth, std::uint8_t flags) {
-        const auto depthFormat = static_cast<std::uint8_t>(depth);
+                         std::uint8_t flags) {
         d::InputFaults faults;
         const dfb::Codec* with = (flags & HasCodec) && !(flags & Compress) ? codec() : nullptr;
-        const dfb::Buffer message =
-            d::encodeFragment(*pool, tile, channels, 0, with, coderFor(depthFormat, flags), color, faults);
+        const dfb::Buffer message = d::encodeFragment(*pool, tile, channels, 0, with, coderFor(flags), color, faults);
         const std::size_t prefix = sizeof(d::MessageHeader);
         std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
-        all.emplace_back(name, fuzz::Output().put(depthFormat).put(flags).text(body).bytes());
+        all.emplace_back(name, fuzz::Output().put(flags).text(body).bytes());
         fuzz::require(take(fuzz::Input(all.back().second)), "what is good is taken");
     };
     const dfb::ChannelMask colorAndDepth = dfb::colorChannel | dfb::depthChannel;
@@ -229,25 +231,25 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     const auto constant = tileWith(3, [](int, int) { return true; });
     constant->fill({0.5f, 0.25f, 0.125f, 1}, 3);
     using Format = dfb::WireFormat;
-    add("empty", *empty, colorAndDepth, Format::Float32, Format::Float32, 0);
-    add("dots", *dots, colorAndDepth, Format::Float32, Format::Float32, 0);
-    add("runs", *runs, colorAndDepth, Format::Float32, Format::Float32, 0);
-    add("dense", *dense, colorAndDepth, Format::Float32, Format::Float32, 0);
-    add("constant", *constant, colorAndDepth, Format::Float32, Format::Float32, 0);
-    add("color_only", *dots, dfb::colorChannel, Format::Float32, Format::Float32, 0);
-    add("all_channels", *runs, dfb::allChannels, Format::Float32, Format::Float32, 0);
-    add("deep", *dots, colorAndDepth | dfb::farChannel, Format::Float32, Format::Float32, NearDepth);
-    add("half", *dots, colorAndDepth, Format::Float16, Format::Float16, 0);
-    add("unorm16", *dense, colorAndDepth, Format::Unorm16, Format::Unorm16, LargeColors);
-    add("unorm8", *runs, colorAndDepth, Format::Unorm8, Format::Unorm8, NearDepth);
-    add("constant_unorm8", *constant, colorAndDepth, Format::Unorm8, Format::Unorm16, NearDepth);
-    add("compressed", *dots, colorAndDepth, Format::Float32, Format::Float32, HasCodec);
-    add("compressed_half", *dense, colorAndDepth, Format::Float16, Format::Float32, HasCodec);
-    add("compressed_here", *runs, dfb::allChannels, Format::Unorm8, Format::Unorm16, HasCodec | Compress);
-    add("compressed_dense", *dense, colorAndDepth, Format::Float32, Format::Float32, HasCodec | Compress);
-    // The header says Float32, the coder another format.
-    all.push_back(all[2]);
-    all.back().first = "another_depth_format";
-    all.back().second[0] = static_cast<char>(Format::Unorm8);
+    add("empty", *empty, colorAndDepth, Format::Float32, 0);
+    add("dots", *dots, colorAndDepth, Format::Float32, 0);
+    add("runs", *runs, colorAndDepth, Format::Float32, 0);
+    add("dense", *dense, colorAndDepth, Format::Float32, 0);
+    add("constant", *constant, colorAndDepth, Format::Float32, 0);
+    add("color_only", *dots, dfb::colorChannel, Format::Float32, 0);
+    add("all_channels", *runs, dfb::allChannels, Format::Float32, 0);
+    add("deep", *dots, colorAndDepth | dfb::farChannel, Format::Float32, 0);
+    add("half", *dots, colorAndDepth, Format::Float16, 0);
+    add("unorm16", *dense, colorAndDepth, Format::Unorm16, LargeColors);
+    add("unorm8", *runs, colorAndDepth, Format::Unorm8, 0);
+    add("constant_unorm8", *constant, colorAndDepth, Format::Unorm8, 0);
+    const auto black = tileWith(1, [](int x, int y) { return x < y; });
+    black->forEachPixel([](int x, int, float* rgba, float&) { std::fill_n(rgba, 4, x % 3 ? 0.0f : 0.5f); });
+    add("by_depth", *black, colorAndDepth, Format::Float32, ByDepth);
+    add("by_depth_unorm8", *black, colorAndDepth, Format::Unorm8, ByDepth);
+    add("compressed", *dots, colorAndDepth, Format::Float32, HasCodec);
+    add("compressed_half", *dense, colorAndDepth, Format::Float16, HasCodec);
+    add("compressed_here", *runs, dfb::allChannels, Format::Unorm8, HasCodec | Compress);
+    add("compressed_dense", *dense, colorAndDepth, Format::Float32, HasCodec | Compress);
     return all;
 }

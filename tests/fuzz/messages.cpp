@@ -198,15 +198,12 @@ dfb::FrameBufferConfig configFor(Way way)
     config.depth = !way.has(Ordered) && !way.has(Wall);
     config.displayRank = way.has(DisplayElsewhere) ? 1 : 0;
     config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return ownerOf(tile); };
-    config.progress = dfb::Progress::Caller;
-    config.sharedMemory = false;
 #if defined(DFB_HAS_SNAPPY)
     if (way.has(HasCodec))
         config.codec = std::make_shared<dfb::SnappyCodec>();
 #endif
     if (way.has(Rounded))
         config.wire = dfb::WireFormat::Unorm16;
-    config.checksums = way.has(Checksums);
     config.framesInFlight = static_cast<int>(way.engineCount());
     if (way.has(Wall))
         config.format = dfb::OutputFormat::None;
@@ -319,14 +316,17 @@ private:
     {
         auto config = configFor(way_);
         config.executor = peer_->tasks;
-        const auto agreement = d::Agreement::of<TileOp, PixelOp>(config, 1, side, Pipeline::travelling(config),
-                                                                 tileCount, [](int tile) { return ownerOf(tile); });
+        dfb::MessengerOptions options;
+        options.progress = dfb::Progress::Caller;
+        options.sharedMemory = false;
+        options.checksums = way_.has(Checksums);
+        const auto agreement =
+            d::Agreement::of<TileOp, PixelOp>(config, options.checksums, 1, side, Pipeline::travelling(config),
+                                              tileCount, [](int tile) { return ownerOf(tile); });
         const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
             peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
         };
-        messenger_ = std::make_shared<dfb::Messenger<PlayedTransport>>(
-            peer_, dfb::MessengerOptions{config.progress, config.checksums, config.sharedMemory, config.peerTimeoutMs,
-                                         config.onPeerLost});
+        messenger_ = std::make_shared<dfb::Messenger<PlayedTransport>>(peer_, options);
         if (way_.has(NoConfiguration))
             sendAll(*peer_, in_, way_, 0);
         PixelOp pixelOp;

@@ -1,7 +1,7 @@
 // The readers of dfb_render: what they take is a mesh, atoms or a volume that the renderer can use, and is the same
 // when it is written and read once more; what they refuse is refused with std::runtime_error that begins with the name.
 //
-// An input: a byte that picks the reader, then the file; of a volume its name up to a line break before.
+// An input: a byte that picks the reader and the frame, then the file; of a volume its name up to a line break before.
 #include "fuzz.hpp"
 
 #include <obj.hpp>
@@ -52,7 +52,9 @@ Scene sceneWith(const Object& object)
     Scene scene;
     scene.add(object, true);
     fuzz::require(isFinite(scene.bounds.lo) && isFinite(scene.bounds.hi), "the bounds of the scene are finite");
-    fuzz::require(isFinite(scene.focus.lo) && isFinite(scene.focus.hi), "what there is to see is finite");
+    const Focus focus = scene.focus();
+    fuzz::require(isFinite(focus.box.lo) && isFinite(focus.box.hi) && std::isfinite(focus.radius),
+                  "what there is to see is finite");
     return scene;
 }
 
@@ -64,6 +66,11 @@ void checkMesh(const Mesh& mesh)
     for (const Triangle& t : mesh.triangles)
         for (const std::uint32_t index : t)
             fuzz::require(index < mesh.positions.size(), "indices are of vertices");
+    fuzz::require(mesh.colors.empty() || mesh.colors.size() == mesh.positions.size(),
+                  "all vertices have a colour or none");
+    for (const Vec3& c : mesh.colors)
+        for (int i = 0; i < 3; ++i)
+            fuzz::require(c[i] >= 0 && c[i] <= 1, "a colour is one");
     const Mesh again = parsePly(plyOf(mesh), name);
     bool same = again.positions.size() == mesh.positions.size() && again.triangles == mesh.triangles;
     for (std::size_t i = 0; i < mesh.positions.size() && same; ++i)
@@ -87,6 +94,8 @@ void checkSpheres(const std::vector<Sphere>& spheres)
     std::string text = std::to_string(spheres.size()) + "\n\n";
     for (const Sphere& s : spheres) {
         fuzz::require(isUsable(s.center) && s.radius > 0, "an atom is usable");
+        for (int i = 0; i < 3; ++i)
+            fuzz::require(s.color[i] >= 0 && s.color[i] <= 1, "its colour is one");
         text += "C " + textOf(s.center.x) + ' ' + textOf(s.center.y) + ' ' + textOf(s.center.z) + '\n';
     }
     const auto again = parseXyz(text, name);
@@ -134,7 +143,7 @@ void checkVolume(const std::string& bytes)
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size)
 {
     fuzz::Input in(data, size);
-    const auto reader = in.take<std::uint8_t>() % readers;
+    const int pick = in.take<std::uint8_t>(), reader = pick % readers, frame = pick / readers % 4;
     const std::string bytes = in.rest();
     if (reader == Raw) {
         checkVolume(bytes);
@@ -142,17 +151,20 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     }
     std::vector<Sphere> spheres;
     Mesh mesh;
+    Notes notes;
     try {
         if (reader == Ply)
-            mesh = parsePly(bytes, name);
+            mesh = parsePly(bytes, name, &notes);
         else if (reader == Obj)
-            mesh = parseObj(bytes, name);
+            mesh = parseObj(bytes, name, &notes);
         else
-            spheres = parseXyz(bytes, name);
+            spheres = parseXyz(bytes, name, frame, &notes);
     } catch (const std::runtime_error& e) {
         fuzz::require(std::string(e.what()).compare(0, name.size() + 2, name + ": ") == 0, "the error names the file");
         return 0;
     }
+    for (const std::string& note : notes)
+        fuzz::require(note.compare(0, name.size() + 2, name + ": ") == 0, "a note names the file");
     if (reader == Xyz)
         checkSpheres(spheres);
     else
@@ -201,6 +213,17 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("obj_large_index", Obj, "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 4294967299\n");
     add("obj_index_with_more", Obj, "v 0 0 0\nv 1 0 0\nv 1 1 0\nf 1 2 3x\n");
     add("xyz", Xyz, "3\nany text\nC 0 0.5 -1\nO\t1e1 2 3\r\nXx 4 5 6");
+    add("ply_colors", Ply,
+        header("ascii", "element vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty uchar red\n"
+                        "property ushort green\nproperty float blue\nelement face 1\n"
+                        "property list uchar int vertex_indices\nproperty uchar red\n")
+            + "0 0 0 255 65535 1\n1 0 0 128 0 0.5\n+1 1 0 0 0 0\n3 0 1 2 7\n");
+    add("obj_colors", Obj, "v 0 0 0 1 0 .5 # red\nv 1 0 0 0 0 1\nv 1 1 0 0 0 0\nf 1 2 3\n");
+    add("xyz_extended", Xyz,
+        "2\nLattice=\"1 0 0\" Properties=\"pos:R:3:mass:R:1:species:S:1\"\n1 2 3 16 fe 5\n+4 5 6 7 92\n");
+    const std::string frames = "1\nfirst\nC 1 0 0\n2\nsecond\nC 2 0 0\nQq 3 0 0\n\n1\nthird\nC 4 0 0\n \n";
+    add("xyz_frames", Xyz, frames);
+    add("xyz_second_frame", Reader(Xyz + 2 * readers), frames);
     add("raw_uint8", Raw, "a_2x3x4_uint8.raw\n" + std::string(12, 'a') + std::string(12, 'z'));
     Output shorts, floats;
     for (std::uint16_t i = 0; i < 8; ++i)

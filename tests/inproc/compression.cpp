@@ -27,7 +27,7 @@ TEST_CASE("Frames with and without compression take turns until all ranks have c
         using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
         for (int frame = 0; frame < frames; ++frame) {
-            const auto report = scene::renderLoop(fb, s, scene::Loop::Declared, 0, 1);
+            const auto report = scene::renderLoop(fb, s, scene::Loop::Declared);
             compressed[static_cast<std::size_t>(fb.rank())].push_back(report.compressed);
             if (fb.isDisplayRank()) {
                 hashes.push_back(scene::Picture(fb.image(), report).hash());

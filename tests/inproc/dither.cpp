@@ -8,6 +8,8 @@
 #include <string>
 #include <vector>
 
+namespace dither_cases {
+
 namespace {
 
 using scene::Loop;
@@ -143,3 +145,5 @@ TEST_CASE("Ranks must agree whether to dither", "[dither]")
     for (const std::string& text : said)
         CHECK(scene::has(text, "InvalidArgument: "));
 }
+
+} // namespace dither_cases

@@ -19,6 +19,8 @@
 #include <tbb/task_arena.h>
 #endif
 
+namespace edges_cases {
+
 namespace {
 
 using Inproc = dfb::InprocTransport;
@@ -248,3 +250,5 @@ TEST_CASE("A framebuffer is used inside the user's own TBB arena, by several of 
     CHECK(images == 7);
 }
 #endif
+
+} // namespace edges_cases

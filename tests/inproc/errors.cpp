@@ -22,6 +22,8 @@
 #include <utility>
 #include <vector>
 
+namespace errors_cases {
+
 namespace {
 
 using scene::has;
@@ -319,7 +321,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     CHECK(has(texts[0], "frame 2"));
     CHECK(has(texts[10], "-1 children"));
     CHECK(has(texts[10], "tile 3"));
-    CHECK(has(texts[16], "without channel 1"));
+    CHECK(has(texts[16], "without its depth"));
     CHECK(has(texts[17], "rows of"));
     CHECK(sentMeanwhile == 0);
     CHECK(wrong == 0);
@@ -335,18 +337,8 @@ TEST_CASE("Frame parameters that can not be are refused", "[errors]")
         params.passes = 0;
         texts.push_back(outcomeOf([&] { fb.begin(params); }));
         params.passes = 1;
-        params.declarationKey = 5;
+        params.maxLayers = -1;
         texts.push_back(outcomeOf([&] { fb.begin(params); }));
-        params.declared = true;
-        auto frame = fb.begin(params);
-        texts.push_back(outcomeOf([&] { frame.declare({{28, 0, 0}}); }));
-        texts.push_back(outcomeOf([&] { frame.declare({{-1, 0, 0}}); }));
-        frame.declare({});
-        texts.push_back(outcomeOf([&] { frame.declare({}); }));
-        frame.end();
-        auto second = fb.begin(params); // the declaration still holds
-        texts.push_back(second.wantsDeclaration() ? "wants one" : outcomeOf([&] { second.declare({}); }));
-        second.end();
     });
     for (const std::string& text : texts) {
         INFO(text);
@@ -423,27 +415,110 @@ TEST_CASE("A frame begun with different backgrounds fails on every rank", "[erro
     CHECK(bad.wrongAfter == 0);
 }
 
+TEST_CASE("declare() at a wrong time or of what is not there is refused, and nothing comes of it", "[errors]")
+{
+    const Scene s = scene::makeScene(3);
+    const std::vector<dfb::testing::Pixel> expected = scene::referenceOf(s);
+    for (const int ranks : {1, 3}) {
+        std::vector<std::string> texts;
+        std::size_t wrong = 0;
+        dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
+            FrameBuffer<Blend> fb(communicator, configOf(s));
+            const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
+            const auto pairs = dfb::visibleTiles(world, scene::FlatCamera(), fb.layout());
+            const auto inputs = dfb::inputsOf(world, pairs);
+            std::vector<std::string> mine;
+            for (int round = 0; round < 3; ++round) { // what is refused must not be taken for what holds, either
+                dfb::FrameParams params = paramsOf(s);
+                params.declared = true;
+                auto frame = fb.begin(params);
+                mine.push_back(outcomeOf([&] { frame.declare({{0, 0, 0}, {28, 0, 0}}); }));
+                mine.push_back(outcomeOf([&] { frame.declare({{0, 0, 0}, {-1, 0, 0}}); }));
+                frame.declare(inputs);
+                mine.push_back(outcomeOf([&] { frame.declare({}); }));
+                const auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
+                for (const dfb::BrickInTile& pair : pairs) {
+                    const dfb::Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)];
+                    frame.start(*tile, pair.tile);
+                    tile->generation = 1;
+                    tile->source = brick.id;
+                    renderBrick(s, brick, *tile);
+                    frame.setTile(*tile);
+                }
+                mine.push_back(outcomeOf([&] { frame.declare(inputs); }));
+                const auto report = frame.end();
+                if (fb.isDisplayRank())
+                    wrong += scene::wrongValues(Picture(fb.image(), report), expected);
+                // Where nothing is declared.
+                params.declared = false;
+                auto other = fb.begin(params);
+                mine.push_back(outcomeOf([&] { other.declare(inputs); }));
+                for (const int index : fb.ownedTiles()) {
+                    other.start(*tile, index);
+                    other.setTile(*tile);
+                }
+                other.end();
+            }
+            if (fb.isDisplayRank())
+                texts = mine;
+        });
+        CHECK(wrong == 0);
+        CHECK(texts.size() == 15);
+        for (const std::string& text : texts) {
+            INFO(text);
+            CHECK(has(text, "InvalidArgument"));
+        }
+    }
+}
+
+TEST_CASE("A loop that fails before it has declared its inputs fails the frame at once", "[errors]")
+{
+    struct NoCamera {
+        bool throws;
+        dfb::Region project(const dfb::Box3& b, int width, int height) const
+        {
+            if (throws)
+                throw std::runtime_error("no camera");
+            return scene::FlatCamera().project(b, width, height);
+        }
+    };
+    const Scene s = scene::makeScene(6, 3);
+    for (const bool isPartial : {false, true})
+        for (int odd = 0; odd < 3; ++odd) {
+            const auto start = std::chrono::steady_clock::now();
+            const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
+                dfb::FrameParams params = paramsOf(s);
+                params.timeoutMs = 60000;
+                params.allowPartial = isPartial;
+                const auto report = dfb::renderDataParallel(
+                    fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), NoCamera{fb.rank() == odd},
+                    [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, params);
+                if (report.failure)
+                    throw dfb::FrameError(*report.failure);
+            });
+            INFO("rank " << odd << (isPartial ? ", partial" : "") << joined(bad.texts));
+            CHECK(allSame(bad.texts));
+            CHECK(has(bad.texts[0], "FrameError"));
+            CHECK(has(bad.texts[0], "no camera"));
+            CHECK(has(bad.texts[0], "rank " + std::to_string(odd)));
+            CHECK(bad.wrongAfter == 0);
+            CHECK(std::chrono::steady_clock::now() - start < std::chrono::seconds(30));
+        }
+}
+
 TEST_CASE("Ranks that wait for different things find out, and none waits for ever", "[errors]")
 {
     // An empty scene: no input travels that could give the difference away.
     const Scene s = scene::makeScene(0);
-    enum class What { Declared, NotDeclared, Key };
-    for (const What what : {What::Declared, What::NotDeclared, What::Key})
+    for (const bool oddDeclares : {true, false})
         for (const int ranks : {2, 3, 5})
             for (int odd = 0; odd < ranks; ++odd) {
                 const BadFrame bad = badFrame<FrameBuffer<Blend>>(ranks, s, configOf(s), [&](auto& fb) {
                     const bool isOdd = fb.rank() == odd;
                     dfb::FrameParams params;
-                    params.declared = what == What::Key || isOdd == (what == What::Declared);
-                    params.declarationKey = what == What::Key ? 5 : 0;
-                    if (what == What::Key) {
-                        auto frame = fb.begin(params);
-                        frame.declare({});
-                        frame.end();
-                        params.declarationKey = isOdd ? 6 : 5;
-                    }
+                    params.declared = isOdd == oddDeclares;
                     auto frame = fb.begin(params);
-                    if (frame.wantsDeclaration())
+                    if (params.declared)
                         frame.declare({});
                     auto tile = std::make_unique<typename std::decay_t<decltype(fb)>::Tile>();
                     for (int index : fb.ownedTiles())
@@ -453,7 +528,7 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
                         }
                     frame.end();
                 });
-                INFO("what " << static_cast<int>(what) << ", rank " << odd << joined(bad.texts));
+                INFO((oddDeclares ? "declares" : "does not declare") << ", rank " << odd << joined(bad.texts));
                 CHECK(allSame(bad.texts));
                 CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
                 CHECK(bad.wrongAfter == 0);
@@ -1289,3 +1364,5 @@ TEST_CASE("An operation that takes longer than a frame may fails the frame, not 
     CHECK(has(texts[0], "are still being finished"));
     CHECK(after == std::vector<std::string>(2, "fine"));
 }
+
+} // namespace errors_cases

@@ -3,6 +3,28 @@
 
 #include "../algorithms/everywhere.hpp"
 
+#include <future>
+#include <vector>
+
+// With all numbers of ranks at once, for a case that mostly waits.
+template <class Case>
+void everywhereAtOnce()
+{
+    const std::vector<int> counts{1, 2, 3, 4, 7};
+    std::vector<std::future<algorithms::Result>> results;
+    for (const int ranks : counts)
+        results.push_back(std::async(std::launch::async, algorithms::inProcess<Case>, ranks));
+    std::uint64_t hash = 0; // with one rank
+    for (std::size_t i = 0; i < counts.size(); ++i) {
+        const algorithms::Result result = results[i].get();
+        if (i == 0)
+            hash = result.hash;
+        INFO(counts[i] << " ranks");
+        CHECK(result.wrong == "");
+        CHECK(result.hash == hash);
+    }
+}
+
 template <class Case>
 void everywhere()
 {

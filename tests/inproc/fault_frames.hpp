@@ -164,15 +164,17 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     config.height = group.scene.height;
     config.format = dfb::OutputFormat::RGBA32F;
     config.depth = true;
-    config.checksums = true;
     config.gather = group.seed % 2 ? dfb::GatherMode::AtEnd : dfb::GatherMode::Batches;
     config.messagePoolBytes = group.seed % 3 ? std::size_t{64} << 20 : 0;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1 + static_cast<int>(group.seed % 2));
+    dfb::MessengerOptions options;
+    options.checksums = true;
     std::vector<FaultEnding> endings;
     std::unique_ptr<FrameBuffer> made;
     // Another rank may be in the first frame already, and a message of that damaged.
     const std::string making = outcomeOf([&] {
-        made = std::make_unique<FrameBuffer>(typename Transport::Communicator{communicator, group.faults}, config);
+        made = std::make_unique<FrameBuffer>(typename Transport::Communicator{communicator, group.faults}, config,
+                                             options);
     });
     if (!made)
         return {{making, 0}};

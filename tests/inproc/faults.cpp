@@ -9,6 +9,8 @@
 #include <string>
 #include <vector>
 
+namespace faults_cases {
+
 namespace {
 
 struct Tally {
@@ -111,3 +113,5 @@ TEST_CASE("Disturbed frames end in the right image or in an error of dfb", "[fau
 }
 
 TEST_CASE("Many more disturbed frames", "[faults][.stress]") { check(faultGroups(100000, 40000), 40000); }
+
+} // namespace faults_cases

@@ -23,6 +23,8 @@
 #include <utility>
 #include <vector>
 
+namespace flood_cases {
+
 namespace {
 
 using board::Board;
@@ -440,10 +442,11 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
                     std::make_shared<Board>(), ranks,
                     [&](const auto& communicator) {
                         auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
-                        config.progress = dfb::Progress::Caller;
                         if (toOne)
                             config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                        AddingFrameBuffer fb(communicator, config);
+                        dfb::MessengerOptions options;
+                        options.progress = dfb::Progress::Caller;
+                        AddingFrameBuffer fb(communicator, config, options);
                         const auto r = floodFrame(fb, 3, from);
                         if (fb.isDisplayRank()) {
                             wrong = wrongSums(fb.image(), ranks, 3);
@@ -539,3 +542,5 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
         CHECK(reports[0].peakMemoryBytes <= static_cast<std::int64_t>(limit));
     }
 }
+
+} // namespace flood_cases

@@ -23,8 +23,10 @@ std::string largeImage(const typename Transport::Communicator& communicator, boo
     config.format = dfb::OutputFormat::RGBA32F;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
     config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks > 1 ? 1 : 0; };
-    config.sharedMemory = sharedMemory;
-    dfb::DistributedFrameBuffer<dfb::BasicImageParallel<256>, dfb::NoPixelOp, Transport> fb(communicator, config);
+    dfb::MessengerOptions options;
+    options.sharedMemory = sharedMemory;
+    dfb::DistributedFrameBuffer<dfb::BasicImageParallel<256>, dfb::NoPixelOp, Transport> fb(communicator, config,
+                                                                                            options);
     dfb::FrameReport report;
     for (int frame = 0; frame < 2; ++frame) // where an image is shared, from the second one on at the latest
         report = dfb::renderImageParallel(fb, [&](auto& tile) {

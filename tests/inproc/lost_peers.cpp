@@ -15,6 +15,8 @@
 #include <thread>
 #include <vector>
 
+namespace lost_peers_cases {
+
 namespace {
 
 using board::Board;
@@ -75,12 +77,18 @@ private:
 
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, HeldTransport>;
 
-dfb::FrameBufferConfig smallConfig(int peerTimeoutMs = timeoutMs)
+dfb::FrameBufferConfig smallConfig()
 {
     auto config = configOf(scene::makeScene(0));
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-    config.peerTimeoutMs = peerTimeoutMs;
     return config;
+}
+
+dfb::MessengerOptions timedOptions(int peerTimeoutMs = timeoutMs)
+{
+    dfb::MessengerOptions options;
+    options.peerTimeoutMs = peerTimeoutMs;
+    return options;
 }
 
 FrameBuffer::Frame begin(FrameBuffer& fb)
@@ -121,10 +129,8 @@ lose(int ranks, int victim, bool withFrameBuffer,
         std::make_shared<Board>(), ranks,
         [&](const BoardTransport::Communicator& communicator) {
             const int rank = communicator.inner.rank();
-            dfb::MessengerOptions options;
-            options.peerTimeoutMs = timeoutMs;
             auto messenger = std::make_shared<dfb::Messenger<HeldTransport>>(
-                HeldTransport::Communicator{communicator, holds}, options);
+                HeldTransport::Communicator{communicator, holds}, timedOptions());
             std::unique_ptr<FrameBuffer> fb;
             if (withFrameBuffer) {
                 fb = std::make_unique<FrameBuffer>(messenger, smallConfig());
@@ -238,12 +244,12 @@ TEST_CASE("The handler is called where a rank was found lost, once, and not on t
         std::make_shared<Board>(), ranks,
         [&](const BoardTransport::Communicator& communicator) {
             const auto rank = static_cast<std::size_t>(communicator.inner.rank());
-            auto config = smallConfig();
-            config.onPeerLost = [&, rank](const dfb::ErrorInfo& error) {
+            auto options = timedOptions();
+            options.onPeerLost = [&, rank](const dfb::ErrorInfo& error) {
                 ++calls[rank];
                 lost = error.rank;
             };
-            FrameBuffer fb({communicator, holds}, config);
+            FrameBuffer fb({communicator, holds}, smallConfig(), options);
             emptyFrame(fb);
             if (fb.rank() == victim) {
                 holds->held[victim] = true;
@@ -271,7 +277,7 @@ TEST_CASE("A rank that renders long, or polls slowly, raises no alarm", "[lost_p
     runOn(
         std::make_shared<Board>(), 3,
         [&](const BoardTransport::Communicator& communicator) {
-            FrameBuffer fb({communicator, holds}, smallConfig());
+            FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions());
             emptyFrame(fb);
             const auto rank = static_cast<std::size_t>(fb.rank());
             if (rank == 2)
@@ -301,7 +307,7 @@ TEST_CASE("A rank that was held itself does not take the others for lost", "[los
         std::make_shared<Board>(), 3,
         [&](const BoardTransport::Communicator& communicator) {
             const bool isHeld = communicator.inner.rank() == 1;
-            FrameBuffer fb({communicator, holds}, smallConfig(isHeld ? timeoutMs : 60000));
+            FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(isHeld ? timeoutMs : 60000));
             emptyFrame(fb);
             const auto rank = static_cast<std::size_t>(fb.rank());
             texts[rank] = outcomeOf([&] {
@@ -331,12 +337,10 @@ TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken
             std::make_shared<Board>(), 2,
             [&](const BoardTransport::Communicator& communicator) {
                 const bool isOther = communicator.inner.rank() == 1;
-                auto config = smallConfig();
+                auto options = timedOptions(isOther && !byCaller ? 0 : timeoutMs);
                 if (isOther && byCaller)
-                    config.progress = dfb::Progress::Caller;
-                else if (isOther)
-                    config.peerTimeoutMs = 0;
-                FrameBuffer fb({communicator, holds}, config);
+                    options.progress = dfb::Progress::Caller;
+                FrameBuffer fb({communicator, holds}, smallConfig(), options);
                 const auto rank = static_cast<std::size_t>(fb.rank());
                 texts[rank] = outcomeOf([&] {
                     auto frame = begin(fb);
@@ -376,7 +380,7 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
         runOn(
             board, ranks,
             [&](const BoardTransport::Communicator& communicator) {
-                FrameBuffer fb({communicator, holds}, smallConfig(peerTimeoutMs));
+                FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(peerTimeoutMs));
                 emptyFrame(fb);
                 std::this_thread::sleep_for(milliseconds(300)); // until all are out of it and asleep
                 if (fb.rank() == 0) {
@@ -428,7 +432,7 @@ TEST_CASE("A time-out for peers that can not be is refused on all ranks", "[lost
             [&](const BoardTransport::Communicator& communicator) {
                 const int rank = communicator.inner.rank();
                 texts[static_cast<std::size_t>(rank)] = outcomeOf([&] {
-                    FrameBuffer fb({communicator, holds}, smallConfig(rank == 1 ? wrong : 0));
+                    FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(rank == 1 ? wrong : 0));
                 });
             },
             seed);
@@ -437,3 +441,5 @@ TEST_CASE("A time-out for peers that can not be is refused on all ranks", "[lost
             CHECK((has(text, "InvalidArgument") && has(text, std::to_string(wrong) + " ms")));
     }
 }
+
+} // namespace lost_peers_cases

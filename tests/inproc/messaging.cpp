@@ -25,6 +25,8 @@
 #include <utility>
 #include <vector>
 
+namespace messaging_cases {
+
 namespace {
 
 using board::Board;
@@ -376,13 +378,13 @@ TEST_CASE("With checksums the image is the same", "[messaging]")
             }
         };
         runOn(board, 3, [&](const auto& communicator) {
-            auto config = configOf(s);
-            config.checksums = true;
+            dfb::MessengerOptions options;
+            options.checksums = true;
             if (scene::isDataParallel(loop)) {
-                FrameBuffer<Blend> fb(communicator, config);
+                FrameBuffer<Blend> fb(communicator, configOf(s), options);
                 body(fb);
             } else {
-                FrameBuffer<Single> fb(communicator, config);
+                FrameBuffer<Single> fb(communicator, configOf(s), options);
                 body(fb);
             }
         });
@@ -423,10 +425,10 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
     };
     Scene s = sceneFor(Loop::Declared);
     runOn(board, 2, [&](const auto& communicator) {
-        auto config = configOf(s);
-        config.checksums = true;
-        config.peerTimeoutMs = peerTimeoutMs;
-        FrameBuffer<Blend> fb(communicator, config);
+        dfb::MessengerOptions options;
+        options.checksums = true;
+        options.peerTimeoutMs = peerTimeoutMs;
+        FrameBuffer<Blend> fb(communicator, configOf(s), options);
         const auto rank = static_cast<std::size_t>(fb.rank());
         const auto frame = [&](int limit) {
             return outcomeOf([&] {
@@ -540,9 +542,10 @@ TEST_CASE("With frames in flight a damaged message costs frames, not the framebu
     std::size_t wrong = 1;
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
-        config.checksums = true;
         config.framesInFlight = 2; // the second has never begun one when the first fails
-        FrameBuffer<Blend> fb(communicator, config);
+        dfb::MessengerOptions options;
+        options.checksums = true;
+        FrameBuffer<Blend> fb(communicator, config, options);
         const auto rank = static_cast<std::size_t>(fb.rank());
         texts[rank] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
         after[rank].push_back(outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); }));
@@ -580,10 +583,11 @@ TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in
     std::vector<std::string> texts(2);
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
-        config.checksums = true;
-        config.peerTimeoutMs = 300;
         config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
-        FrameBuffer<Blend> fb(communicator, config);
+        dfb::MessengerOptions options;
+        options.checksums = true;
+        options.peerTimeoutMs = 300;
+        FrameBuffer<Blend> fb(communicator, config, options);
         scene::renderLoop(fb, s, Loop::Declared);
         if (fb.rank() == 1) {
             armed = true;
@@ -740,10 +744,10 @@ TEST_CASE("Ranks that disagree about checksums get an error each, and none waits
                 runOn(
                     std::make_shared<Board>(), ranks,
                     [&](const BoardTransport::Communicator& communicator) {
-                        auto config = configOf(sceneFor(Loop::Declared));
-                        config.checksums = (communicator.inner.rank() == odd) == uses;
-                        texts[static_cast<std::size_t>(communicator.inner.rank())] =
-                            outcomeOf([&] { FrameBuffer<Blend> fb(communicator, config); });
+                        dfb::MessengerOptions options;
+                        options.checksums = (communicator.inner.rank() == odd) == uses;
+                        texts[static_cast<std::size_t>(communicator.inner.rank())] = outcomeOf(
+                            [&] { FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options); });
                     },
                     std::nullopt, std::chrono::seconds(5));
                 INFO("rank " << odd << " of " << ranks << (uses ? " uses them" : " uses none") << joined(texts));
@@ -941,9 +945,10 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
             std::make_shared<Board>(), 2,
             [&](const BoardTransport::Communicator& communicator) {
                 auto config = configOf(s);
-                config.progress = dfb::Progress::Caller;
                 config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                FrameBuffer<Counter> fb(communicator, config);
+                dfb::MessengerOptions options;
+                options.progress = dfb::Progress::Caller;
+                FrameBuffer<Counter> fb(communicator, config, options);
                 {
                     auto frame = fb.begin(scene::paramsOf(s));
                     const auto tile = std::make_unique<FrameBuffer<Counter>::Tile>();
@@ -1047,3 +1052,5 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
     CHECK(reports[0].tilesIncomplete <= 2);
     CHECK(reports[0].compositingOverheadMs < params.timeoutMs / 2);
 }
+
+} // namespace messaging_cases

@@ -16,6 +16,8 @@
 #include <xmmintrin.h>
 #endif
 
+namespace operations_cases {
+
 namespace {
 
 using scene::Loop;
@@ -439,3 +441,5 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
     CHECK(wrong == 0);
 }
 #endif
+
+} // namespace operations_cases

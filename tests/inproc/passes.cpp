@@ -13,6 +13,8 @@
 #include <utility>
 #include <vector>
 
+namespace passes_cases {
+
 namespace {
 
 using board::Board;
@@ -119,3 +121,5 @@ TEST_CASE("From the renderer to the operation pixels are copied once, and from t
     check<dfb::BasicAlphaBlend<16>>();
     check<dfb::BasicDepthComposite<16>>();
 }
+
+} // namespace passes_cases

@@ -166,7 +166,7 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
 }
 
 template <class FrameBuffer>
-dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal = 0, std::uint64_t declarationKey = 0)
+dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal = 0)
 {
     const auto mine = bricksOf(s, fb.rank(), fb.size(), deal);
     const auto render = [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); };
@@ -182,11 +182,9 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
     }
     case Loop::Declared: break;
     }
-    dfb::FrameParams params = paramsOf(s);
-    params.declarationKey = declarationKey;
     return dfb::renderDataParallel(
         fb, dfb::World(mine), FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); },
-        params);
+        paramsOf(s));
 }
 
 // What the display rank had after a frame.
@@ -220,7 +218,9 @@ struct Picture {
     }
 };
 
-inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
+// `more(sample, pass, x, y)` gives a sample what it has beside colour and depth.
+template <class More>
+std::vector<dfb::testing::Pixel> referenceOf(const Scene& s, const More& more)
 {
     std::vector<dfb::testing::Pixel> result;
     for (int y = 0; y < s.height; ++y)
@@ -228,10 +228,12 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             std::vector<dfb::testing::Pixel> passes;
             for (int pass = 0; pass < s.passes; ++pass) {
                 std::vector<dfb::testing::Sample> samples;
-                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing
-                    if (const auto sample = sampleOf(s, brick, pass, x, y);
-                        sample && sample->rgba != std::array<float, 4>{})
+                for (const dfb::Brick& brick : s.bricks) // what is all 0 is nothing, unless it has a depth
+                    if (auto sample = sampleOf(s, brick, pass, x, y);
+                        sample && (s.rule == dfb::BlendRule::Nearest || sample->rgba != std::array<float, 4>{})) {
+                        more(*sample, pass, x, y);
                         samples.push_back(*sample);
+                    }
                 passes.push_back(
                     s.rule == dfb::BlendRule::SortByDepth ? dfb::testing::composite(std::move(samples), s.background)
                     : s.rule == dfb::BlendRule::InOrder   ? dfb::testing::compositeInOrder(samples, s.background)
@@ -240,6 +242,11 @@ inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
             result.push_back(dfb::testing::mean(passes));
         }
     return result;
+}
+
+inline std::vector<dfb::testing::Pixel> referenceOf(const Scene& s)
+{
+    return referenceOf(s, [](const dfb::testing::Sample&, int, int, int) {});
 }
 
 // The same where some tiles are not complete.
@@ -301,7 +308,7 @@ std::string outcomeOf(const Call& call)
 
 inline bool has(const std::string& text, const std::string& part) { return text.find(part) != std::string::npos; }
 
-// With one worker, tasks run in the order of arrival. With none, the threads of the ranks do all, also what MPI wants.
+// With one worker, tasks run in the order of arrival. With none, the threads of the ranks run them.
 inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config;
@@ -309,12 +316,10 @@ inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
     config.height = s.height;
     config.format = dfb::OutputFormat::RGBA32F;
     config.depth = true;
-    if (threads > 0) {
+    if (threads > 0)
         config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
-    } else {
+    else
         config.executor = std::make_shared<dfb::CallerExecutor>();
-        config.progress = dfb::Progress::Caller;
-    }
     return config;
 }
 

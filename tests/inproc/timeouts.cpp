@@ -21,6 +21,8 @@
 #include <utility>
 #include <vector>
 
+namespace timeouts_cases {
+
 namespace {
 
 using board::Board;
@@ -720,9 +722,9 @@ TEST_CASE("Progress by the caller: an absent rank that does not poll is a Transp
     runOn(
         std::make_shared<Board>(), 2,
         [&](const auto& communicator) {
-            auto config = smallConfig();
-            config.progress = dfb::Progress::Caller;
-            FrameBuffer fb(communicator, config);
+            dfb::MessengerOptions options;
+            options.progress = dfb::Progress::Caller;
+            FrameBuffer fb(communicator, smallConfig(), options);
             auto frame = fb.begin(timed(true));
             frame.declare({});
             if (fb.rank() == 1)
@@ -740,3 +742,5 @@ TEST_CASE("Progress by the caller: an absent rank that does not poll is a Transp
     CHECK(endings[0].ms >= 2 * limitMs);
     CHECK(endings[0].ms < 2 * limitMs + marginMs);
 }
+
+} // namespace timeouts_cases

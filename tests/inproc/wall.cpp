@@ -6,6 +6,8 @@
 
 #include <map>
 
+namespace wall_cases {
+
 TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
 {
     const auto watched = std::make_shared<board::Board>();
@@ -42,3 +44,5 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
         CHECK(bytes <= 4 * (4096 + 64));
     }
 }
+
+} // namespace wall_cases

@@ -12,6 +12,8 @@
 #include <string>
 #include <vector>
 
+namespace wall_safety_cases {
+
 namespace {
 
 using board::Board;
@@ -88,6 +90,8 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
                     wrong += image.rgba32f()[4 * i] != shade;
             };
             result.texts[rank] = outcomeOf([&] { frame(0.5f); });
+            const bool isShown = result.texts[rank] == "fine";
+            wrong += wall.image(fb.rank()).empty() == isShown || wall.imageFrame() != (isShown ? 1 : -1);
             result.after[rank] = outcomeOf([&] { frame(0.25f); });
         },
         std::nullopt, std::chrono::seconds(20));
@@ -189,3 +193,5 @@ TEST_CASE("A part of a display that is lost is named with its display, one that 
     CHECK(twice.after == fine);
     CHECK(twice.wrong == 0);
 }
+
+} // namespace wall_safety_cases

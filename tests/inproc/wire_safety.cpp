@@ -16,6 +16,8 @@
 #include <string>
 #include <vector>
 
+namespace wire_safety_cases {
+
 namespace {
 
 using board::Board;
@@ -370,3 +372,5 @@ TEST_CASE("Bricks that no rank can have are an error on every rank", "[wire_safe
         CHECK(has(texts[0], lie.part));
     }
 }
+
+} // namespace wire_safety_cases

@@ -13,6 +13,8 @@
 #include <thread>
 #include <vector>
 
+namespace caller_cases {
+
 namespace {
 
 using Op = dfb::BasicOrderedBlend<64>;
@@ -44,13 +46,14 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
     dfb::FrameBufferConfig config;
     config.width = config.height = 64 * 20;
     config.format = dfb::OutputFormat::None;
-    config.progress = dfb::Progress::Caller;
     config.executor = std::make_shared<dfb::CallerExecutor>();
-    config.sharedMemory = false;
     config.messagePoolBytes = std::size_t{1} << 30;
     const int owner = last > 1 ? 1 : 0;
     config.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
-    Fb fb(MPI_COMM_WORLD, config);
+    dfb::MessengerOptions options;
+    options.progress = dfb::Progress::Caller;
+    options.sharedMemory = false;
+    Fb fb(MPI_COMM_WORLD, config, options);
     std::vector<float> pixels(4 * 64 * 64);
     for (std::size_t i = 0; i < pixels.size(); ++i)
         pixels[i] = i % 4 == 3 ? 1.0f : static_cast<float>(i % 1009) / 1009;
@@ -85,3 +88,5 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
         CHECK(passesBarrier(fb));
     }
 }
+
+} // namespace caller_cases

@@ -10,6 +10,8 @@
 #include <string>
 #include <vector>
 
+namespace errors_cases {
+
 namespace {
 
 using scene::has;
@@ -275,3 +277,5 @@ TEST_CASE("A rank that is built for other tiles or operations is refused on ever
         }
     Blend fb(MPI_COMM_WORLD, config); // nothing is left of those
 }
+
+} // namespace errors_cases

@@ -11,6 +11,8 @@
 #include <thread>
 #include <vector>
 
+namespace faults_cases {
+
 namespace {
 
 // Every rank's texts, without waiting inside MPI.
@@ -79,3 +81,5 @@ TEST_CASE("Disturbed frames over MPI end in the right image or in an error of df
         CHECK(harmless > 100);
     }
 }
+
+} // namespace faults_cases

@@ -10,6 +10,8 @@
 #include <string>
 #include <vector>
 
+namespace images_cases {
+
 namespace {
 
 using scene::Loop;
@@ -22,9 +24,9 @@ using Single = dfb::BasicImageParallel<16>;
 // On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
 template <class TileOp, class Transport, class Communicator>
 Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
-                  int deal = 0, int frames = 2)
+                  int deal = 0, const dfb::MessengerOptions& options = {}, int frames = 2)
 {
-    dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(communicator, config);
+    dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(communicator, config, options);
     Picture result;
     for (int frame = 0; frame < frames; ++frame) {
         const auto report = scene::renderLoop(fb, s, loop, deal);
@@ -33,18 +35,19 @@ Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, c
     return result;
 }
 
-Picture overMpi(MPI_Comm communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config, int deal = 0)
+Picture overMpi(MPI_Comm communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config, int deal = 0,
+                const dfb::MessengerOptions& options = {})
 {
-    return scene::isDataParallel(loop) ? pictureOn<Blend, dfb::MpiTransport>(communicator, s, loop, config, deal)
-                                       : pictureOn<Single, dfb::MpiTransport>(communicator, s, loop, config, deal);
+    return scene::isDataParallel(loop)
+               ? pictureOn<Blend, dfb::MpiTransport>(communicator, s, loop, config, deal, options)
+               : pictureOn<Single, dfb::MpiTransport>(communicator, s, loop, config, deal, options);
 }
 
 // The same with ranks in this process.
-Picture inProcess(int ranks, const Scene& s, Loop loop, dfb::FrameBufferConfig config)
+Picture inProcess(int ranks, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config)
 {
     Picture result;
     std::mutex mutex;
-    config.progress = dfb::Progress::Thread;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         auto mine = config;
         mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
@@ -91,10 +94,11 @@ TEST_CASE("The image does not depend on configuration", "[images]")
     const int size = sizeOf(MPI_COMM_WORLD);
     const Scene s = sceneFor(Loop::Declared, 5);
     const std::uint64_t expected = inProcess(1, s, Loop::Declared, configOf(s, 2)).hash();
-    const auto check = [&](const char* what, const std::function<void(dfb::FrameBufferConfig&)>& change, int deal = 0) {
+    const auto check = [&](const char* what, const std::function<void(dfb::FrameBufferConfig&)>& change, int deal = 0,
+                           const dfb::MessengerOptions& options = {}) {
         auto config = configOf(s, 2);
         change(config);
-        const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config, deal);
+        const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config, deal, options);
         INFO(what);
         CHECK((rankIn(MPI_COMM_WORLD) == config.displayRank ? p.hash() == expected : p.bytes.empty()));
     };
@@ -104,11 +108,12 @@ TEST_CASE("The image does not depend on configuration", "[images]")
         "all bricks on the last rank", [](auto&) {}, -1);
     check("another display rank", [&](auto& c) { c.displayRank = size - 1; });
     check("linear owners", [](auto& c) { c.ownerMap = dfb::linearOwner; });
-    check("progress by the caller", [](auto& c) { c.progress = dfb::Progress::Caller; });
-    check("no threads of its own", [](auto& c) {
-        c.progress = dfb::Progress::Caller;
-        c.executor = std::make_shared<dfb::CallerExecutor>();
-    });
+    dfb::MessengerOptions byCaller;
+    byCaller.progress = dfb::Progress::Caller;
+    check(
+        "progress by the caller", [](auto&) {}, 0, byCaller);
+    check(
+        "no threads of its own", [](auto& c) { c.executor = std::make_shared<dfb::CallerExecutor>(); }, 0, byCaller);
     check("one worker", [](auto& c) { c.executor = std::make_shared<dfb::ThreadExecutor>(1); });
 #if defined(DFB_HAS_TBB)
     check("oneTBB", [](auto& c) { c.executor = std::make_shared<dfb::TbbExecutor>(2); });
@@ -149,7 +154,7 @@ TEST_CASE("Ordinary: an empty view, one pixel, a declaration that is kept", "[im
     dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s, 2));
     std::vector<std::int64_t> messages;
     for (int frame = 0; frame < 3; ++frame) {
-        const auto report = scene::renderLoop(fb, s, Loop::Declared, 0, 77);
+        const auto report = scene::renderLoop(fb, s, Loop::Declared);
         messages.push_back(report.messagesSent);
         if (fb.isDisplayRank())
             CHECK(scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0);
@@ -198,3 +203,5 @@ TEST_CASE("A part of the ranks, and two framebuffers on different communicators 
     }
     CHECK(MPI_Comm_free(&half) == MPI_SUCCESS); // it is still the caller's
 }
+
+} // namespace images_cases

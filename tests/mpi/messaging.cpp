@@ -19,6 +19,8 @@
 #include <utility>
 #include <vector>
 
+namespace messaging_cases {
+
 namespace {
 
 using dfb::detail::MessageHeader;
@@ -126,10 +128,11 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
     for (const flood::NamedExecutor& e : executors())
         for (const From from : {From::Loop, From::Thread}) {
             auto config = floodConfig(256, e.make());
-            config.sharedMemory = from == From::Loop;
+            dfb::MessengerOptions options;
+            options.sharedMemory = from == From::Loop;
             config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
             config.displayRank = ranks - 1;
-            AddingFrameBuffer fb(MPI_COMM_WORLD, config);
+            AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
             dfb::FrameReport report;
             for (int i = 0; i < 2; ++i) {
                 report = floodFrame(fb, parts, from, longMs);
@@ -159,9 +162,10 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
             for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
                 auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
                 config.gather = gather;
-                config.progress = progress;
-                config.sharedMemory = gather == dfb::GatherMode::Batches;
-                AddingFrameBuffer fb(MPI_COMM_WORLD, config);
+                dfb::MessengerOptions options;
+                options.progress = progress;
+                options.sharedMemory = gather == dfb::GatherMode::Batches;
+                AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
                 const auto report = floodFrame(fb, 2, From::Loop, longMs);
                 INFO(e.name);
                 if (fb.isDisplayRank())
@@ -177,8 +181,9 @@ TEST_CASE("Gathering at the end, or all through MPI, gives the same image bit fo
     for (const bool shared : {true, false}) {
         auto config = configOf(s);
         config.gather = shared ? dfb::GatherMode::Batches : dfb::GatherMode::AtEnd;
-        config.sharedMemory = shared;
-        dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config);
+        dfb::MessengerOptions options;
+        options.sharedMemory = shared;
+        dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config, options);
         for (int i = 0; i < 2; ++i) {
             const auto report = scene::renderLoop(fb, s, Loop::Declared);
             hashes.push_back(fb.isDisplayRank() ? Picture(fb.image(), report).hash() : 0);
@@ -258,9 +263,9 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
                         std::byte{64};
                 return TamperingTransport::What::Pass;
             };
-            auto config = configOf(s);
-            config.checksums = true;
-            TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, damage}, config);
+            dfb::MessengerOptions options;
+            options.checksums = true;
+            TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, damage}, configOf(s), options);
             CHECK(goodFrame(fb, s));
             bool right = true;
             const std::string text = outcomeOf([&] {
@@ -390,7 +395,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
 {
     const Scene s = sceneFor(6, 10);
     auto config = configOf(s);
-    config.progress = dfb::Progress::Caller;
+    dfb::MessengerOptions options;
+    options.progress = dfb::Progress::Caller;
     const int size = sizeOf(MPI_COMM_WORLD), rank = rankIn(MPI_COMM_WORLD);
     config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
     static std::atomic<int> inputs;
@@ -402,7 +408,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
             ++inputs;
         }
     };
-    dfb::DistributedFrameBuffer<Counter> fb(MPI_COMM_WORLD, config);
+    dfb::DistributedFrameBuffer<Counter> fb(MPI_COMM_WORLD, config, options);
     {
         auto frame = fb.begin(scene::paramsOf(s));
         MPI_Barrier(MPI_COMM_WORLD); // rank 0 is done with what makes it move messages by itself
@@ -480,3 +486,5 @@ TEST_CASE("A message of more than 2 GiB comes whole", "[messaging][.stress]")
     CHECK(inbox.byteCount == (rank == last ? byteCount : 0));
     CHECK(inbox.checksum == (rank == last ? checksum : 0));
 }
+
+} // namespace messaging_cases

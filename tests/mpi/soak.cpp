@@ -12,6 +12,8 @@
 #include <string>
 #include <vector>
 
+namespace soak_cases {
+
 // Sanitizers keep memory that was freed, to find who uses it.
 #if defined(__SANITIZE_ADDRESS__)
 #define SOAK_WITHOUT_MEMORY
@@ -93,8 +95,9 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
     auto config = configOf(first, 1 + static_cast<int>(h >> 24 & 1));
     config.displayRank = static_cast<int>(h >> 32 & 255) % sizeOf(communicator);
     config.gather = (h >> 40) % 2 ? dfb::GatherMode::AtEnd : dfb::GatherMode::Batches;
-    config.sharedMemory = (h >> 41) % 4 != 0;
-    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config);
+    dfb::MessengerOptions options;
+    options.sharedMemory = (h >> 41) % 4 != 0;
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config, options);
     std::string wrong;
     for (int frame = 0; frame < frames; ++frame) {
         scene::Scene s = first; // with other bricks
@@ -180,3 +183,5 @@ void soak(int frames)
 TEST_CASE("Framebuffers come and go on parts of the ranks, and leave nothing behind", "[soak]") { soak(800); }
 
 TEST_CASE("20,000 frames leave nothing behind", "[soak][.stress]") { soak(20000); }
+
+} // namespace soak_cases

@@ -49,7 +49,7 @@ set(_name_of_tbb TBB)
 set(_name_of_snappy Snappy)
 
 # Everything, in three ways.
-dfb_add_package_test(find_package HOW find_package VERSION 0.1 EXPECT ${_others})
+dfb_add_package_test(find_package HOW find_package VERSION 0.1 EXPECT ${_others} OPTIONS -DFRAME=ON)
 foreach(_how add_subdirectory FetchContent)
   set(_options "")
   foreach(_component mpi tbb snappy)
@@ -60,7 +60,7 @@ foreach(_how add_subdirectory FetchContent)
 endforeach()
 
 # Core alone, and each component alone, on a machine that has nothing else.
-dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy)
+dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy OPTIONS -DFRAME=ON)
 dfb_add_package_test(add_subdirectory_core HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF)
 foreach(_component IN LISTS _others)

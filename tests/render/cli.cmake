@@ -12,6 +12,16 @@ find_package(nlohmann_json CONFIG REQUIRED) # dfb_render has it, too
 add_executable(dfb_check_stats render/tools/check_stats.cpp)
 target_link_libraries(dfb_check_stats PRIVATE dfb_developer nlohmann_json::nlohmann_json)
 
+# The same program, but that rank 1 stops in the middle of its frames.
+if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
+  add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> render/tools/stop_rank.cpp)
+  target_link_libraries(dfb_render_stopped PRIVATE dfb_developer dfb_embree_example)
+  dfb_add_mpi_run(render.peer_timeout RANKS 2 TIMEOUT 20 LABELS example
+    COMMAND $<TARGET_FILE:dfb_render_stopped> demo --size 64x64 --frames 1000000 --peer-timeout 1)
+  set_tests_properties(render.peer_timeout.np2 PROPERTIES
+    PASS_REGULAR_EXPRESSION "dfb: transport failure: rank 1: this rank is lost")
+endif()
+
 set(_launch "")
 if(TARGET dfb::mpi)
   set(_launch ${MPIEXEC_EXECUTABLE} ${_mpiexec_flags} ${MPIEXEC_PREFLAGS} ${MPIEXEC_NUMPROC_FLAG})
@@ -42,11 +52,11 @@ function(_add_cli_case case)
     add_test(NAME render.cli.${case}.${start}
       COMMAND ${CMAKE_COMMAND} -DSETTINGS=${_settings} -DCASE=${case} -DSTART=${start}
         -P ${CMAKE_CURRENT_SOURCE_DIR}/render/cli_cases.cmake)
-    set(processors 2)
+    set(slots ${_busy_ranks})
     if(start STREQUAL "one" OR start STREQUAL "np1")
-      set(processors 1)
+      set(slots ${_busy})
     endif()
-    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180 PROCESSORS ${processors})
+    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180 PROCESSORS ${slots})
   endforeach()
 endfunction()
 
@@ -70,6 +80,7 @@ _add_cli_case(png ranks2 np3)
 _add_cli_case(far ranks3 np3)
 _add_cli_case(hash ranks1 ranks2 ranks5 np1 np3 np4)
 _add_cli_case(modes ranks3 np3)
+_add_cli_case(shared_memory np2)
 if(EXISTS ${DFB_TEST_DATA}/boston_teapot_256x256x178_uint8.raw)
   _add_cli_case(teapot one)
 endif()

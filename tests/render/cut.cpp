@@ -19,6 +19,8 @@
 #include <utility>
 #include <vector>
 
+namespace cut_cases {
+
 namespace {
 
 using example::Box;
@@ -620,3 +622,5 @@ TEST_CASE("Figures of a frame are plausible", "[cut]")
     CHECK(four.report.bytesSent < 20 * 200 * 150 * 20);
     CHECK(four.report.messagesSent > 10);
 }
+
+} // namespace cut_cases

@@ -9,6 +9,8 @@
 #include <utility>
 #include <vector>
 
+namespace options_cases {
+
 using namespace example;
 
 namespace {
@@ -59,6 +61,9 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.compression == Compression::None);
     CHECK(o.sharedMemory);
     CHECK(o.peerTimeout == 300);
+    CHECK(o.xyzFrame == 0);
+    CHECK(o.deep == 0);
+    CHECK_FALSE(o.view.distance);
     CHECK(o.ownerMap == OwnerMap::Lattice);
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
@@ -179,6 +184,8 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
             checkRefused({option, value});
     checkRefused({"--fov", "0"});
     checkRefused({"--camera-distance", "-1"});
+    for (const std::string value : {"0", "-1", "1.5", "last"})
+        checkRefused({"--xyz-frame", value});
     checkRefused({"--opacity", "1.01"});
     checkRefused({"--opacity", "-0.01"});
     checkRefused({"--background", "1,1"});
@@ -310,6 +317,15 @@ TEST_CASE("A pattern numbers the files of the frames", "[options]")
     checkRefused({"--stats", "s_%d.json"}); // one file for all frames
 }
 
+TEST_CASE("Bricks that lie in each other have as many segments as they have cells", "[options]")
+{
+    CHECK(options({"demo", "--interleave", "5"}).deep == 5);
+    CHECK(options({"demo", "--interleave", "1"}).deep == 0);
+    CHECK(options({"demo", "--interleave", "5", "--deep", "2"}).deep == 2);
+    CHECK(options({"demo", "--interleave", "5", "--deep", "0"}).deep == 0);
+    CHECK(options({"demo", "--deep", "3"}).deep == 3);
+}
+
 TEST_CASE("A scene must be named", "[options]")
 {
     for (const std::vector<std::string>& words : std::vector<std::vector<std::string>>{{},
@@ -350,3 +366,5 @@ TEST_CASE("The help says it all", "[options]")
     }
     CHECK(parse({"demo", "--size", "9x9", "--help"}).exitCode == 0);
 }
+
+} // namespace options_cases

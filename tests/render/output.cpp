@@ -13,6 +13,8 @@
 #include <string>
 #include <vector>
 
+namespace output_cases {
+
 using namespace example;
 using test::errorOf;
 using test::isLineWith;
@@ -344,3 +346,5 @@ TEST_CASE("To ask whether a file can be written leaves all as it is", "[output]"
     std::ifstream(old) >> text;
     CHECK(text == "text");
 }
+
+} // namespace output_cases

@@ -17,6 +17,8 @@
 #include <string>
 #include <vector>
 
+namespace readers_cases {
+
 using namespace example;
 using test::errorOf;
 using test::isLineWith;
@@ -454,7 +456,7 @@ TEST_CASE("OBJ: bad vertices and faces", "[readers]")
         INFO('\'' << from << "' becomes '" << to << '\'');
         CHECK(isLineWith(objRefusal(replaced(plainObj, from, to)), "the.file: "));
     }
-    // What tinyobjloader would cut to 32 bits, or to the digits; and where it sees the end of a line.
+    // What does not fit into 32 bits, or is more than digits; and lines that end with \r.
     for (const char* face : {"f 1 2 4294967299", "f 1 2 3x", "f 1 2 3/x"})
         CHECK(isLineWith(objRefusal(replaced(plainObj, "f -1 2 1", face)), "the.file: "));
     for (const char* lines : {"v 1 nan 0\r", "#\rv 1 nan 0\n"})
@@ -490,14 +492,174 @@ TEST_CASE("XYZ: wrong counts and bad lines", "[readers]")
         INFO(size << " bytes");
         CHECK(isLineWith(xyzRefusal(good.substr(0, size)), "the.file: "));
     }
-    for (const std::string bytes :
-         {"0\n\n", "-1\n\nC 0 0 0\n", "one\n\nC 0 0 0\n", "1 2\n\nC 0 0 0\n", "1.0\n\nC 0 0 0\n",
-          "99999999999999999999999\n\nC 0 0 0\n", "4000000000\n\nC 0 0 0\n", "1\n\nC 0 0 0\nC 1 1 1\n",
-          "2\n\nC 0 0 0\n", "1\n\nC 0 0\n", "1\n\nC 0 0 0 0\n", "1\n\nC 0 zero 0\n", "1\n\nC 0 nan 0\n",
-          "1\n\nC 0 inf 0\n", "1\n\nC 0 1e30 0\n", "1\n\nC 0 1e99 0\n", "1\n\n\nC 0 0 0\n", "1\n\nC 0,0 0 0\n"}) {
+    for (const std::string bytes : {"0\n\n",
+                                    "-1\n\nC 0 0 0\n",
+                                    "one\n\nC 0 0 0\n",
+                                    "1 2\n\nC 0 0 0\n",
+                                    "1.0\n\nC 0 0 0\n",
+                                    "99999999999999999999999\n\nC 0 0 0\n",
+                                    "4000000000\n\nC 0 0 0\n",
+                                    "1\n\nC 0 0 0\nC 1 1 1\n",
+                                    "2\n\nC 0 0 0\n",
+                                    "1\n\nC 0 0\n",
+                                    "1\n\nC 0 zero 0\n",
+                                    "1\n\nC 0 nan 0\n",
+                                    "1\n\nC 0 +-1 0\n",
+                                    "1\n\nC 0 inf 0\n",
+                                    "1\n\nC 0 1e30 0\n",
+                                    "1\n\nC 0 1e99 0\n",
+                                    "1\n\n\nC 0 0 0\n",
+                                    "1\n\nC 0,0 0 0\n",
+                                    "1\nProperties=pos:R:3\n0 0 0\n",
+                                    "1\nProperties=species:S:1:pos:R\nC 0 0 0\n",
+                                    "1\nProperties=species:S:1:pos:R:2\nC 0 0 0\n",
+                                    "1\nProperties=id:I:1:species:S:1:pos:R:3\n7 C 0 0\n",
+                                    "1\nProperties=species:S:1:pos:R:99999999999\nC 0 0 0\n"}) {
         INFO(bytes);
         CHECK(isLineWith(xyzRefusal(bytes), "the.file: "));
     }
+}
+
+TEST_CASE("XYZ: more columns, signs, elements in upper or lower case or by number", "[readers]")
+{
+    Notes notes;
+    const std::string atoms = "Fe +0.5 -1 +2e0 0.1 extra 7\nfe 1 2 3\nFE 1 2 3\n26 1 2 3\nCL 1 2 3\nc 0 1e-50 0\n";
+    const std::vector<Sphere> spheres = parseXyz("6\n\n" + atoms, "a.xyz", 0, &notes);
+    REQUIRE(spheres.size() == 6);
+    CHECK(same(spheres[0].center, {0.5f, -1, 2}));
+    CHECK(same(spheres[5].center, {0, 0, 0}));
+    const Sphere chlorine = parseXyz("1\n\nCl 0 0 0\n", "a.xyz").front();
+    const Sphere carbon = parseXyz("1\n\nC 0 0 0\n", "a.xyz").front();
+    for (std::size_t i = 1; i < 4; ++i) {
+        CHECK(same(spheres[i].color, spheres[0].color));
+        CHECK(spheres[i].radius == spheres[0].radius);
+    }
+    CHECK_FALSE(same(spheres[0].color, carbon.color));
+    CHECK(same(spheres[4].color, chlorine.color));
+    CHECK(spheres[4].radius == 1.75f);
+    CHECK(same(spheres[5].color, carbon.color));
+    CHECK(notes.empty());
+}
+
+TEST_CASE("XYZ: unknown elements are drawn and named", "[readers]")
+{
+    Notes notes;
+    const auto spheres =
+        parseXyz("6\n\nXx 0 0 0\nC 1 0 0\nC1 2 0 0\nXx 3 0 0\n119 4 0 0\n0 0 0 1\n", "a.xyz", 0, &notes);
+    CHECK(spheres.size() == 6);
+    REQUIRE(notes.size() == 1);
+    CHECK(isLineWith(notes[0], "a.xyz: "));
+    for (const char* part : {"Xx (2)", "C1 (1)", "119 (1)", "0 (1)"})
+        CHECK(test::contains(notes[0], part));
+    CHECK_FALSE(test::contains(notes[0], "C (")); // which is known
+    std::string many = "50\n\n";
+    for (int i = 0; i < 50; ++i)
+        many += "Q" + std::to_string(i) + std::string(100, 'q') + " 0 0 0\n";
+    notes.clear();
+    parseXyz(many, "a.xyz", 0, &notes);
+    REQUIRE(notes.size() == 1);
+    CHECK(test::contains(notes[0], " and 44 more"));
+    CHECK(notes[0].size() < 300);
+}
+
+TEST_CASE("XYZ: the comment of extended XYZ says what the columns are", "[readers]")
+{
+    for (const std::string properties :
+         {"Properties=pos:R:3:mass:R:1:species:S:1:id:I:1",
+          "Lattice=\"1 0 0\" Properties=\"pos:R:3:mass:R:1:species:S:1\" pbc=\"T T T\""}) {
+        const auto spheres = parseXyz("1\n" + properties + "\n1 2 3 16 O 5\n", "a.xyz");
+        REQUIRE(spheres.size() == 1);
+        CHECK(same(spheres[0].center, {1, 2, 3}));
+        CHECK(spheres[0].radius == 1.52f);
+    }
+    const auto usual = parseXyz("1\nProperties=species:S:1:pos:R:3:forces:R:3\nO 1 2 3 4 5 6\n", "a.xyz");
+    CHECK(same(usual.at(0).center, {1, 2, 3}));
+}
+
+TEST_CASE("XYZ: of several frames the first, or the one that is asked for", "[readers]")
+{
+    const std::string bytes = "1\nfirst\nC 1 0 0\n2\nsecond\nC 2 0 0\nC 3 0 0\n\n1\nthird\nC 4 0 0\n \n";
+    Notes notes;
+    const auto first = parseXyz(bytes, "a.xyz", 0, &notes);
+    REQUIRE(first.size() == 1);
+    CHECK(first[0].center.x == 1.0f);
+    REQUIRE(notes.size() == 1);
+    CHECK(isLineWith(notes[0], "a.xyz: the first of several frames"));
+    CHECK(test::contains(notes[0], "--xyz-frame"));
+    notes.clear();
+    CHECK(parseXyz(bytes, "a.xyz", 1, &notes).size() == 1);
+    CHECK(parseXyz(bytes, "a.xyz", 2, &notes).at(1).center.x == 3.0f);
+    CHECK(parseXyz(bytes, "a.xyz", 3, &notes).at(0).center.x == 4.0f);
+    CHECK(parseXyz("1\n\nC 0 0 0\n\n", "a.xyz", 0, &notes).size() == 1);
+    CHECK(notes.empty()); // it was asked for, or there is but one
+    const std::string error = errorOf([&] { parseXyz(bytes, "a.xyz", 4); });
+    CHECK(isLineWith(error, "a.xyz: "));
+    CHECK(test::contains(error, "frame 4"));
+    CHECK(test::contains(error, "3 frames"));
+    // A frame before it that is wrong, and a count that is too small.
+    CHECK(isLineWith(errorOf([&] { parseXyz("1\n\nC 0 0 0\nC 1 1 1\n1\n\nC 0 0 0\n", "a.xyz", 2); }), "line 4"));
+    CHECK(isLineWith(errorOf([&] { parseXyz("9\n\nC 0 0 0\n1\n\nC 0 0 0\n", "a.xyz", 2); }), "a.xyz: "));
+}
+
+TEST_CASE("OBJ: errors name the line, and the index as it is in the file", "[readers]")
+{
+    const std::string vertices = "# four\nv 0 0 0\nv 1 0 0 # a comment\nv 1 1 0\n\nv 0 1 0\n";
+    const std::vector<std::pair<std::string, std::string>> wrong{
+        {"f 1 2 99\n", "vertex 99"},      {"f 1 2 0\n", "vertex 0"},
+        {"f 1/1 -7//2 3\n", "vertex -7"}, {"f 1 2 4294967299\n", "vertex 4294967299"},
+        {"f 1 2 x3\n", "'x3'"},           {"f 1 2\n", "2 vertices"},
+        {"v 1 nan 0\n", "'nan'"},         {"v 1 2\n", "x y z"},
+        {"v 1 1e20 0\n", "1e15"}};
+    for (const auto& [line, part] : wrong) {
+        INFO(line);
+        const std::string error = objRefusal(vertices + "f 1 2 3 4 # all\n" + line);
+        CHECK(isLineWith(error, "the.file: line 8: "));
+        CHECK(test::contains(error, part));
+    }
+}
+
+TEST_CASE("The colours of vertices are taken as sRGB", "[readers]")
+{
+    const Vec3 black(0, 0, 0), half(0.214f, 0.214f, 0.214f), red(1, 0, 0);
+    const auto check = [&](const Mesh& mesh) {
+        REQUIRE(mesh.positions.size() == 3);
+        REQUIRE(mesh.colors.size() == 3);
+        CHECK(same(mesh.colors[0], black));
+        CHECK(length(mesh.colors[1] - half) < 4e-3f); // 128 is not quite a half of 255
+        CHECK(same(mesh.colors[2], red));
+    };
+    const auto ply = [](const std::string& type, const std::string& prefix) {
+        return plyHeader("ascii", "element vertex 3\nproperty float x\nproperty float y\nproperty float z\nproperty "
+                                      + type + " " + prefix + "red\nproperty " + type + " " + prefix
+                                      + "green\nproperty " + type + " " + prefix
+                                      + "blue\nproperty uchar alpha\nelement face 1\n"
+                                        "property list uchar int vertex_indices\n");
+    };
+    Notes notes;
+    check(parsePly(ply("uchar", "") + "0 0 0 0 0 0 9\n1 0 0 128 128 128 9\n0 1 0 255 0 0 9\n3 0 1 2\n", "a", &notes));
+    check(parsePly(ply("uchar", "diffuse_") + "0 0 0 0 0 0 9\n1 0 0 128 128 128 9\n0 1 0 255 0 0 9\n3 0 1 2\n", "a"));
+    check(parsePly(ply("ushort", "") + "0 0 0 0 0 0 9\n1 0 0 32768 32768 32768 9\n0 +1 0 65535 0 0 9\n3 0 1 2\n", "a"));
+    check(parsePly(ply("float", "") + "0 0 0 0 0 0 9\n1 0 0 0.5 0.5 0.5 9\n0 1 0 1 0 0 9\n3 0 1 2\n", "a"));
+    check(parseObj("v 0 0 0 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "a", &notes));
+    CHECK(notes.empty());
+    // Not of all, not a colour, no colour at all, and those of faces.
+    CHECK(parseObj("v 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "a.obj", &notes).colors.empty());
+    CHECK(parseObj("v 0 0 0 0 0 9\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n", "b.obj", &notes).colors.empty());
+    CHECK(parsePly(ply("float", "") + "0 0 0 0 0 0 9\n1 0 0 nan 0.5 0.5 9\n0 1 0 1 0 0 9\n3 0 1 2\n", "c.ply", &notes)
+              .colors.empty());
+    REQUIRE(notes.size() == 3);
+    for (std::size_t i = 0; i < 3; ++i)
+        CHECK(isLineWith(notes[i], std::vector<std::string>{"a.obj: ", "b.obj: ", "c.ply: "}[i]));
+    notes.clear();
+    parsePly(plyHeader("ascii", plainElements + "property uchar red\n")
+                 + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 0.25 -2\n4 0 1 2 3 9\n3 4 1 0 9\n",
+             "d.ply", &notes);
+    REQUIRE(notes.size() == 1);
+    CHECK(isLineWith(notes[0], "d.ply: the colours of faces"));
+    notes.clear();
+    parsePly(asciiMixed(), "a.ply", &notes); // red alone is no colour
+    parseObj(plainObj, "a.obj", &notes);     // nor is a weight
+    CHECK(notes.empty());
 }
 
 TEST_CASE("A scene takes files by their ending and says which one is wrong", "[readers]")
@@ -535,6 +697,44 @@ TEST_CASE("A scene takes files by their ending and says which one is wrong", "[r
     }
 }
 
+TEST_CASE("A scene says what is not as its files may have meant it", "[readers]")
+{
+    const test::TemporaryFolder folder;
+    const auto notesOf = [&](const std::string& name, const std::string& bytes) {
+        Scene scene;
+        addFile(scene, folder.write(name, bytes), true);
+        return scene.notes;
+    };
+    const auto checkNote = [](const Notes& notes, const std::string& name, const std::string& part) {
+        REQUIRE(notes.size() == 1);
+        CHECK(isLineWith(notes[0], name + ": "));
+        CHECK(test::contains(notes[0], part));
+    };
+    const float nan = std::numeric_limits<float>::quiet_NaN(), inf = std::numeric_limits<float>::infinity();
+    std::string sparse(100 * 100 * 100, '\0');
+    for (const std::size_t at : {50u * 10000 + 51 * 100 + 51, 3u}) { // one bright voxel beside the lattice, or on it
+        CHECK(notesOf("s_100x100x100_uint8.raw", std::string(sparse).replace(at, 1, "\xff")).empty());
+    }
+    CHECK(notesOf("a_2x3x4_uint8.raw", std::string(24, 'v')).empty());
+    CHECK(notesOf("a_2x2x2_uint16.raw", bytesOf<std::uint16_t>({9, 7, 300, 40000, 7, 8, 9, 10})).empty());
+    CHECK(notesOf("a_2x2x2_float32.raw", bytesOf<float>({0, 0, 0, 0, 0, 0, 0, 1e-9f})).empty());
+    checkNote(notesOf("z_2x3x4_uint8.raw", std::string(24, '\0')), folder / "z_2x3x4_uint8.raw", "all voxels are 0");
+    checkNote(notesOf("s_100x100x100_uint8.raw", sparse), folder / "s_100x100x100_uint8.raw", "all voxels are 0");
+    checkNote(notesOf("d_2x3x4_uint8.raw", std::string(23, '\0') + '\x09'), folder / "d_2x3x4_uint8.raw",
+              "from 0 to 9");
+    checkNote(notesOf("z_2x2x2_uint16.raw", std::string(16, '\0')), folder / "z_2x2x2_uint16.raw", "all voxels are 0");
+    checkNote(notesOf("z_2x2x2_float32.raw", bytesOf(std::vector<float>(8, 2.5f))), folder / "z_2x2x2_float32.raw",
+              "all voxels are 2.5");
+    checkNote(notesOf("n_2x2x2_float32.raw", bytesOf<float>({-3, 0, nan, 5, inf, -inf, 2, 1})),
+              folder / "n_2x2x2_float32.raw", "not finite: 3; they count as 0");
+    // Those of readers arrive as well.
+    checkNote(notesOf("u.xyz", "1\n\nXx 0 0 0\n"), folder / "u.xyz", "Xx (1)");
+    checkNote(notesOf("u.obj", "v 0 0 0\nv 1 0 0 0.5 0.5 .5\nv 0 1 0 1 0 0\nf 1 2 3\n"), folder / "u.obj", "colours");
+    checkNote(notesOf("u.ply", plyHeader("ascii", plainElements + "property uchar red\n")
+                                   + "0 0 0\n1 0 0\n1 1 0\n0 1 0\n0.5 0.25 -2\n4 0 1 2 3 9\n3 4 1 0 9\n"),
+              folder / "u.ply", "colours");
+}
+
 TEST_CASE("What is too small beside its place is left where it is", "[readers]")
 {
     for (const float place : {1e14f, 0.0f})
@@ -545,3 +745,5 @@ TEST_CASE("What is too small beside its place is left where it is", "[readers]")
                 CHECK((std::isfinite(p.x) && std::isfinite(p.y) && std::isfinite(p.z)));
         }
 }
+
+} // namespace readers_cases

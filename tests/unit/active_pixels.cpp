@@ -13,6 +13,8 @@
 #include <random>
 #include <vector>
 
+namespace active_pixels_cases {
+
 namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
@@ -41,6 +43,28 @@ TEST_CASE("A pixel is active if any of its channels is not 0, whatever the sign"
             }
             CHECK(dfb::detail::activePixelBits(rgba, pixels) == expected);
             CHECK(dfb::detail::findActivePixels(rgba, pixels) == expected);
+        }
+}
+
+TEST_CASE("By depth a pixel is active if that is below infinity, and NaN is noticed", "[wire]")
+{
+    std::mt19937 random(8);
+    const float values[] = {infinity, infinity, notANumber, -notANumber, -infinity, 0, -0.0f, -1, 1e38f, denormal};
+    for (int count = 0; count <= 64; ++count)
+        for (int round = 0; round < 20; ++round) {
+            std::vector<float> row(static_cast<std::size_t>(count) + 1);
+            for (float& value : row)
+                value = values[random() % 10];
+            const float* depth = row.data() + random() % 2; // not aligned either
+            std::uint64_t active = 0, nan = 0;
+            for (int i = 0; i < count; ++i) {
+                active |= std::uint64_t{depth[i] < infinity} << i;
+                nan |= std::uint64_t{std::isnan(depth[i])} << i;
+            }
+            for (const auto& bits : {dfb::detail::depthBits(depth, count), dfb::detail::findDepths(depth, count)}) {
+                CHECK(bits.active == active);
+                CHECK(bits.nan == nan);
+            }
         }
 }
 
@@ -106,7 +130,7 @@ TEST_CASE("Spans reach over the places where a row is cut for the search", "[wir
             tile->pixel(x, 0)[3] = 1;                   // all
             tile->pixel(x, 1)[0] = x % 64 != 5 ? 1 : 0; // with gaps
         }
-        active.gather(*tile, dfb::colorChannel, colors.data());
+        active.gather(*tile, dfb::colorChannel, false, colors.data());
         REQUIRE(active.rowCounts.size() == 2);
         CHECK(active.rowCounts[0] == 1);
         CHECK(active.spans[0].count == width);
@@ -140,12 +164,12 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
                     image[static_cast<std::size_t>(4 * (y * stride + x) + c)] =
                         valid.contains(r.x0 + x, r.y0 + y) ? (random() % 8 ? 0.5f : 0.0f) : notANumber;
         dfb::detail::ActivePixels narrow, wide;
-        narrow.gather(view, dfb::colorChannel, colors.data());
+        narrow.gather(view, dfb::colorChannel, false, colors.data());
         CHECK_FALSE(narrow.mayBeFaulty());
         for (float& value : image)
             value = std::isnan(value) ? 0 : value;
         view.valid = view.region;
-        wide.gather(view, dfb::colorChannel, expectedColors.data());
+        wide.gather(view, dfb::colorChannel, false, expectedColors.data());
         REQUIRE(narrow.pixels == wide.pixels);
         CHECK((narrow.pixels == 0 || (narrow.rowBegin == wide.rowBegin && narrow.rowEnd == wide.rowEnd)));
         CHECK(narrow.rowCounts == wide.rowCounts);
@@ -154,3 +178,5 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
         CHECK(std::equal(colors.begin(), colors.begin() + 4 * narrow.pixels, expectedColors.begin()));
     }
 }
+
+} // namespace active_pixels_cases

@@ -10,6 +10,8 @@
 #include <random>
 #include <vector>
 
+namespace background_pixels_cases {
+
 TEST_CASE("Of pixels that become background those are written that are not", "[background_pixels]")
 {
     for (const int width : {1, 63, 64, 65, 200}) {
@@ -97,3 +99,5 @@ TEST_CASE("A finished tile leaves alone what is the background already, and noth
     CHECK(std::count(depth.begin(), depth.end(), std::numeric_limits<float>::infinity()) == width * height);
     CHECK((color.back() == 1 && color.front() == 0.5f));
 }
+
+} // namespace background_pixels_cases

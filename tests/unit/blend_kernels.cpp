@@ -14,6 +14,8 @@
 #include <numeric>
 #include <vector>
 
+namespace blend_kernels_cases {
+
 namespace {
 
 namespace d = dfb::detail;
@@ -328,3 +330,5 @@ TEST_CASE("An infinity behind what is opaque shows nothing of the tile before", 
     const std::size_t rowBytes = 16 * 4 * sizeof(float);
     CHECK(std::memcmp(out.color.data(), out.color.data() + rowBytes, rowBytes) == 0);
 }
+
+} // namespace blend_kernels_cases

@@ -11,6 +11,8 @@
 #include <string>
 #include <vector>
 
+namespace cameras_cases {
+
 namespace {
 
 using Random = std::mt19937_64;
@@ -140,3 +142,5 @@ TEST_CASE("Cameras that are none are refused", "[cameras]")
     CHECK_THROWS_AS(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, {0, 0, 0}, 5), InvalidArgument);
     CHECK_THROWS_AS(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, {0, 1, 0}, 361), InvalidArgument);
 }
+
+} // namespace cameras_cases

@@ -11,6 +11,8 @@
 #include <string>
 #include <vector>
 
+namespace checksum_cases {
+
 namespace {
 
 using Bytes = std::vector<std::byte>;
@@ -113,3 +115,5 @@ TEST_CASE("crc32c finds each wrong bit of a message, and two")
 }
 
 } // namespace
+
+} // namespace checksum_cases

@@ -5,6 +5,8 @@
 
 #include <vector>
 
+namespace compression_gains_cases {
+
 namespace {
 
 // In which of so many frames rank 1 of 2 is worthwhile, if messages of 1000 bytes to it become `sent(frame)`.
@@ -49,3 +51,5 @@ TEST_CASE("A rank that begins to gain is compressed for again, if it is worth it
     // Between giving up and coming back there is some room.
     CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 12);
 }
+
+} // namespace compression_gains_cases

@@ -7,6 +7,8 @@
 #include <random>
 #include <vector>
 
+namespace compression_trial_cases {
+
 using dfb::detail::CompressionTrial;
 
 namespace {
@@ -98,3 +100,5 @@ TEST_CASE("Who is told the same chooses the same", "[compression]")
         b.took(time);
     }
 }
+
+} // namespace compression_trial_cases

@@ -12,6 +12,8 @@
 #include <set>
 #include <vector>
 
+namespace dither_cases {
+
 namespace {
 
 using dfb::OutputFormat;
@@ -202,3 +204,5 @@ TEST_CASE("A row says how far alpha is from a level, and other formats are as ev
     dfb::ditherPixels(rgba, 2, OutputFormat::None, 0, 0, dithered);
     CHECK(std::equal(dithered, dithered + 32, plain));
 }
+
+} // namespace dither_cases

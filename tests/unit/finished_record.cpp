@@ -11,6 +11,8 @@
 #include <random>
 #include <vector>
 
+namespace finished_record_cases {
+
 namespace {
 
 namespace d = dfb::detail;
@@ -160,3 +162,5 @@ TEST_CASE("Finished tiles that are malformed are refused or stay within their ti
     CHECK(refused > 9000); // those that were cut, at least, and most others
     CHECK(taken > 100);    // a changed padding or pixel harms nobody
 }
+
+} // namespace finished_record_cases

@@ -15,6 +15,8 @@
 #include <utility>
 #include <vector>
 
+namespace flow_control_cases {
+
 namespace {
 
 using dfb::Buffer;
@@ -731,3 +733,5 @@ TEST_CASE("A receiver answers in the order of asking, the whole or the first mes
     CHECK((last().source == 1 && last().granted == 101));
     CHECK(flow.peakInboxBytes() == 30);
 }
+
+} // namespace flow_control_cases

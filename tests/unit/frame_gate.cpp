@@ -6,6 +6,8 @@
 #include <atomic>
 #include <thread>
 
+namespace frame_gate_cases {
+
 using dfb::detail::FrameGate;
 
 const auto noHelp = [] { return false; };
@@ -88,3 +90,5 @@ TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[f
         CHECK_FALSE(gate.enter(frame));
     }
 }
+
+} // namespace frame_gate_cases

@@ -11,6 +11,8 @@
 #include <set>
 #include <vector>
 
+namespace heartbeat_cases {
+
 namespace {
 
 using dfb::detail::Heartbeat;
@@ -234,3 +236,5 @@ TEST_CASE("Two ranks that answer in time never lose each other, however they are
         CHECK(questions <= 2 * 4 * 20);
     }
 }
+
+} // namespace heartbeat_cases

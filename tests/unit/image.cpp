@@ -10,6 +10,8 @@
 #include <limits>
 #include <vector>
 
+namespace image_cases {
+
 namespace {
 
 // `count` neighbours of a value on each side, and the value.
@@ -173,3 +175,5 @@ TEST_CASE("sRGB levels of values that a double can not tell from a boundary", "[
     }
     CHECK(wrong == 0);
 }
+
+} // namespace image_cases

@@ -10,6 +10,8 @@
 #include <utility>
 #include <vector>
 
+namespace image_gate_cases {
+
 using dfb::detail::ImageGate;
 using dfb::detail::ImageWriter;
 using std::chrono::milliseconds;
@@ -82,3 +84,5 @@ TEST_CASE("Nobody writes once the gate is closed", "[gather]")
         writer.join();
     CHECK(wrong == 0);
 }
+
+} // namespace image_gate_cases

@@ -9,6 +9,8 @@
 #include <utility>
 #include <vector>
 
+namespace layout_cases {
+
 TEST_CASE("The tiles of a layout cover each pixel once", "[layout]")
 {
     for (const auto& [width, height] : std::vector<std::pair<int, int>>{
@@ -19,8 +21,8 @@ TEST_CASE("The tiles of a layout cover each pixel once", "[layout]")
             bool sane = layout.tileCount() == layout.tilesX() * layout.tilesY();
             for (int tile = 0; tile < layout.tileCount(); ++tile) {
                 const dfb::Region r = layout.region(tile);
-                sane = sane && !r.empty() && r.width() <= size && r.height() <= size && r.x0 % size == 0 && r.y0 % size == 0
-                       && layout.tileAt(layout.column(tile), layout.row(tile)) == tile;
+                sane = sane && !r.empty() && r.width() <= size && r.height() <= size && r.x0 % size == 0
+                       && r.y0 % size == 0 && layout.tileAt(layout.column(tile), layout.row(tile)) == tile;
                 for (int y = r.y0; y < r.y1; ++y)
                     for (int x = r.x0; x < r.x1; ++x)
                         ++covered.at(static_cast<std::size_t>(y * width + x));
@@ -39,7 +41,8 @@ TEST_CASE("The largest images", "[layout]")
     const dfb::TileLayout all(65536, 65536, 8);
     CHECK(all.tileCount() == 8192 * 8192);
     CHECK(all.region(all.tileCount() - 1) == dfb::Region{65528, 65528, 65536, 65536});
-    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{0, 5}, {5, 0}, {-1, 5}, {65537, 5}, {5, 65537}})
+    for (const auto& [width, height] :
+         std::vector<std::pair<int, int>>{{0, 5}, {5, 0}, {-1, 5}, {65537, 5}, {5, 65537}})
         CHECK_THROWS_AS(dfb::TileLayout(width, height, 64), dfb::InvalidArgument);
 }
 
@@ -63,7 +66,8 @@ TEST_CASE("tilesIn names exactly the tiles that meet a region", "[layout]")
 
 TEST_CASE("Owner maps give every tile to a rank, evenly", "[layout]")
 {
-    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{1, 1}, {7, 1}, {1, 9}, {97, 61}, {256, 256}, {1024, 768}})
+    for (const auto& [width, height] :
+         std::vector<std::pair<int, int>>{{1, 1}, {7, 1}, {1, 9}, {97, 61}, {256, 256}, {1024, 768}})
         for (const int ranks : {1, 2, 3, 4, 5, 7, 8, 16, 61, 1000}) {
             const dfb::TileLayout layout(width, height, 8);
             INFO(width << "x" << height << ", " << ranks << " ranks");
@@ -77,11 +81,12 @@ TEST_CASE("Owner maps give every tile to a rank, evenly", "[layout]")
             };
             const auto linear = spread(dfb::linearOwner);
             CHECK(linear.second - linear.first <= 1);
-            // A row of the lattice goes round the ranks, so within a row, and thus in all, a rank has at most one tile a row
-            // more than another.
+            // A row of the lattice goes round the ranks, so within a row, and thus in all, a rank has at most one tile
+            // a row more than another.
             const auto lattice = spread(dfb::latticeOwner);
             CHECK(lattice.second - lattice.first <= layout.tilesY());
-            // A random scatter: counts are binomial, mean m and deviation below sqrt(m); 6 deviations, and 6 for small m.
+            // A random scatter: counts are binomial, mean m and deviation below sqrt(m); 6 deviations, and 6 for small
+            // m.
             const auto hashed = spread(dfb::hashOwner);
             const double mean = static_cast<double>(layout.tileCount()) / ranks;
             CHECK(hashed.second <= mean + 6 * std::sqrt(mean) + 6);
@@ -105,3 +110,5 @@ TEST_CASE("The lattice gives neighbours to different ranks", "[layout]")
         CHECK(same == 0);
     }
 }
+
+} // namespace layout_cases

@@ -13,6 +13,8 @@
 #include <random>
 #include <vector>
 
+namespace levels_cases {
+
 namespace {
 
 using dfb::OutputFormat;
@@ -270,3 +272,5 @@ TEST_CASE("Floats are copied, doubles rounded", "[levels]")
         CHECK(b == expected);
     }
 }
+
+} // namespace levels_cases

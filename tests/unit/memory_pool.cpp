@@ -12,6 +12,8 @@
 #include <utility>
 #include <vector>
 
+namespace memory_pool_cases {
+
 TEST_CASE("Blocks are aligned, large enough and used again", "[memory]")
 {
     const auto pool = dfb::MemoryPool::create();
@@ -93,3 +95,5 @@ TEST_CASE("No two threads hold the same block", "[memory]")
     CHECK(spoilt == 0);
     CHECK(pool->peakBytes() <= 4 * (256 + 384)); // what was held at once, not what was asked for in all
 }
+
+} // namespace memory_pool_cases

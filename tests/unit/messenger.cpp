@@ -16,6 +16,8 @@
 #include <utility>
 #include <vector>
 
+namespace messenger_cases {
+
 namespace {
 
 using dfb::Buffer;
@@ -380,3 +382,5 @@ TEST_CASE("Who gives up says so to all others, once, and they can not go on eith
     CHECK(a->stops == std::vector<bool>{false}); // waits for nobody
     CHECK(b->stops == std::vector<bool>{false});
 }
+
+} // namespace messenger_cases

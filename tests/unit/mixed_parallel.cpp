@@ -6,6 +6,8 @@
 #include <utility>
 #include <vector>
 
+namespace mixed_parallel_cases {
+
 TEST_CASE("Where something is hidden, fronts come first, and what may be hidden from the end back", "[mixed]")
 {
     // In tiles 0 to 3 bricks 0 to 2 are behind each other, in tile 4 is brick 2 alone.
@@ -43,3 +45,5 @@ TEST_CASE("Where something is hidden, fronts come first, and what may be hidden 
     CHECK(work.generationOf(work.jobs[2]) == 2);
     CHECK(work.generationOf(work.jobs[3]) == 0);
 }
+
+} // namespace mixed_parallel_cases

@@ -9,6 +9,8 @@
 #include <random>
 #include <vector>
 
+namespace moments_cases {
+
 namespace {
 
 using Sample = std::array<double, 4>;
@@ -90,3 +92,5 @@ TEST_CASE("Ten million samples do not drift", "[moments]")
     CHECK(relative(m.m2, m2) < 1e-10);
     CHECK(relative(m.varianceOfMean(), m2 / 4 / (count - 1) / count) < 1e-10);
 }
+
+} // namespace moments_cases

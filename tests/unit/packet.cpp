@@ -11,6 +11,8 @@
 #include <utility>
 #include <vector>
 
+namespace packet_cases {
+
 namespace {
 
 using dfb::detail::packetBytes;
@@ -124,3 +126,5 @@ TEST_CASE("Bytes that are no packet are refused, or read as something that lies 
         tryBytes(randomBytes(random, random() % 300));
     CHECK(refused > 20000);
 }
+
+} // namespace packet_cases

@@ -18,6 +18,8 @@
 #include <utility>
 #include <vector>
 
+namespace tile_ops_cases {
+
 namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
@@ -29,6 +31,37 @@ using dfb::testing::Random;
 using dfb::testing::TileInputs;
 using dfb::testing::TileOutput;
 using dfb::testing::uniform;
+
+// Of a user's: the image is white where any input has a depth.
+struct HasDepth {
+    static constexpr int tileSize = 8;
+    static constexpr dfb::ChannelMask channels = dfb::colorChannel | dfb::depthChannel;
+    static constexpr bool activeByDepth = true;
+
+    void newFrame(const dfb::TileInfo& info) { there_.assign(static_cast<std::size_t>(info.region.width()) * 8, 0); }
+    void add(dfb::Fragment&& fragment)
+    {
+        dfb::FragmentCursor cursor(fragment);
+        for (std::size_t y = 0; y < 8; ++y) {
+            const dfb::FragmentRow row = cursor.next();
+            for (int s = 0; s < row.spanCount; ++s)
+                std::fill_n(there_.begin() + static_cast<std::ptrdiff_t>(8 * y + row.spans[s].x), row.spans[s].count,
+                            1);
+        }
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        for (int y = 0; y < 8; ++y) {
+            double row[32];
+            for (int i = 0; i < 32; ++i)
+                row[i] = there_[static_cast<std::size_t>(8 * y + i / 4)];
+            out.setRow(y, row, nullptr);
+        }
+    }
+
+private:
+    std::vector<int> there_;
+};
 
 template <class Op>
 dfb::testing::ErrorReport compare(const TileInputs<Op::tileSize>& in)
@@ -57,6 +90,45 @@ TEST_CASE("AlphaBlend is within 1 ulp of exact in float, exact in 8 bits and in 
         CHECK(c.ulpsBelow() <= 2);
         CHECK(c.wrongBytes == 0);
     }
+}
+
+TEST_CASE("DepthComposite is within 1 ulp of exact in float, exact in 8 bits and in depth", "[ops]")
+{
+    using Op = dfb::BasicDepthComposite<8>;
+    for (std::uint64_t seed = 300; seed < 340; ++seed) {
+        auto in = adversarial<8>(seed, 1 + static_cast<int>(seed % 9), 1 + static_cast<int>(seed % 3));
+        Random random(seed);
+        for (const auto& tile : in.tiles) // without colour, without a depth, with one that is none
+            for (int i = 0; i < 64; ++i) {
+                if (random() % 4 == 0)
+                    std::fill_n(tile->color + 4 * i, 4, 0.0f);
+                if (random() % 8 == 0)
+                    tile->depth[i] = random() % 2 ? infinity : notANumber;
+            }
+        const auto expected = dfb::testing::referenceOf(in, [&](const std::vector<dfb::testing::Sample>& samples) {
+            return dfb::testing::nearest(samples, in.background);
+        });
+        INFO("seed " << seed);
+        const ErrorReport c = dfb::testing::compare<Op>(in, expected);
+        CHECK(c.ulpsBelow() <= 2);
+        CHECK(c.wrongBytes == 0);
+    }
+}
+
+TEST_CASE("An operation of a user's may say that depth is what counts", "[ops]")
+{
+    TileInputs<8> in;
+    auto& tile = in.add(0, 0);
+    tile.fill({1, 1, 1, 1});
+    for (int i = 0; i < 64; i += 3) {
+        tile.depth[i] = static_cast<float>(i);
+        std::fill_n(tile.color + 4 * i, 4, 0.0f);
+    }
+    const TileOutput out = dfb::testing::runTileOp<HasDepth>(in, {0}, dfb::OutputFormat::RGBA32F);
+    int wrong = 0;
+    for (std::size_t i = 0; i < 64; ++i)
+        wrong += out.value(4 * i) != (i % 3 == 0 ? 1.0f : 0.0f);
+    CHECK(wrong == 0);
 }
 
 TEST_CASE("ImageParallel is within 1 ulp of exact in float, exact in 8 bits and in depth", "[ops]")
@@ -418,3 +490,5 @@ TEST_CASE("What a single layer covers comes out the same whether it is taken as 
         }
     }
 }
+
+} // namespace tile_ops_cases

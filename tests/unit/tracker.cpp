@@ -14,6 +14,8 @@
 
 #include <sys/resource.h>
 
+namespace tracker_cases {
+
 namespace {
 
 struct Input {
@@ -455,3 +457,5 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
         CHECK(e.info().got == 2);
     }
 }
+
+} // namespace tracker_cases

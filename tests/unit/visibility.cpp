@@ -12,6 +12,8 @@
 #include <utility>
 #include <vector>
 
+namespace visibility_cases {
+
 namespace {
 
 using Random = std::mt19937_64;
@@ -277,3 +279,5 @@ TEST_CASE("visibleTiles pairs each brick with the tiles that its projection meet
     }
     CHECK(dfb::visibleTiles(dfb::World(), camera, layout).empty());
 }
+
+} // namespace visibility_cases

@@ -9,6 +9,8 @@
 #include <string>
 #include <vector>
 
+namespace visibility_order_cases {
+
 namespace {
 
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
@@ -109,3 +111,5 @@ TEST_CASE("Bricks that overlap or stand in a circle have no order", "[visibility
         {1, {{0, 1, 2}, {9, 2, 3}}}, {2, {{2, 0, 1}, {3, 9, 2}}}, {3, {{1, 2, 0}, {2, 3, 9}}}};
     CHECK(outcome(circle).find("circle") != std::string::npos);
 }
+
+} // namespace visibility_order_cases

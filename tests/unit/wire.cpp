@@ -17,6 +17,8 @@
 #include <utility>
 #include <vector>
 
+namespace wire_cases {
+
 namespace {
 
 using dfb::detail::fragmentPrefix;
@@ -394,6 +396,44 @@ TEST_CASE("Depth travels in canonical form, and what is not finite is counted on
     CHECK(faults.nonFinite == 64); // also where the tile is constant and travels as one pixel
 }
 
+TEST_CASE("By depth what has one travels, whatever its colour, and nothing else", "[wire]")
+{
+    const auto pool = dfb::MemoryPool::create();
+    const dfb::TileLayout layout(8, 8, 8);
+    auto tile = makeTile<8>(layout, 0);
+    tile->pixel(0, 0)[3] = 1.0f;                                                  // no depth
+    tile->depth[1] = 2.0f;                                                        // no colour
+    tile->pixel(2, 0)[0] = notANumber, tile->depth[2] = -infinity;                // counted
+    tile->pixel(3, 0)[3] = 1.0f, tile->depth[3] = notANumber;                     // counted, is not there
+    tile->pixel(4, 0)[0] = notANumber;                                            // is not looked at
+    tile->pixel(5, 0)[0] = 0.5f, tile->pixel(5, 0)[3] = 1.0f, tile->depth[5] = 0; // in range
+    for (const auto format : {dfb::WireFormat::Float32, dfb::WireFormat::Unorm8}) {
+        const dfb::detail::WireCoder coder(dfb::WirePrecision(format), true);
+        dfb::detail::InputFaults faults;
+        const dfb::Fragment fragment = dfb::detail::decodeFragment(
+            *pool, dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, coder, format, faults), layout,
+            [](int) { return 3; }, nullptr, coder);
+        CHECK(faults.nonFinite == 2);
+        dfb::FragmentCursor cursor(fragment);
+        const dfb::FragmentRow row = cursor.next();
+        REQUIRE(row.spanCount == 2);
+        CHECK((row.spans[0].x == 1 && row.spans[0].count == 2));
+        CHECK((row.spans[1].x == 5 && row.spans[1].count == 1));
+        CHECK((row.depth[0] == 2.0f && row.depth[1] == -infinity && row.depth[2] == 0.0f));
+        CHECK((row.color[3] == 0.0f && row.color[11] == 1.0f));
+        CHECK(fragment.activePixels() == 3);
+        tile->pixel(2, 0)[0] = 0.0f, tile->depth[3] = infinity; // then alpha 0 is rounded, too
+        faults = {};
+        const dfb::Fragment rounded = dfb::detail::decodeFragment(
+            *pool, dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, coder, format, faults), layout,
+            [](int) { return 3; }, nullptr, coder);
+        CHECK(faults.nonFinite == 0);
+        CHECK(rounded.colorFormat() == format);
+        CHECK(rounded.color()[3] == 0.0f);
+        tile->pixel(2, 0)[0] = tile->depth[3] = notANumber;
+    }
+}
+
 TEST_CASE("Bytes that are no message are refused or decode to something valid", "[wire]") { prefixesAndFlips(nullptr); }
 
 TEST_CASE("A message of another version, byte order or codec is named as such", "[wire]")
@@ -453,3 +493,5 @@ TEST_CASE("Compressed bytes that are no message are refused or decode to somethi
     prefixesAndFlips(&codec);
 }
 #endif
+
+} // namespace wire_cases

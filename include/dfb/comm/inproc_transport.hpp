@@ -125,6 +125,7 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return hub_->size(); }
+    int sharingRanks() const noexcept { return size(); }
     bool needsPolling() const noexcept { return hub_->shuffles(); }
     bool mayPoll() const noexcept { return true; }
     bool wakesOnArrival() const noexcept { return true; }

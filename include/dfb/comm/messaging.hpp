@@ -170,6 +170,15 @@ public:
         return true;
     }
 
+    // For calls that wait, before anything has happened: throws InvalidArgument on a thread that could not make the
+    // progress that it would wait for.
+    void requireProgress() const
+    {
+        if (messenger_->needsCaller() && !messenger_->mayPoll())
+            throw InvalidArgument("at this thread level of MPI calls that wait belong to the thread that initialised "
+                                  "it");
+    }
+
     // Message bytes and messages to other ranks since the start.
     std::int64_t bytesSent() const noexcept { return bytesSent_; }
     std::int64_t messagesSent() const noexcept { return messagesSent_; }
@@ -282,9 +291,10 @@ public:
 
     // Collective: combines `own` over all ranks and waits for the result. Throws TransportError, also when a message
     // could not be read that may have been a part of this: when there is no result after a second, or `peerTimeoutMs`
-    // if it came before this rank was here.
+    // if it came before this rank was here; InvalidArgument, see requireProgress().
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
+        requireProgress();
         struct Result {
             std::atomic<bool> there{false};
             Bytes bytes;

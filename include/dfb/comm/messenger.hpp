@@ -8,6 +8,7 @@
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/processors.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -29,14 +30,16 @@
 
 namespace dfb {
 
+// How messages travel: for all framebuffers and walls of a messenger. Only `checksums` must be the same on all ranks.
 struct MessengerOptions {
-    Progress progress = Progress::Thread;
-    bool checksums = false; // each message carries a CRC-32C; must be the same on all ranks
-    // Ranks that see each other's memory hand messages over there.
-    bool sharedMemory = true;
-    // With Progress::Thread: while messages are expected, in a frame or a call that waits for all ranks, a rank of
-    // which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this rank
-    // looks for no other and is not looked for; what is less than 100 counts as that. May differ between ranks.
+    Progress progress = Progress::Auto;
+    bool checksums = false;   // a CRC-32C in each message: whoever does not trust the network pays for it
+    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
+    // On ranks with a progress thread: while messages are expected, in a frame or a call that waits for all ranks, a
+    // rank of which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this
+    // rank looks for no other and is not looked for. Else 100 or more; framebuffers refuse what is less.
+    // And how long, at most, is waited for what a message that could not be read may have been; in a frame without a
+    // time-out 0 is no limit.
     int peerTimeoutMs = defaultPeerTimeoutMs;
     // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort of
     // MPI_COMM_WORLD, with the error on standard error), as MPI does not go on without a rank. Else all ranks get the
@@ -106,8 +109,8 @@ class Messenger final : private TransportHandler {
 public:
     // Collective, like the destructor. Throws TransportError.
     explicit Messenger(const typename Transport::Communicator& communicator, MessengerOptions options = {})
-        : options_(options), pool_(MemoryPool::create(options.sharedMemory)),
-          transport_(communicator, pool_, options.progress)
+        : options_(resolved(std::move(options), communicator)), pool_(MemoryPool::create(options_.sharedMemory)),
+          transport_(communicator, pool_, options_.progress)
     {
         transport_.start(*this);
         if (!hasOwnThread())
@@ -133,10 +136,22 @@ public:
 
     int rank() const noexcept { return transport_.rank(); }
     int size() const noexcept { return transport_.size(); }
+    // What it was made with, but for Progress::Auto, in place of which is what it has become.
     const MessengerOptions& options() const noexcept { return options_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
-    // Moves messages; true if any moved. With Progress::Thread there is no need to call it, and on a thread that may
+    // How many threads this rank should render and composite with: the processors that the calling thread may run on,
+    // divided by the ranks that may run there, too, those of this messenger on this node; at least 1. What a
+    // framebuffer has that is given no executor.
+    int threadShare() const noexcept
+    {
+        int ranks = 1;
+        if constexpr (detail::KnowsSharing<Transport>::value)
+            ranks = transport_.sharingRanks();
+        return dfb::threadShare(Processors::ofThisThread().count(), ranks);
+    }
+
+    // Moves messages; true if any moved. With a progress thread there is no need to call it, and on a thread that may
     // not be in MPI it does nothing. Never blocks.
     bool poll() { return !progress_.running() && transport_.mayPoll() && progress_.tryPoll(); }
 
@@ -296,6 +311,12 @@ private:
         detail::MessageHeader header;
         Buffer message;
     };
+
+    static MessengerOptions resolved(MessengerOptions options, const typename Transport::Communicator& communicator)
+    {
+        options.progress = detail::resolved<Transport>(options.progress, communicator);
+        return options;
+    }
 
     void leave(const char* why)
     {

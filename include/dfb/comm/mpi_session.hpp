@@ -22,27 +22,13 @@ namespace dfb {
 
 class MpiSession {
 public:
-    // Initialises MPI at a thread level; one that is less than MPI_THREAD_MULTIPLE asks for Progress::Caller. Throws
-    // TransportError if MPI has been initialised or finalised before, or does not have that level.
-    MpiSession(int& argc, char**& argv, int level = MPI_THREAD_MULTIPLE)
-    {
-        int initialized = 0, finalized = 0;
-        MPI_Initialized(&initialized);
-        MPI_Finalized(&finalized);
-        if (finalized)
-            throw TransportError("MPI has been finalised: it can not be initialised again");
-        if (initialized)
-            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
-        detail::checkMpi(MPI_Init_thread(&argc, &argv, level, &level_), "MPI_Init_thread", -1);
-        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
-        if (level_ < level) {
-            finalize();
-            throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
-                                     + " at most, " + detail::mpiLevelName(level) + " was asked for",
-                                 rank_);
-        }
-    }
+    // Initialises MPI at the highest thread level that it has: with MPI_THREAD_MULTIPLE messages move by themselves
+    // (see Progress). Throws TransportError if MPI has been initialised or finalised before.
+    MpiSession(int& argc, char**& argv) : MpiSession(argc, argv, MPI_THREAD_MULTIPLE, MPI_THREAD_SINGLE) {}
+
+    // At this level, or a higher one. Throws TransportError, too, if MPI does not have it.
+    MpiSession(int& argc, char**& argv, int level) : MpiSession(argc, argv, level, level) {}
+
     MpiSession(const MpiSession&) = delete;
     MpiSession& operator=(const MpiSession&) = delete;
 
@@ -68,10 +54,30 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
-    int level() const noexcept { return level_; } // that MPI has, at least what was asked for
+    int level() const noexcept { return level_; } // that MPI was initialised at
     MPI_Comm communicator() const noexcept { return MPI_COMM_WORLD; }
 
 private:
+    MpiSession(int& argc, char**& argv, int asked, int needed)
+    {
+        int initialized = 0, finalized = 0;
+        MPI_Initialized(&initialized);
+        MPI_Finalized(&finalized);
+        if (finalized)
+            throw TransportError("MPI has been finalised: it can not be initialised again");
+        if (initialized)
+            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
+        detail::checkMpi(MPI_Init_thread(&argc, &argv, asked, &level_), "MPI_Init_thread", -1);
+        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
+        if (level_ < needed) {
+            finalize();
+            throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
+                                     + " at most, " + detail::mpiLevelName(needed) + " was asked for",
+                                 rank_);
+        }
+    }
+
     // Where one rank's exception is another's, the ranks come here together: waits a moment, so that all can have said
     // why, the first of all.
     static void abortJob()

@@ -18,6 +18,7 @@
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/detail/fifo.hpp>
+#include <dfb/processors.hpp>
 
 #include <mpi.h>
 
@@ -91,10 +92,10 @@ public:
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // at a lower thread level than `progress` needs; and on all ranks if they were built with different packet formats,
-    // or if one of them can not make its transport, with its rank and what has failed there. The others can not be
-    // told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result. At
-    // MPI_THREAD_FUNNELED to be called by the thread that initialised MPI.
+    // below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all ranks if they were built with different packet
+    // formats, or if one of them can not make its transport, with its rank and what has failed there. The others can
+    // not be told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result.
+    // Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
@@ -132,8 +133,21 @@ public:
             release();
     }
 
+    // Only where any thread may call MPI while others do. False, too, if MPI is not there: the constructor says why.
+    static bool mayHaveThread(const Communicator&) noexcept
+    {
+        int initialized = 0, finalized = 0, level = MPI_THREAD_SINGLE;
+        MPI_Initialized(&initialized);
+        MPI_Finalized(&finalized);
+        if (initialized && !finalized)
+            MPI_Query_thread(&level);
+        return level == MPI_THREAD_MULTIPLE;
+    }
+
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
+    // Of this node, by the CPU masks of the threads that made their transports.
+    int sharingRanks() const noexcept { return sharingRanks_; }
     // Whether messages to that rank stay where they are, in memory that it sees.
     bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
     // Where a block of the pool lies for those ranks, -1: nowhere; and the block of another rank that lies there, null:
@@ -148,7 +162,7 @@ public:
         return memory ? memory->at(place, byteCount) : nullptr;
     }
     bool needsPolling() const noexcept { return true; }
-    // At MPI_THREAD_FUNNELED only the thread that initialised MPI, above that any.
+    // Below MPI_THREAD_SERIALIZED only the thread that initialised MPI.
     bool mayPoll() const noexcept
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
@@ -222,20 +236,19 @@ private:
         MPI_Finalized(&finalized);
         if (!initialized || finalized)
             throw TransportError(finalized ? "MPI has been finalised"
-                                           : "MPI is not initialised: call MPI_Init_thread first");
+                                           : "MPI is not initialised: call MPI_Init or MPI_Init_thread first");
         int level = MPI_THREAD_SINGLE;
         MPI_Query_thread(&level);
-        const int needed = progress == Progress::Thread ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED;
-        if (level < needed)
+        if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
             throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
-                                 + ", " + detail::mpiLevelName(needed) + " is needed: call MPI_Init_thread with it"
-                                 + (progress == Progress::Thread ? ", or configure Progress::Caller" : ""));
-        if (level == MPI_THREAD_FUNNELED) {
+                                 + ", Progress::Thread needs MPI_THREAD_MULTIPLE: call MPI_Init_thread with it, or "
+                                   "leave Progress::Auto");
+        if (level < MPI_THREAD_SERIALIZED) {
             int isMain = 0;
             MPI_Is_thread_main(&isMain);
             if (!isMain)
-                throw TransportError("MPI was initialised at thread level MPI_THREAD_FUNNELED by another thread: only "
-                                     "that one may call MPI");
+                throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
+                                     + " by another thread: only that one may call MPI");
             onlyThread_ = std::this_thread::get_id();
         }
     }
@@ -330,6 +343,7 @@ private:
     // What a rank tells all others then.
     struct Card {
         std::uint64_t host;
+        Processors processors;
         detail::NodeMemory::Address memory;
     };
 
@@ -344,7 +358,7 @@ private:
             check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
             memory = memoryToShare();
             mine = {std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
-                    memory ? memory->address() : detail::NodeMemory::Address()};
+                    Processors::ofThisThread(), memory ? memory->address() : detail::NodeMemory::Address()};
         });
         std::vector<Card> all(static_cast<std::size_t>(size_));
         MPI_Request request = MPI_REQUEST_NULL;
@@ -352,7 +366,10 @@ private:
               "MPI_Iallgather");
         wait(request);
         const auto isHere = [&](const Card& card) { return card.host == mine.host; };
-        findCrowding(std::count_if(all.begin(), all.end(), isHere));
+        sharingRanks_ = static_cast<int>(std::count_if(all.begin(), all.end(), [&](const Card& card) {
+            return isHere(card) && card.processors.meets(mine.processors);
+        }));
+        findCrowding(mine.processors.count());
 
         // Each tells the others whose memory it sees.
         std::vector<std::uint8_t> sees(all.size()), seen(all.size());
@@ -387,11 +404,10 @@ private:
 
     // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
     // each wakes up so often, and takes the core from all others that often.
-    void findCrowding(std::ptrdiff_t ranksHere)
+    void findCrowding(int cores)
     {
-        const auto cores = static_cast<std::ptrdiff_t>(std::max(1u, std::thread::hardware_concurrency()));
-        const std::ptrdiff_t ranksPerCore = 4 * ranksHere / cores; // in quarters
-        crowding_ = static_cast<int>(std::clamp<std::ptrdiff_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
+        const std::int64_t ranksPerCore = std::int64_t{4} * sharingRanks_ / std::max(1, cores); // in quarters
+        crowding_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
     using Record = detail::PacketRecord;
@@ -901,6 +917,7 @@ private:
     MPI_Comm comm_ = MPI_COMM_NULL;
     int rank_ = 0, size_ = 1, lastTag_ = 1;
     int crowding_ = 4;
+    int sharingRanks_ = 1;
     std::thread::id onlyThread_; // that may call MPI; none if all may
 
     NapSignal signal_;

@@ -33,6 +33,16 @@
 //   bool lendsTo(int other) const;  std::int32_t placeOf(const std::byte* block) const;
 //   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
 //
+// And, if a thread of the library's own may not always poll (without this it always may):
+//   static bool mayHaveThread(const Communicator&);
+//                                                whether the constructor accepts Progress::Thread on this rank; never
+//                                                throws. Progress::Auto becomes Thread or Caller by it, so that the
+//                                                constructor gets no Auto
+//
+// And, if it knows (without this a rank has its processors for itself):
+//   int sharingRanks() const;                    how many ranks may run on processors that this one may run on, this one
+//                                                included
+//
 // And, if it can end the job of which the ranks are processes:
 //   void abort(const std::string& text);         between start() and stop(), or in waiting(), on the thread that polls;
 //                                                says why on standard error and ends all ranks; does not return
@@ -54,13 +64,16 @@
 
 namespace dfb {
 
-// Who calls poll() of a transport that needs it.
+// Who calls poll() of a transport that needs it. Ranks may differ.
 enum class Progress {
-    Thread, // a thread of the library's own; MPI must have been initialised with MPI_THREAD_MULTIPLE
-    Caller // the calls of the user: DistributedFrameBuffer::poll(), Frame::setTile(), and those that wait (the
-           // constructor, Frame::end(), ...). At MPI_THREAD_FUNNELED those that wait belong to the thread that
-           // initialised MPI; at MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile. Messages move only in
-           // those calls
+    // Thread where the transport allows it, else Caller: with MPI the thread level decides, on each rank.
+    Auto,
+    // A thread of the library's own. MPI must have been initialised with MPI_THREAD_MULTIPLE.
+    Thread,
+    // The calls of the user: DistributedFrameBuffer::poll(), Frame::setTile(), and those that wait (the constructor,
+    // Frame::end(), ...). Messages move only in those calls. At MPI_THREAD_SINGLE and MPI_THREAD_FUNNELED those that
+    // wait belong to the thread that initialised MPI; at MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile.
+    Caller
 };
 
 // Where a transport delivers. The calls are quick, never block, may come from any thread, and must not call the
@@ -163,6 +176,35 @@ template <class T>
 struct SharesMemory<T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)),
                                    decltype(std::declval<const T&>().placeOf(nullptr)),
                                    decltype(std::declval<const T&>().blockAt(0, 0, 0))>> : std::true_type {
+};
+
+// Optional.
+template <class T, class = void>
+struct LimitsThreads : std::false_type {
+};
+template <class T>
+struct LimitsThreads<T, std::void_t<decltype(T::mayHaveThread(std::declval<const typename T::Communicator&>()))>>
+    : std::true_type {
+};
+
+// What Progress::Auto is with this transport.
+template <class T>
+Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communicator& communicator)
+{
+    if (progress != Progress::Auto)
+        return progress;
+    if constexpr (LimitsThreads<T>::value)
+        return T::mayHaveThread(communicator) ? Progress::Thread : Progress::Caller;
+    else
+        return Progress::Thread;
+}
+
+// Optional.
+template <class T, class = void>
+struct KnowsSharing : std::false_type {
+};
+template <class T>
+struct KnowsSharing<T, std::void_t<decltype(std::declval<const T&>().sharingRanks())>> : std::true_type {
 };
 
 // Optional.

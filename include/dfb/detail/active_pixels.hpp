@@ -1,4 +1,5 @@
-// ActivePixels: what of a tile travels: the pixels with any colour channel that is not 0, as spans.
+// ActivePixels: what of a tile travels: the pixels with any colour channel that is not 0, or those with a depth, as
+// spans.
 #pragma once
 
 #include <dfb/cpu.hpp>
@@ -57,6 +58,50 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
         return findActivePixelsAvx2(rgba, count);
 #endif
     return findActivePixels(rgba, count);
+}
+
+// Of up to 64 pixels, bit by bit.
+struct DepthBits {
+    std::uint64_t active = 0; // below +infinity
+    std::uint64_t nan = 0;
+};
+
+DFB_INLINE DepthBits findDepths(const float* depth, int count)
+{
+    DepthBits bits;
+    for (int i = 0; i < count; ++i) {
+        bits.active |= std::uint64_t{depth[i] < std::numeric_limits<float>::infinity()} << i;
+        bits.nan |= std::uint64_t{depth[i] != depth[i]} << i;
+    }
+    return bits;
+}
+
+#if defined(DFB_HAS_AVX2_CLONES)
+DFB_AVX2 inline DepthBits findDepthsAvx2(const float* depth, int count)
+{
+    const __m256 infinity = _mm256_set1_ps(std::numeric_limits<float>::infinity());
+    const auto bitsOf8 = [](int mask) { return static_cast<std::uint64_t>(mask & 255); };
+    DepthBits bits;
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        const __m256 d = _mm256_loadu_ps(depth + i);
+        bits.active |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, infinity, _CMP_LT_OQ))) << i;
+        bits.nan |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, d, _CMP_UNORD_Q))) << i;
+    }
+    if (i == count)
+        return bits;
+    const DepthBits rest = findDepths(depth + i, count - i);
+    return {bits.active | rest.active << i, bits.nan | rest.nan << i};
+}
+#endif
+
+inline DepthBits depthBits(const float* depth, int count)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        return findDepthsAvx2(depth, count);
+#endif
+    return findDepths(depth, count);
 }
 
 // Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
@@ -136,18 +181,19 @@ inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::si
 }
 
 // One per thread, to be used again and again. A pixel of colour 0 and alpha 0 contributes nothing, whatever its depth;
-// one with colour and alpha 0 is emission and does. What it is called with is a Tile or a TileView.
+// one with colour and alpha 0 is emission and does. By depth, what has one below +infinity does, and nothing else. What
+// it is called with is a Tile or a TileView.
 struct ActivePixels {
     std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
     std::vector<Span> spans;
     int rowBegin = 0, rowEnd = 0;
     std::uint32_t pixels = 0;
 
-    // `channels` has colour, and the tile all of them. Copies the colours, as they travel, to `colors`, which has room
-    // for all pixels of the tile, and the rest to where plane() says. Each row is copied as soon as its spans are
-    // found: rows of a large image are far apart in memory, and so are read there once.
+    // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
+    // `colors`, which has room for all pixels of the tile, and the rest to where plane() says. Each row is copied as
+    // soon as its spans are found: rows of a large image are far apart in memory, and so are read there once.
     template <class TileType>
-    void gather(const TileType& tile, ChannelMask channels, float* colors)
+    void gather(const TileType& tile, ChannelMask channels, bool byDepth, float* colors)
     {
         const ConstPlanes planes = tile.planes();
         const auto most =
@@ -164,7 +210,7 @@ struct ActivePixels {
                 targets[targetCount++] = {c, reinterpret_cast<std::byte*>(planes_[c].data())};
             }
         bool isClean = true;
-        find(tile, [&](std::size_t first, int count) {
+        find(tile, byDepth, [&](std::size_t first, int count) {
             for (std::size_t i = 0; i < targetCount; ++i) {
                 const auto [channel, to] = targets[i];
                 isClean &= copyAndCheck(planes, channel, first, count, to);
@@ -179,15 +225,19 @@ struct ActivePixels {
     }
     // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
     bool mayBeFaulty() const noexcept { return !isClean_; }
+    // Pixels that are not active because their depth is NaN.
+    std::uint64_t nanDepths() const noexcept { return nanDepths_; }
 
     // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
     template <class TileType, class F>
-    void find(const TileType& tile, const F& f)
+    void find(const TileType& tile, bool byDepth, const F& f)
     {
         rowCounts.clear();
         spans.clear();
         rowBegin = rowEnd = 0;
         pixels = 0;
+        nanDepths_ = 0;
+        const float* depths = byDepth ? floatsOf(tile.planes().at[Depth]) : nullptr;
         const Region valid = tile.validRegion();
         const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
         const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
@@ -196,7 +246,15 @@ struct ActivePixels {
             const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.rowStride();
             if (y + ahead < yEnd)
                 prefetch(tile.pixel(x0, y + ahead), width);
-            findSpans(tile.pixel(0, y), x0, x0 + width);
+            if (depths)
+                findSpans(x0, x0 + width, [&](int x, int count) {
+                    const DepthBits bits = depthBits(depths + begin + static_cast<std::size_t>(x), count);
+                    for (std::uint64_t nan = bits.nan; nan != 0; nan &= nan - 1)
+                        ++nanDepths_;
+                    return bits.active;
+                });
+            else
+                findSpans(x0, x0 + width, [&](int x, int count) { return activePixelBits(tile.pixel(x, y), count); });
             for (std::size_t i = before; i < spans.size(); ++i) {
                 f(begin + spans[i].x, static_cast<int>(spans[i].count));
                 pixels += spans[i].count;
@@ -236,14 +294,14 @@ private:
 #endif
     }
 
-    // Of pixels [begin, end) of a row.
-    void findSpans(const float* row, int begin, int end)
+    // Of pixels [begin, end) of a row; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active.
+    template <class BitsOfSome>
+    void findSpans(int begin, int end, const BitsOfSome& bitsOfSome)
     {
         const std::size_t before = spans.size();
         for (int x0 = begin; x0 < end; x0 += 64) {
             const int count = std::min(64, end - x0);
-            const float* from = row + 4 * static_cast<std::ptrdiff_t>(x0);
-            forEachRun(activePixelBits(from, count), [&](int at, int run) {
+            forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
                 const int x = x0 + at;
                 if (spans.size() > before && spans.back().x + spans.back().count == x)
                     spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
@@ -255,6 +313,7 @@ private:
 
     std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such
     bool isClean_ = true;
+    std::uint64_t nanDepths_ = 0;
 };
 
 } // namespace dfb::detail

@@ -61,12 +61,10 @@ public:
           senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
           record_(settings_.format, settings_.channels)
     {
-        if (isDisplay_ && enabled()) {
+        if (displays()) {
             tilesOf_ = std::vector<TilesOf>(senders_.size());
             for (int tile = 0; tile < layout_.tileCount(); ++tile)
                 ++tilesOf_[static_cast<std::size_t>(ownerOf_(tile))].owned;
-        }
-        if (isDisplay_ && settings_.format != OutputFormat::None) {
             image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
             for (auto& s : state_)
@@ -77,13 +75,17 @@ public:
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
 
+    // Its pixels are those of a frame only as imageFrame() says: -1: of none.
     const Image& image() const noexcept { return image_; }
+    std::int64_t imageFrame() const noexcept { return imageFrame_; }
     bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
+    bool displays() const noexcept { return isDisplay_ && enabled(); }
 
     // `compresses`: whether the codec, if there is one, is used. `background`: what the image shows beside the tiles.
     void newFrame(std::int64_t frame, bool compresses, const std::array<float, 4>& background)
     {
         frame_ = frame;
+        imageFrame_ = -1;
         imageEpoch_ += std::memcmp(&background, &lastBackground_, sizeof background) != 0;
         lastBackground_ = background;
         compresses_ = compresses && settings_.codec;
@@ -383,10 +385,7 @@ public:
     }
 
     // All tiles of the other ranks are in the image.
-    bool complete() const
-    {
-        return !isDisplay_ || !enabled() || (ranksDone_ == senderCount() && tilesReceived_ == tilesAnnounced_);
-    }
+    bool complete() const { return !displays() || (ranksDone_ == senderCount() && tilesReceived_ == tilesAnnounced_); }
 
     // How many ranks have tiles for this one, how many of these have said how many, and in words whose have not come.
     int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
@@ -406,7 +405,7 @@ public:
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
     // background before and is of the same colour is left alone, as are tiles of an earlier frame that are
-    // `kept(tile)`.
+    // `kept(tile)`. With that the image is this frame's.
     template <class Kept>
     void fillBackground(const std::array<float, 4>& rgba, const Kept& kept)
     {
@@ -429,12 +428,13 @@ public:
                 out.setRow(y, row.data(), nullptr);
             s = TileState::Background;
         }
+        imageFrame_ = frame_;
     }
 
     // On the display rank: whether tiles of that rank have not come, and whether this may be one of them.
     bool isOnItsWay(int tile, int owner) const
     {
-        if (!isDisplay_ || !enabled() || owner == rank_)
+        if (!displays() || owner == rank_)
             return false;
         const TilesOf& t = tilesOf_[static_cast<std::size_t>(owner)];
         return t.received != t.announced && state_[static_cast<std::size_t>(tile)] != TileState::Received;
@@ -452,7 +452,7 @@ public:
     {
         return isDisplay_ && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
-    bool isComplete(int tile) const { return incomplete_.count(tile) == 0; }
+    bool isComplete(int tile) const { return imageFrame_ >= 0 && incomplete_.count(tile) == 0; }
 
     // The frame has failed: nothing in the image can be relied on.
     void invalidate()
@@ -588,7 +588,7 @@ private:
 
     void requireDisplay() const
     {
-        if (!isDisplay_ || !enabled())
+        if (!displays())
             failMalformed("a finished tile was sent to a rank that displays nothing");
     }
 
@@ -601,7 +601,7 @@ private:
     OwnerOf ownerOf_;
     Send send_;
     const FinishedRecord record_;
-    std::int64_t frame_ = 0, imageEpoch_ = 1;
+    std::int64_t frame_ = 0, imageFrame_ = -1, imageEpoch_ = 1;
     bool compresses_ = false;
 
     mutable std::mutex mutex_;

@@ -47,11 +47,6 @@ public:
                 int slot = 0)
         : pool_(messenger->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
-        config_.progress = messenger->options().progress;
-        config_.checksums = messenger->options().checksums;
-        config_.sharedMemory = messenger->options().sharedMemory;
-        config_.peerTimeoutMs = messenger->options().peerTimeoutMs;
-        config_.onPeerLost = messenger->options().onPeerLost;
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
         MessageHandler& self = *this;
         messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
@@ -70,17 +65,23 @@ public:
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
-            if (config_.peerTimeoutMs != 0 && config_.peerTimeoutMs < 100)
-                throw InvalidArgument("a time-out for peers of " + std::to_string(config_.peerTimeoutMs)
-                                      + " ms: 0, or 100 and more");
+            if (const int ms = messaging_->messenger().options().peerTimeoutMs; ms != 0 && ms < 100)
+                throw InvalidArgument("a time-out for peers of " + std::to_string(ms) + " ms: 0, or 100 and more");
             checkWire();
             pipeline_ =
                 std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of<TileOp, PixelOp>(config_, rank(), Tile::size, Pipeline::travelling(config_),
-                                                  layout().tileCount(), [this](int tile) { return tileOwner(tile); });
+            mine = Agreement::of<TileOp, PixelOp>(config_, messaging_->messenger().options().checksums, rank(),
+                                                  Tile::size, Pipeline::travelling(config_), layout().tileCount(),
+                                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message};
+        } catch (const OutOfMemory& e) {
+            const bool several = config_.framesInFlight > 1;
+            mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()
+                               + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
+                                                + " frames in flight"
+                                          : "")};
         } catch (const std::exception& e) {
             // No memory, or out of the owner map: the others must not wait for this rank.
             mine = {false, "rank " + std::to_string(rank()) + ": " + e.what()};
@@ -105,10 +106,10 @@ public:
     const TileLayout& layout() const noexcept { return pipeline_->table().layout(); }
     int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return pipeline_->table().owned(); }
-    const Image& image() const noexcept { return pipeline_->gather().image(); }
+    const Image& image() const noexcept { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
+    std::int64_t imageFrame() const noexcept { return pipeline_->gather().imageFrame(); }
     bool isComplete(int tile) const { return pipeline_->gather().isComplete(tile); }
     std::int64_t frame() const noexcept { return gate_.frame(); }
-    bool wantsDeclaration() const noexcept { return wantsDeclaration_; }
     bool failed() const noexcept { return outcome_->failed(); }
 
     void begin(const FrameParams& params, const TileFrameData& tileData, const PixelFrameData& pixelData)
@@ -120,27 +121,19 @@ public:
         if (params.maxLayers < 0)
             throw InvalidArgument("at most " + std::to_string(params.maxLayers) + " layers");
         checkSamples(params);
-        if (params.declarationKey != 0 && !params.declared)
-            throw InvalidArgument("a declarationKey without declared inputs");
         if (params.timeoutMs < 0 || (params.timeoutMs == 0 && params.allowPartial))
             throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms"
                                   + (params.allowPartial ? " for a frame that may be partial" : ""));
-        if (messaging_->messenger().needsCaller() && !messaging_->messenger().mayPoll())
-            throw InvalidArgument("at this thread level of MPI frames belong to the thread that initialised it");
+        messaging_->requireProgress();
         messaging_->messenger().throwIfFailed();
-        const bool reuse = params.declared && params.declarationKey != 0 && params.declarationKey == lastKey_;
         params_ = params;
-        lastKey_ = 0;
-        wantsDeclaration_ = params.declared && !reuse;
-        if (!reuse) {
-            manifests_.reset();
-            declaredFrom_.reset();
-        }
+        manifests_.newFrame(!lastFailed_); // if it did, some owners may have what was declared in it, and others not
 
         TileInfo info;
         info.rank = rank();
         info.frame = gate_.next();
         info.passes = params.passes;
+        info.firstSample = firstSampleOf(params);
         info.accumulationId = params.accumulationId;
         info.wanted = Pipeline::imageChannels(config_);
         info.background = params.background;
@@ -189,8 +182,6 @@ public:
             }
         if (!params.declared)
             tilesLess(countUnknown);
-        else if (reuse)
-            applyDeclarations();
     }
 
     template <class AnyTile>
@@ -279,25 +270,25 @@ public:
 
     void declare(const std::vector<TileInput>& inputs)
     {
-        if (!wantsDeclaration_ || manifests_.declared())
-            throw InvalidArgument(!params_.declared ? "declare() in a frame that was not begun with declared inputs"
-                                                    : "declare() a second time, or where the last frame's holds");
+        if (!params_.declared)
+            throw InvalidArgument("declare() in a frame that was not begun with declared inputs");
+        if (manifests_.declared())
+            throw InvalidArgument("declare() a second time in a frame");
         for (const TileInput& input : inputs)
             if (input.tile < 0 || input.tile >= layout().tileCount())
                 throw InvalidArgument("declare() of tile " + std::to_string(input.tile) + " of an image of "
                                       + std::to_string(layout().tileCount()) + " tiles");
         if (outcome_->failed())
             return;
-        const bool sent = manifests_.split(
+        const bool isWaiting = manifests_.declare(
             inputs, rank(), [this](int tile) { return tileOwner(tile); },
             [this](int owner, const Bytes& manifest) {
                 messaging_->send(owner, MessageKind::Manifest, gate_.frame(), manifest);
             });
-        if (!sent)
+        if (!isWaiting)
             enterAllDeclared();
     }
 
-    std::any& declaredFrom() noexcept { return declaredFrom_; }
     std::any& loopMemory() noexcept { return loopMemory_; }
 
     void abort(const std::exception_ptr& reason, int tile)
@@ -328,11 +319,17 @@ public:
         poll();
     }
 
+    void requireProgress() const { messaging_->requireProgress(); }
+
     FrameReport end()
     {
-        if (wantsDeclaration_ && !manifests_.declared() && !outcome_->failed())
-            guarded([] { throw InvalidArgument("end() of a frame with declared inputs without declare()"); });
-        if (!image().empty())
+        if (params_.declared && !manifests_.declared() && !outcome_->failed()) {
+            const auto reason = outcome_->reason(); // why declare() was not called, in a frame that may be partial
+            failWhole(reason ? std::make_exception_ptr(Error(*reason))
+                             : std::make_exception_ptr(
+                                 InvalidArgument("end() of a frame with declared inputs without declare()")));
+        }
+        if (pipeline_->gather().displays())
             guarded([this] { pipeline_->finishBackground(); });
         const Verdict verdict = conclude();
         if (verdict.error && (!params_.allowPartial || verdict.error->kind == ErrorKind::Disagreement))
@@ -343,8 +340,8 @@ public:
             if (config_.codec)
                 compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
             gains_->endFrame();
-            lastKey_ = params_.declarationKey;
             lastAccumulationId_ = params_.accumulationId;
+            nextSample_ = params_.samples ? 0 : pipeline_->table().frameInfo().firstSample + params_.passes;
         }
 
         const double nsPerMs = 1e6;
@@ -356,6 +353,8 @@ public:
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
         report.compressed = compressed;
+        report.threads = messaging_->executor().concurrency();
+        report.progress = messaging_->messenger().needsCaller() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         return report;
     }
@@ -375,7 +374,9 @@ public:
             if (outcome_->failed())
                 dropRest();
             else
-                failWhole(std::make_exception_ptr(Error(cancelled("the frame was left without end()"))));
+                failWhole(std::make_exception_ptr(
+                    Error(cancelled("the frame was left without end(). If by an exception: Frame::guard() around what "
+                                    "throws tells all ranks its text"))));
             conclude();
         } catch (const TransportError&) {
             // begin() will say so.
@@ -583,7 +584,7 @@ private:
         switch (kind) {
         case MessageKind::Fragment: arrive(std::move(message), source); break;
         case MessageKind::Manifest:
-            if (!wantsDeclaration_) {
+            if (!params_.declared) {
                 ErrorInfo info;
                 info.kind = ErrorKind::Disagreement;
                 info.message = "the sender declares its inputs, this rank expects no declaration";
@@ -660,7 +661,7 @@ private:
             } else if (scope == AllDeclared) {
                 if (!messaging_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
-                differs = isUp && !wantsDeclaration_;
+                differs = isUp && !params_.declared;
             } else if (scope == SameParams) {
                 const Bytes bytes = messaging_->bytesOf(message);
                 ByteReader in(bytes);
@@ -842,7 +843,7 @@ private:
     std::optional<ErrorInfo> missing()
     {
         std::optional<ErrorInfo> info;
-        if (!ownTilesDone_ && wantsDeclaration_ && tilesLeft_ >= countUnknown / 2) {
+        if (!ownTilesDone_ && params_.declared && tilesLeft_ >= countUnknown / 2) {
             info.emplace();
             info->message = "not all ranks have declared their inputs";
             info->expected = size();
@@ -927,20 +928,34 @@ private:
     void checkWire() const
     {
         const WirePrecision& w = config_.wire;
-        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f) || !(w.depthFar > w.depthNear)
-            || !(w.depthFar - w.depthNear < std::numeric_limits<float>::infinity()))
+        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
             throw InvalidArgument("an error budget of " + std::to_string(w.budget) + ", colours up to "
-                                  + std::to_string(w.maxColor) + ", depths from " + std::to_string(w.depthNear) + " to "
-                                  + std::to_string(w.depthFar));
+                                  + std::to_string(w.maxColor));
         if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
             throw InvalidArgument("a least transmittance of " + std::to_string(config_.minTransmittance));
     }
 
-    // Throws InvalidArgument for a plan that this framebuffer can not follow.
+    // Whether what the last frame left behind is of use.
+    bool accumulates(const FrameParams& params) const
+    {
+        return KeepsState<TileOp>::value && !lastFailed_ && params.accumulationId == lastAccumulationId_;
+    }
+
+    // Without a plan: of each tile.
+    int firstSampleOf(const FrameParams& params) const
+    {
+        return !params.samples && accumulates(params) ? nextSample_ : 0;
+    }
+
+    // Throws InvalidArgument for samples that this framebuffer can not take.
     void checkSamples(const FrameParams& params) const
     {
-        if (!params.samples)
+        if (!params.samples) {
+            if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
+                throw InvalidArgument("a tile can not have " + std::to_string(params.passes) + " samples from "
+                                      + std::to_string(firstSampleOf(params)) + " on: take another accumulationId");
             return;
+        }
         if (params.samples->size() != static_cast<std::size_t>(layout().tileCount()))
             throw InvalidArgument("a plan of the samples of " + std::to_string(params.samples->size())
                                   + " tiles for an image of " + std::to_string(layout().tileCount()));
@@ -950,7 +965,7 @@ private:
                                       + std::to_string(t.first) + " on");
             if (!KeepsState<TileOp>::value && (t.count == 0 || t.first > 0))
                 throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
-            if ((t.first > 0 || t.count == 0) && (lastFailed_ || params.accumulationId != lastAccumulationId_))
+            if ((t.first > 0 || t.count == 0) && !accumulates(params))
                 throw InvalidArgument("what was accumulated is of no use, as the last frame failed or had another "
                                       "accumulationId: begin again with sample 0 of each tile");
         }
@@ -1014,7 +1029,7 @@ private:
     // the verdict, is it waited for no longer than for a rank of which nothing is heard.
     Verdict waitWithoutLimit()
     {
-        const auto limit = std::chrono::milliseconds(config_.peerTimeoutMs);
+        const auto limit = std::chrono::milliseconds(messaging_->messenger().options().peerTimeoutMs);
         if (const Verdict* verdict = outcome_->wait(Clock::now() + untilCompared))
             return *verdict;
         compareParams();
@@ -1057,8 +1072,9 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     FrameBufferConfig config_;
     std::unique_ptr<Pipeline> pipeline_;
+    const Image noImage_;
     ManifestExchange manifests_;
-    std::any declaredFrom_, loopMemory_; // see Frame
+    std::any loopMemory_; // see Frame
     JobShare jobs_;
     HiddenTiles hidden_;
 
@@ -1066,13 +1082,12 @@ private:
     FrameGate gate_;
     std::unique_ptr<FrameOutcome<Transport>> outcome_;
     FrameParams params_;
-    std::uint64_t lastKey_ = 0; // of the declaration that the last frame went by
     std::uint64_t lastAccumulationId_ = 0;
+    int nextSample_ = 0; // of each tile, if the next frame has no plan and accumulates
     bool frameOpen_ = false, lastFailed_ = false;
     FrameFigures figures_;
     CompressionTrial compressionTrial_;
     std::optional<CompressionGains> gains_; // per rank that this one sends to
-    std::atomic<bool> wantsDeclaration_{false};
     std::atomic<std::int64_t> tilesLeft_{0};
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<bool> ownTilesDone_{false}, endCalled_{false};

@@ -1,8 +1,10 @@
 // ManifestExchange: every rank tells the owners which inputs it will send, and all learn when all owners
 // know. Counts come from the senders only, so owner and contributor can not disagree about visibility.
 //
-// Each rank sends one manifest to each owner that it touches; the owner acknowledges; a rank whose manifests are all
-// acknowledged enters a reduction, and when that is done every manifest has arrived everywhere.
+// What a rank has declared holds until it declares something else. In each frame a rank sends a manifest to those
+// owners alone for which its inputs are not those of the last frame; the owner acknowledges it and forgets the rank's
+// older one. A rank whose manifests are all acknowledged, or that had none to send, enters a reduction. When that is
+// done, every manifest has arrived everywhere, and owners know that those who sent none send the same as before.
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
@@ -10,7 +12,9 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <limits>
 #include <mutex>
+#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -22,6 +26,10 @@ struct TileInput {
     std::uint32_t source = 0;
     std::uint16_t part = 0;
 };
+inline bool operator==(const TileInput& a, const TileInput& b) noexcept
+{
+    return a.tile == b.tile && a.source == b.source && a.part == b.part;
+}
 
 } // namespace dfb
 
@@ -46,12 +54,17 @@ public:
     };
 
     void clear() { inputs_.clear(); }
-    void add(const ExpectedInput& input) { inputs_.push_back(input); }
-    // All have been added: from now on they can be looked up.
-    void sort()
+    // Puts these in place of all that come from `ranks`, which ascend.
+    void replace(const std::vector<int>& ranks, const std::vector<ExpectedInput>& inputs)
     {
-        std::sort(inputs_.begin(), inputs_.end(),
-                  [](const ExpectedInput& a, const ExpectedInput& b) { return a.tile < b.tile; });
+        const auto isReplaced = [&](const ExpectedInput& input) {
+            return std::binary_search(ranks.begin(), ranks.end(), input.rank);
+        };
+        inputs_.erase(std::remove_if(inputs_.begin(), inputs_.end(), isReplaced), inputs_.end());
+        inputs_.insert(inputs_.end(), inputs.begin(), inputs.end());
+        std::sort(inputs_.begin(), inputs_.end(), [](const ExpectedInput& a, const ExpectedInput& b) {
+            return std::tie(a.tile, a.source, a.part, a.rank) < std::tie(b.tile, b.source, b.part, b.rank);
+        });
     }
 
     auto begin() const noexcept { return inputs_.begin(); }
@@ -72,48 +85,81 @@ private:
 
 class ManifestExchange {
 public:
-    void reset()
+    // `lastHolds`: what was declared up to the last frame has arrived at all owners. It must be the same on all ranks.
+    // False: all of it is forgotten.
+    void newFrame(bool lastHolds)
     {
-        std::lock_guard<std::mutex> lock(mutex_);
-        expected_.clear();
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (!lastHolds) {
+            expected_.clear();
+            mine_.clear();
+            told_.clear();
+        }
+        changedRanks_.clear();
+        changedInputs_.clear();
         acksMissing_.clear();
         declared_ = isComplete_ = false;
     }
 
-    // For the inputs of this rank: calls send(owner, bytes) with what is to be sent to whom. `ownerOf(tile)` gives the
-    // owner. False if nothing is. By one thread at a time.
+    // Takes note of what this rank will send: calls send(owner, bytes) for each other owner for which it has changed.
+    // `ownerOf(tile)` gives the owner. Returns whether answers are to come. By one thread at a time.
     template <class OwnerOf, class Send>
-    bool split(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
+    bool declare(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
     {
-        toSend_.clear();
+        if (inputs == mine_) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            declared_ = true;
+            return false;
+        }
+        mine_ = inputs;
+        toTell_.clear();
+        for (const TileInput& input : inputs)
+            toTell_.push_back({ownerOf(input.tile), input});
+        std::sort(toTell_.begin(), toTell_.end(), [](const Addressed& a, const Addressed& b) {
+            return std::tie(a.owner, a.input.tile, a.input.source, a.input.part)
+                   < std::tie(b.owner, b.input.tile, b.input.source, b.input.part);
+        });
+        news_.clear();
+        for (std::size_t before = 0, now = 0; before < told_.size() || now < toTell_.size();) {
+            const int owner = std::min(ownerAt(told_, before), ownerAt(toTell_, now));
+            const Part was = partOf(told_, before, owner), is = partOf(toTell_, now, owner);
+            if (!std::equal(told_.begin() + was.begin, told_.begin() + was.end, toTell_.begin() + is.begin,
+                            toTell_.begin() + is.end,
+                            [](const Addressed& a, const Addressed& b) { return a.input == b.input; }))
+                news_.push_back(is);
+            before = static_cast<std::size_t>(was.end);
+            now = static_cast<std::size_t>(is.end);
+        }
+        bool isWaiting = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             declared_ = true;
-            for (std::size_t i = 0; i < inputs.size(); ++i) {
-                const TileInput& input = inputs[i];
-                const int owner = ownerOf(input.tile);
-                if (owner == rank)
-                    expected_.add({input.tile, input.source, input.part, rank});
-                else
-                    toSend_.emplace_back(owner, i);
-            }
-            std::sort(toSend_.begin(), toSend_.end());
-            for (const auto& [owner, input] : toSend_) // all of them, before the first can answer
-                if (acksMissing_.empty() || acksMissing_.back() != owner)
-                    acksMissing_.push_back(owner);
+            for (const Part& part : news_) // all of them, before the first can answer
+                if (part.owner == rank) {
+                    changedRanks_.push_back(rank);
+                    for (std::ptrdiff_t i = part.begin; i < part.end; ++i) {
+                        const TileInput& input = toTell_[static_cast<std::size_t>(i)].input;
+                        changedInputs_.push_back({input.tile, input.source, input.part, rank});
+                    }
+                } else {
+                    acksMissing_.push_back(part.owner);
+                    isWaiting = true;
+                }
         }
-        for (std::size_t i = 0; i < toSend_.size();) {
-            const int owner = toSend_[i].first;
+        for (const Part& part : news_) {
+            if (part.owner == rank)
+                continue;
             manifest_.clear();
-            for (; i < toSend_.size() && toSend_[i].first == owner; ++i) {
-                const TileInput& input = inputs[toSend_[i].second];
+            for (std::ptrdiff_t i = part.begin; i < part.end; ++i) {
+                const TileInput& input = toTell_[static_cast<std::size_t>(i)].input;
                 manifest_.put(static_cast<std::int32_t>(input.tile));
                 manifest_.put(input.source);
                 manifest_.put(input.part);
             }
-            send(owner, manifest_.bytes());
+            send(part.owner, manifest_.bytes());
         }
-        return !toSend_.empty();
+        told_.swap(toTell_);
+        return isWaiting;
     }
 
     // The owner's side, with a manifest of rank `from`. Throws Error (MalformedMessage); `isMine(tile)` tells which
@@ -124,13 +170,14 @@ public:
         std::lock_guard<std::mutex> lock(mutex_);
         if (isComplete_)
             fail("a manifest after all ranks have declared");
+        changedRanks_.push_back(from);
         while (in.left() > 0) {
             const int tile = in.get<std::int32_t>();
             const auto source = in.get<std::uint32_t>();
             const auto part = in.get<std::uint16_t>();
             if (!isMine(tile))
                 fail("a manifest names a tile of another owner", tile, source);
-            expected_.add({tile, source, part, from});
+            changedInputs_.push_back({tile, source, part, from});
         }
     }
 
@@ -149,8 +196,10 @@ public:
     void complete()
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        if (!std::exchange(isComplete_, true))
-            expected_.sort();
+        if (std::exchange(isComplete_, true) || changedRanks_.empty())
+            return;
+        std::sort(changedRanks_.begin(), changedRanks_.end());
+        expected_.replace(changedRanks_, changedInputs_);
     }
 
     bool declared() const
@@ -163,6 +212,30 @@ public:
     const ExpectedInputs& expected() const { return expected_; }
 
 private:
+    struct Addressed {
+        int owner = 0;
+        TileInput input;
+    };
+    // Of a list that is ordered by owner: those of one owner.
+    struct Part {
+        int owner = 0;
+        std::ptrdiff_t begin = 0, end = 0;
+    };
+
+    // Comes after all owners where the list ends.
+    static int ownerAt(const std::vector<Addressed>& list, std::size_t i)
+    {
+        return i < list.size() ? list[i].owner : std::numeric_limits<int>::max();
+    }
+    // Empty, from `begin` on, if that owner has none.
+    static Part partOf(const std::vector<Addressed>& list, std::size_t begin, int owner)
+    {
+        std::size_t end = begin;
+        while (ownerAt(list, end) == owner)
+            ++end;
+        return {owner, static_cast<std::ptrdiff_t>(begin), static_cast<std::ptrdiff_t>(end)};
+    }
+
     [[noreturn]] static void fail(const char* message, std::int64_t tile = -1, std::int64_t source = -1)
     {
         ErrorInfo info;
@@ -174,13 +247,17 @@ private:
     }
 
     mutable std::mutex mutex_;
-    ExpectedInputs expected_;
-    std::vector<int> acksMissing_; // of these owners
+    ExpectedInputs expected_;                  // since the last complete()
+    std::vector<int> changedRanks_;            // of those that have told this owner something new in this frame
+    std::vector<ExpectedInput> changedInputs_; // what it is
+    std::vector<int> acksMissing_;             // of these owners
     bool declared_ = false, isComplete_ = false;
 
-    // Only split() uses them: to which owner which of the inputs goes, and what one owner is sent.
-    std::vector<std::pair<int, std::size_t>> toSend_;
-    ByteWriter manifest_;
+    // Only declare() and newFrame() use them.
+    std::vector<TileInput> mine_;          // as it was declared last
+    std::vector<Addressed> told_, toTell_; // the same by owner; what replaces it
+    std::vector<Part> news_;               // the parts of toTell_ that are not as in told_
+    ByteWriter manifest_;                  // for one owner
 };
 
 } // namespace dfb::detail

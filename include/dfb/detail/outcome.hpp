@@ -79,6 +79,13 @@ public:
         return !voted_;
     }
 
+    // The first thing that went wrong as far as this rank knows, also if the frame goes on without it.
+    std::optional<ErrorInfo> reason()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return error_;
+    }
+
     // Another rank says that it has failed, and why. vote() must follow.
     void failElsewhere(const ErrorInfo& info)
     {

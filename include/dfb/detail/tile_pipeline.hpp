@@ -46,7 +46,7 @@ public:
                config.dither},
               rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
-          coder_(config.wire)
+          coder_(config.wire, ActiveByDepth<TileOp>::value)
     {
     }
 
@@ -55,10 +55,15 @@ public:
     {
         return static_cast<ChannelMask>(config.aux | (config.depth ? depthChannel : 0));
     }
-    // What of a tile is read at all: by the operation, or for the image.
-    static ChannelMask travelling(const FrameBufferConfig& config)
+    // What of a tile is read at all: by the operation, for the image, or to tell in which of several passes what gives
+    // position and ids is the nearest.
+    static ChannelMask travelling(const FrameBufferConfig& config, bool comparesPasses = true)
     {
-        return static_cast<ChannelMask>(Tile::channels & (NeededChannelsOf<TileOp>::value | imageChannels(config)));
+        const bool comparesDepths =
+            comparesPasses && (config.aux & (positionChannel | primitiveIdChannel | instanceIdChannel)) != 0;
+        return static_cast<ChannelMask>(
+            Tile::channels
+            & (NeededChannelsOf<TileOp>::value | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
     }
 
     // The most that one message with pixels can have.
@@ -82,9 +87,11 @@ public:
     {
         nonFinite_ = alphaOutside_ = 0;
         reports_ = {};
+        const bool hasPasses =
+            plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
+        sent_ = travelling(config_, KeepsState<TileOp>::value || hasPasses);
         gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
-        info.depthIsRounded = config_.wire.depth != WireFormat::Float32;
         background_ = info.background;
         backgroundIsFine_ = true;
         table_.newFrame(info, plan);
@@ -102,7 +109,7 @@ public:
     void start(Tile& tile, int index, int pass) const
     {
         static_cast<TileHeader&>(tile) = headerOf(index, pass);
-        tile.clear(travelling(config_));
+        tile.clear(sent_);
     }
     void start(TileView& tile, int index, int pass) const
     {
@@ -119,9 +126,9 @@ public:
                                   + std::to_string(tile.stride) + " pixels");
         const ConstPlanes planes = tile.planes();
         for (std::size_t c = 0; c < channelCount; ++c)
-            if (tile.color && !planes.at[c] && hasChannel(travelling(config_), c))
-                throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without channel "
-                                      + std::to_string(c) + ", which is needed");
+            if (tile.color && !planes.at[c] && hasChannel(sent_, c))
+                throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without its " + channelNames[c]
+                                      + ", which is needed");
     }
 
     // Whether inputs of a tile are hidden by an opaque one.
@@ -162,7 +169,7 @@ public:
     {
         const FloatEnvironment floatEnvironment;
         InputFaults faults;
-        Buffer message = encodeFragment(*pool_, tile, travelling(config_), address_, codec, coder_, wireColor_, faults);
+        Buffer message = encodeFragment(*pool_, tile, sent_, address_, codec, coder_, wireColor_, faults);
         if (faults.nonFinite)
             nonFinite_ += static_cast<std::int64_t>(faults.nonFinite);
         if (faults.alphaOutside)
@@ -184,7 +191,7 @@ public:
         where.source = h.source;
         if (!table_.isMine(tile))
             failMalformed("an input for a tile of another owner");
-        if (const auto mine = static_cast<ChannelMask>(travelling(config_) | colorChannel); fragment.channels() != mine)
+        if (const auto mine = static_cast<ChannelMask>(sent_ | colorChannel); fragment.channels() != mine)
             failMalformed("an input with other channels than this rank's", mine, fragment.channels());
         if (fragment.colorFormat() != WireFormat::Float32 && fragment.colorFormat() != config_.wire.color
             && config_.wire.budget == 0)
@@ -374,6 +381,7 @@ private:
     PixelOp pixelOp_;
     TileTable<TileOp> table_;
     FinalGather gather_;
+    ChannelMask sent_ = 0; // of the inputs of this frame
     std::array<float, 4> background_{};
     bool backgroundIsFine_ = true; // see finishBackground()
     const WireCoder coder_;

@@ -17,6 +17,7 @@
 #include <exception>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <optional>
 #include <string>
 #include <utility>
@@ -61,10 +62,10 @@ class TileTable {
 public:
     using FrameData = typename FrameDataOf<TileOp>::type;
 
+    // Throws InvalidArgument for owners that there are not, and OutOfMemory.
     TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount)
-        : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
-          slotOf_(static_cast<std::size_t>(layout.tileCount()), -1)
-    {
+    try : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
+        slotOf_(static_cast<std::size_t>(layout.tileCount()), -1) {
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const int owner = ownerMap(tile, layout, rankCount);
             if (owner < 0 || owner >= rankCount)
@@ -77,6 +78,11 @@ public:
             }
         }
         slots_.resize(owned_.size());
+        series_.resize(KeepsState<TileOp>::value ? owned_.size() : 0);
+    } catch (const std::bad_alloc&) {
+        constexpr std::size_t mostBytes = 2 * sizeof(std::int32_t) + sizeof(int) + sizeof(std::unique_ptr<Slot>);
+        const auto tiles = static_cast<std::size_t>(layout.tileCount());
+        throw OutOfMemory(mostBytes * tiles, ("tables of " + std::to_string(tiles) + " tiles").c_str());
     }
 
     const TileLayout& layout() const noexcept { return layout_; }
@@ -94,6 +100,13 @@ public:
         info_ = info;
         plan_ = plan;
         arrived_ = endedEarly_ = 0;
+        for (std::size_t i = 0; i < series_.size(); ++i)
+            if (const TileSamples s = samples(owned_[i]); s.count > 0) {
+                Series& series = series_[i];
+                series.goesOn = s.first > 0 && s.first == series.next;
+                series.begin = s.first == 0 ? info.frame : series.begin;
+                series.next = s.first + s.count;
+            }
     }
     // Belongs to it. Throws what copying throws.
     void setData(const FrameData& data) { data_ = data; }
@@ -170,7 +183,7 @@ public:
             {
                 const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
                 const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-                if ((!named && !all && !touched) || samples(owned_[i]).count == 0)
+                if ((!named && !all && !touched && !hasSamples(owned_[i])) || samples(owned_[i]).count == 0)
                     continue;
                 try {
                     Slot& slot = slotFor(owned_[i]);
@@ -313,6 +326,13 @@ private:
         BackgroundPixels background;
     };
 
+    // What a tile gets over several frames.
+    struct Series {
+        std::int64_t begin = 0; // the frame with sample 0
+        int next = 0;           // sample
+        bool goesOn = false;    // in this frame
+    };
+
     std::mutex& mutexOf(int tile) { return mutexes_[static_cast<std::size_t>(tile) % mutexes_.size()]; }
 
     std::unique_ptr<Slot>& slotOf(int tile)
@@ -327,6 +347,7 @@ private:
         if (!slot)
             slot = std::make_unique<Slot>();
         if (slot->frame != info_.frame) {
+            const bool isEmptyYet = goesOn(tile) && !hasSamples(tile);
             slot->frame = info_.frame;
             slot->ready = slot->touched = slot->declared = slot->hasPixels = slot->finished = false;
             slot->spoilt = slot->counted = false;
@@ -341,6 +362,7 @@ private:
             info.region = layout_.region(tile);
             info.passes = samples(tile).count;
             info.firstSample = samples(tile).first;
+            info.emptySamples = isEmptyYet ? info.firstSample : 0;
             try {
                 if constexpr (HasNewFrameWithData<TileOp>::value)
                     slot->op.newFrame(info, data_);
@@ -352,6 +374,19 @@ private:
             }
         }
         return *slot;
+    }
+
+    // Whether the samples of this frame follow those of the tile in earlier ones.
+    bool goesOn(int tile) const
+    {
+        const auto i = static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)]);
+        return KeepsState<TileOp>::value && series_[i].goesOn;
+    }
+    // Whether the operation has had any of those: then it gets this frame's, too, also if there is nothing in them.
+    bool hasSamples(int tile)
+    {
+        const auto i = static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)]);
+        return goesOn(tile) && slots_[i] && slots_[i]->frame >= series_[i].begin;
     }
 
     static void declareSlot(Slot& slot, const ExpectedInputs::Range& inputs)
@@ -400,6 +435,7 @@ private:
     std::vector<std::int32_t> owners_, slotOf_;
     std::vector<int> owned_;
     std::vector<std::unique_ptr<Slot>> slots_;
+    std::vector<Series> series_; // of each owned tile, with an operation that keeps state
     std::array<std::mutex, 64> mutexes_;
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;

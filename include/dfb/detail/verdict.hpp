@@ -78,7 +78,6 @@ inline std::uint64_t fingerprintOf(const FrameParams& p)
     f.add(static_cast<std::uint64_t>(p.maxLayers));
     f.add(p.accumulationId);
     f.add(p.declared);
-    f.add(p.declarationKey);
     f.add(static_cast<std::uint64_t>(p.timeoutMs));
     f.add(p.allowPartial);
     return f.value();
@@ -210,8 +209,7 @@ struct Verdict {
         ErrorInfo info;
         info.kind = ErrorKind::Disagreement;
         info.message = "the frame was begun with different parameters (background, passes, samples, maxLayers, "
-                       "accumulationId, declared, "
-                       "declarationKey, timeoutMs, allowPartial)";
+                       "accumulationId, declared, timeoutMs, allowPartial)";
         return info;
     }
 
@@ -280,11 +278,11 @@ struct Agreement {
     std::string text; // items parted by commas, or what is wrong
     int rank = 0;     // whose; the lowest of those that are alike
 
-    // `tileSize`: of the tile operation; `sent`: those of its channels that travel; `ownerOf(tile)`: the owner map's
-    // answers.
+    // `checksums`: see MessengerOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
+    // `ownerOf(tile)`: the owner map's answers.
     template <class TileOp, class PixelOp, class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, int rank, int tileSize, ChannelMask sent, int tileCount,
-                        const OwnerOf& ownerOf)
+    static Agreement of(const FrameBufferConfig& c, bool checksums, int rank, int tileSize, ChannelMask sent,
+                        int tileCount, const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
@@ -304,12 +302,10 @@ struct Agreement {
                     + ", frames in flight " + text(c.framesInFlight) + ", codec " + text(c.codec ? c.codec->id() : 0)
                     + ", compression " + text(static_cast<int>(c.compression)) + ", gather "
                     + text(static_cast<int>(c.gather)) + ", wire colour " + nameOf(c.wire.color) + ", error budget "
-                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", wire depth "
-                    + nameOf(c.wire.depth) + " of " + text(c.wire.depthNear) + " to " + text(c.wire.depthFar)
-                    + ", least transmittance " + text(c.minTransmittance) + ", checksums " + text(c.checksums)
-                    + ", message pool " + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither "
-                    + text(c.dither) + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation
-                    + typeid(PixelOp).name(),
+                    + text(c.wire.budget) + ", largest colour " + text(c.wire.maxColor) + ", least transmittance "
+                    + text(c.minTransmittance) + ", checksums " + text(checksums) + ", message pool "
+                    + text(c.messagePoolBytes) + ", owner map " + text(owners.value()) + ", dither " + text(c.dither)
+                    + ", " + tileOperation + typeid(TileOp).name() + ", " + pixelOperation + typeid(PixelOp).name(),
                 rank};
     }
 

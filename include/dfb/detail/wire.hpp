@@ -44,7 +44,8 @@ struct FragmentHeader {
     ChannelMask channels = 0;
     FragmentEncoding encoding = FragmentEncoding::Empty;
     std::uint8_t codec = 0; // 0: the payload is raw
-    WireFormat colorFormat = WireFormat::Float32, depthFormat = WireFormat::Float32;
+    WireFormat colorFormat = WireFormat::Float32;
+    std::uint8_t reserved = 0;
 };
 static_assert(sizeof(FragmentHeader) == 40 && std::is_trivially_copyable_v<FragmentHeader>);
 
@@ -55,13 +56,13 @@ inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) 
 
 inline WireFormat formatOf(const FragmentHeader& h, std::size_t channel)
 {
-    return channel == Color ? h.colorFormat : channel == Depth ? h.depthFormat : WireFormat::Float32;
+    return channel == Color ? h.colorFormat : WireFormat::Float32;
 }
 
 // What a plane of so many pixels takes up in a message.
 inline std::size_t planeBytes(const FragmentHeader& h, std::size_t channel, std::size_t pixels)
 {
-    return (bytesOf(formatOf(h, channel)) * static_cast<std::size_t>(channelWords[channel]) * pixels + 3) / 4 * 4;
+    return bytesOf(formatOf(h, channel)) * static_cast<std::size_t>(channelWords[channel]) * pixels;
 }
 inline std::size_t planesBytes(const FragmentHeader& h, std::size_t pixels)
 {
@@ -121,6 +122,21 @@ inline bool isConstant(const std::byte* plane, std::size_t channel, std::size_t 
     return std::memcmp(plane, plane + bytes, bytes * (pixels - 1)) == 0;
 }
 
+// Copies what is premultiplied by alpha, 3 floats a pixel, and makes it so by the alpha that the owner gets: else what
+// is divided by that in the end would not be a mean. `encoded`: the colours `rgba`, as they travel.
+inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const float* rgba, const std::byte* encoded,
+                              const float* in, std::size_t pixels, float* out)
+{
+    static thread_local std::vector<float> decoded;
+    decoded.resize(std::max(decoded.size(), 4 * pixels));
+    coder.decodeColor(format, encoded, pixels, decoded.data());
+    std::memcpy(out, in, 3 * sizeof(float) * pixels);
+    for (std::size_t i = 0; i < pixels; ++i)
+        if (const float alpha = rgba[4 * i + 3], rounded = decoded[4 * i + 3]; alpha > 0 && alpha != rounded)
+            for (std::size_t c = 3 * i; c < 3 * i + 3; ++c)
+                out[c] = in[c] * (rounded / alpha);
+}
+
 // Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
 // its range. Adds to `faults`. `codec` may be null.
 template <class TileType>
@@ -137,7 +153,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         pool.acquire(color == WireFormat::Float32 ? largestFragment(width, height, channels) : fragmentPrefix);
     wide.resize(std::max(wide.size(), color == WireFormat::Float32 ? 0 : 4 * pixelCount));
     float* rgba = color == WireFormat::Float32 ? floatsOf(message.data() + fragmentPrefix) : wide.data();
-    active.gather(tile, channels, rgba);
+    active.gather(tile, channels, coder.activeByDepth(), rgba);
     const auto planeOf = [&](std::size_t c) {
         return c == Color ? reinterpret_cast<const std::byte*>(rgba) : active.plane(c);
     };
@@ -171,9 +187,9 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     }
     const auto count = static_cast<int>(stored);
     h.colorFormat = color != WireFormat::Float32 && coder.inRange(rgba, count) ? color : WireFormat::Float32;
-    h.depthFormat = coder.depth();
     const std::size_t payload = tableBytes + planesBytes(h, stored);
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
+    faults.nonFinite += active.nanDepths();
     if (active.mayBeFaulty())
         active.forEachSpan(tile, [&](std::size_t first, int spanPixels) {
             const ConstPlanes planes = tile.planes();
@@ -199,12 +215,10 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
         if (!hasChannel(channels, c))
             continue;
         const std::size_t bytes = planeBytes(h, c, stored);
-        if (formatOf(h, c) != WireFormat::Float32)
-            std::memset(to + bytes - 4, 0, 4); // what fills it up
         if (c == Color && h.colorFormat != WireFormat::Float32)
             coder.encodeColor(h.colorFormat, rgba, count, to);
-        else if (c == Depth && h.depthFormat != WireFormat::Float32)
-            coder.encodeDepth(h.depthFormat, floatsOf(planeOf(Depth)), count, to);
+        else if ((c == Normal || c == Albedo) && h.colorFormat != WireFormat::Float32)
+            multiplyByRounded(coder, h.colorFormat, rgba, out, floatsOf(planeOf(c)), stored, floatsOf(to));
         else if (c != Color)
             std::memcpy(to, planeOf(c), bytes);
         to += bytes;
@@ -255,7 +269,7 @@ inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t ta
                        const std::byte* body, const WireCoder& coder)
 {
     FragmentHeader wide = h;
-    wide.colorFormat = wide.depthFormat = WireFormat::Float32;
+    wide.colorFormat = WireFormat::Float32;
     Buffer floats = pool.acquire(tableBytes + planesBytes(wide, pixels));
     const std::byte* in = body;
     std::byte* out = floats.data();
@@ -264,9 +278,7 @@ inline Buffer expanded(MemoryPool& pool, const FragmentHeader& h, std::size_t ta
             continue;
         if (c == Color && !coder.decodeColor(h.colorFormat, in, pixels, floatsOf(out)))
             failMalformed("a colour that is out of its format's range");
-        if (c == Depth)
-            coder.decodeDepth(h.depthFormat, in, pixels, floatsOf(out));
-        else if (c != Color)
+        if (c != Color)
             std::memcpy(out, in, planeBytes(h, c, pixels));
         in += planeBytes(h, c, pixels);
         out += planeBytes(wide, c, pixels);
@@ -292,12 +304,9 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
 
-    if (h.colorFormat > WireFormat::Unorm8 || h.depthFormat > WireFormat::Unorm8)
-        failMalformed("unknown format of colour or depth", static_cast<std::int64_t>(WireFormat::Unorm8),
-                      static_cast<std::int64_t>(std::max(h.colorFormat, h.depthFormat)));
-    if (h.depthFormat != coder.depth())
-        failMalformed("depth in another format than this rank's", static_cast<std::int64_t>(coder.depth()),
-                      static_cast<std::int64_t>(h.depthFormat));
+    if (h.colorFormat > WireFormat::Unorm8)
+        failMalformed("unknown format of colour", static_cast<std::int64_t>(WireFormat::Unorm8),
+                      static_cast<std::int64_t>(h.colorFormat));
 
     TileHeader header;
     header.frame = m.number;
@@ -356,7 +365,7 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
                       static_cast<std::int64_t>(message.size()));
     }
 
-    if (h.colorFormat != WireFormat::Float32 || h.depthFormat != WireFormat::Float32) {
+    if (h.colorFormat != WireFormat::Float32) {
         message = expanded(pool, h, tableBytes, stored, message.data() + offset, coder);
         offset = 0;
     }

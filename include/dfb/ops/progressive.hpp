@@ -17,30 +17,41 @@
 namespace dfb {
 
 // `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The
-// image is the mean of all samples since FrameParams::accumulationId changed or a tile began with sample 0; a tile must
-// get its samples in order, in each frame those that follow. A tile without samples in a frame costs nothing and keeps
-// its pixels. For each finished tile TileReport::error is the standard error of its pixels' mean (root mean square over
-// pixels and RGBA) in the worst of its blocks of 8x8 pixels, so that a bright corner counts however dark the rest is;
-// infinite before the second sample. Memory: 45 bytes a pixel of a tile that is owned and was touched, and 36 with
-// normals and albedo more.
+// image is the mean of all samples since FrameParams::accumulationId changed, a frame failed, or a tile began with
+// sample 0. "4 more samples a frame until the camera moves":
+//
+//   params.passes = 4;
+//   for (;;) {
+//       params.accumulationId += camera.hasMoved();
+//       dfb::renderImageParallel(fb, renderTile, params); // or any other loop; tile.sample is 0, 1, 2 and so on
+//   }
+//
+// With FrameParams::samples, a tile must get its samples in order, in each frame those that follow; a tile without
+// samples in a frame costs nothing and keeps its pixels. For each finished tile TileReport::error is the standard error
+// of its pixels' mean (root mean square over pixels and RGBA) in the worst of its blocks of 8x8 pixels, so that a
+// bright corner counts however dark the rest is; infinite before the second sample. Memory: 45 bytes a pixel of a tile
+// that is owned and was touched, and 36 with normals and albedo more.
 template <class Base>
 class Progressive {
 public:
     static constexpr int tileSize = detail::TileSizeOf<Base>::value;
     static constexpr ChannelMask channels = Base::channels;
     static constexpr ChannelMask neededChannels = detail::NeededChannelsOf<Base>::value;
+    static constexpr bool activeByDepth = detail::ActiveByDepth<Base>::value;
     static constexpr bool keepsState = true;
 
     void newFrame(const TileInfo& info)
     {
         base_.newFrame(info);
         info_ = info;
-        if (isFresh_ || info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)) {
+        if (isFresh_ || info.accumulationId != accumulationId_ || (info.passes > 0 && info.firstSample == 0)
+            || info.emptySamples > 0) {
             isFresh_ = false;
             accumulationId_ = info.accumulationId;
-            samples_ = 0;
+            samples_ = info.emptySamples;
             sums_.reset(pixelCount(), info.wanted);
-            m2_.assign(pixelCount(), 0.0);
+            sums_.addBackground(info.emptySamples, info.background);
+            m2_.assign(pixelCount(), 0.0); // also of those, which are all alike
         }
         if (info.passes > 0 && info.firstSample != samples_)
             throw InvalidArgument("the tile has accumulated " + std::to_string(samples_)

@@ -42,18 +42,23 @@ public:
         sum(aux_.normal, row.aux.normal, 3 * first);
         sum(aux_.albedo, row.aux.albedo, 3 * first);
         sum(aux_.weight, row.aux.weight, first);
-        for (std::size_t i = 0; i < row.depth.size(); ++i) {
-            if (row.depth[i] < depth_[first + i] && !aux_.position.empty())
-                std::copy_n(row.aux.position.data() + 3 * i, 3, aux_.position.data() + 3 * (first + i));
+        for (std::size_t i = 0; i < row.depth.size(); ++i)
             depth_[first + i] = std::min(depth_[first + i], row.depth[i]);
-        }
-        const auto nearest = [first](std::vector<NearestId>& to, const std::vector<NearestId>& from) {
+        const auto nearest = [first](auto& to, const auto& from) { // of equal ones the first
             for (std::size_t i = 0; !to.empty() && i < from.size(); ++i)
-                if (from[i].id != noId && (to[first + i].id == noId || from[i].depth < to[first + i].depth))
+                if (from[i].isThere() && (!to[first + i].isThere() || from[i].depth < to[first + i].depth))
                     to[first + i] = from[i];
         };
+        nearest(aux_.position, row.aux.position);
         nearest(aux_.primitiveId, row.aux.primitiveId);
         nearest(aux_.instanceId, row.aux.instanceId);
+    }
+
+    // Adds `count` rows of nothing to all pixels, as if one by one: sums of so many equal floats are exact.
+    void addBackground(std::int64_t count, const std::array<float, 4>& background)
+    {
+        for (std::size_t i = 0; count > 0 && i < rgba_.size(); ++i)
+            rgba_[i] += static_cast<double>(count) * static_cast<double>(background[i % 4]);
     }
 
     const double* rgba(std::size_t pixel) const noexcept { return rgba_.data() + 4 * pixel; }
@@ -76,8 +81,7 @@ public:
             }
             return to.data();
         };
-        const auto ids = [&](std::vector<std::uint32_t>& to,
-                             const std::vector<NearestId>& from) -> const std::uint32_t* {
+        const auto ids = [&](std::vector<std::uint32_t>& to, const std::vector<FrontId>& from) -> const std::uint32_t* {
             if (from.empty())
                 return nullptr;
             to.resize(width);
@@ -87,7 +91,12 @@ public:
         };
         aux.normal = weighted(normal_, aux_.normal);
         aux.albedo = weighted(albedo_, aux_.albedo);
-        aux.position = aux_.position.empty() ? nullptr : aux_.position.data() + 3 * first;
+        if (!aux_.position.empty()) {
+            position_.resize(3 * width);
+            for (std::size_t i = 0; i < width; ++i)
+                std::copy_n(aux_.position[first + i].at, 3, position_.data() + 3 * i);
+            aux.position = position_.data();
+        }
         aux.primitiveId = ids(primitiveId_, aux_.primitiveId);
         aux.instanceId = ids(instanceId_, aux_.instanceId);
         return out.setRow(y, row_.data(), depth_.data() + first, aux);
@@ -98,7 +107,7 @@ private:
     std::vector<float> depth_; // the nearest
     AuxPixels aux_;
     std::vector<double> row_; // the rest: scratch of write()
-    std::vector<float> normal_, albedo_;
+    std::vector<float> normal_, albedo_, position_;
     std::vector<std::uint32_t> primitiveId_, instanceId_;
 };
 
@@ -138,12 +147,12 @@ public:
         Scratch& scratch = start();
         const std::size_t passes = static_cast<std::size_t>(info_.passes);
         const int width = info_.region.width();
-        const bool tracksOrder = (tracked_ & farChannel) || scratch.row.countTies;
+        const bool tracksOrder = (tracked_ & farChannel) != 0;
         scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
         for (int y = 0; y < info_.region.height(); ++y) {
             std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
             for (std::size_t pass = 0; pass < passes; ++pass) {
-                if (tracked_ != 0 || scratch.row.countTies) // of colour and depth nothing stays from the last row
+                if (tracked_ != 0) // of colour and depth nothing stays from the last row
                     scratch.row.resize(width, tracked_);
                 scratch.compositors[pass].nextRow(scratch.row);
                 overBackground(scratch.row, 0, width, info_.background.data());
@@ -161,7 +170,7 @@ public:
     {
         static thread_local PixelSums sums;
         const int last = info_.passes - 1;
-        if (last == 0 && tracked_ == 0 && !out.isDithered() && !(info_.depthIsRounded && Rule != BlendRule::InOrder)) {
+        if (last == 0 && tracked_ == 0 && !out.isDithered()) {
             finishRuns(out);
             return;
         }
@@ -219,9 +228,8 @@ private:
                 scratch.pointers.push_back(&fragments_[next]);
             scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
         }
-        scratch.row.wantsDepth = (info_.wanted & depthChannel) || tracked_ != 0;
+        scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
         scratch.row.wantsGaps = scratch.row.wantsSingles = true;
-        scratch.row.countTies = info_.depthIsRounded && Rule != BlendRule::InOrder;
         scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
         scratch.row.resize(info_.region.width(), tracked_);
         return scratch;
@@ -313,6 +321,7 @@ public:
     static constexpr ChannelMask channels = Channels;
     static constexpr BlendRule rule = Rule;
     static constexpr bool emptyIsBackground = true;
+    static constexpr bool activeByDepth = Rule == BlendRule::Nearest;
 
     void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
     void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
@@ -403,8 +412,10 @@ private:
     int opaque_ = none;            // the first that is
 };
 
-// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry; what is behind it is not
-// blended, whatever its alpha. Accepts any tree.
+// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry: what has a depth below
+// +infinity is there, also if it is black or its alpha 0, and what has not is not, whatever its colour. Inputs behind
+// the nearest are not blended, whatever its alpha; it is laid over the background by that. Depth, position and ids are
+// those of the nearest. Accepts any tree.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");

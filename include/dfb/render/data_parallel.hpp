@@ -11,13 +11,6 @@
 
 namespace dfb {
 
-namespace detail {
-
-struct DataParallelWork : OwnBricks {
-};
-
-} // namespace detail
-
 // Renders all bricks of `world` into the tiles that they may project to, and returns the frame, which is to be ended;
 // every brick must be in the world of one rank only. `renderBrick(brick, tile)` is called from several threads at once,
 // for each pass with its own tile.pass; it writes colour and depth of the pixels of tile.region that rays meet within
@@ -32,21 +25,22 @@ template <class FrameBuffer, class Camera, class RenderBrick>
 {
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
-    const auto& work =
-        detail::workOf<detail::DataParallelWork>(frame, [&](auto& w) { w.find(world, camera, fb.layout()); });
-    const std::vector<BrickInTile>& pairs = work.pairs;
-    if (frame.wantsDeclaration())
+    frame.guard([&] {
+        auto& work = detail::workOf<detail::OwnBricks>(frame);
+        work.find(world, camera, fb.layout());
         frame.declare(work.inputs);
-    const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
-    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
-        const auto job = jobs.at(static_cast<std::int64_t>(i));
-        const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];
-        frame.start(tile, pairs[job.item].tile, job.pass);
-        tile.generation = 1;
-        tile.source = brick.id;
-        renderBrick(brick, tile);
-        frame.setTile(tile);
+        const std::vector<BrickInTile>& pairs = work.pairs;
+        const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
+        detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
+        loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
+            const auto job = jobs.at(static_cast<std::int64_t>(i));
+            const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];
+            frame.start(tile, pairs[job.item].tile, job.pass);
+            tile.generation = 1;
+            tile.source = brick.id;
+            renderBrick(brick, tile);
+            frame.setTile(tile);
+        });
     });
     return frame;
 }

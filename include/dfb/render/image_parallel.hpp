@@ -47,7 +47,6 @@ template <class FrameBuffer, class RenderTile>
                                                              const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = false;
-    params.declarationKey = 0;
     params.maxLayers = 1;
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(assigned.size(), [&](std::size_t i) { return frame.samples(assigned[i]).count; });
@@ -72,7 +71,6 @@ template <class FrameBuffer, class RenderTile>
     if (distribution == WorkDistribution::Owned)
         return startImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
     params.declared = false;
-    params.declarationKey = 0;
     params.maxLayers = 1;
     auto frame = fb.begin(params, tileData, pixelData);
     const detail::PassJobs jobs(static_cast<std::size_t>(fb.layout().tileCount()),
@@ -98,7 +96,7 @@ template <class FrameBuffer, class RenderTile>
                  [&](std::size_t i, auto& tile) { render(rank + static_cast<std::int64_t>(i) * size, tile); });
         break;
     case WorkDistribution::Dynamic:
-        loop.guard([&] {
+        frame.guard([&] {
             for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
                  range = frame.nextJobs(count))
                 renderRange(range.begin, range.end, detail::scatteringStride(count));

@@ -173,7 +173,7 @@ struct MixedJob {
     int pass = 0;
 };
 
-// What there is to do in a mixed-parallel frame: the pairs hold as long as a declaration, the rest for one frame.
+// What there is to do in a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs;
     std::vector<int> passes;       // of each pair
@@ -298,22 +298,20 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
     params.declared = true;
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.guard([&] {
-        auto& work = detail::workOf<detail::MixedWork>(
-            frame, [&](auto& w) { detail::findVisibleTiles(world, camera, fb.layout(), w.pairs); });
+    frame.guard([&] {
+        auto& work = detail::workOf<detail::MixedWork>(frame);
+        detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
         const std::vector<BrickInTile>& pairs = work.pairs;
         const std::vector<detail::MixedJob>& jobs = work.jobs;
         frame.expectLayers(work.mostPerTile(fb.layout().tileCount()));
         work.findJobs(frame, world, owner);
-        if (frame.wantsDeclaration()) {
-            // The tile, whoever renders it, is declared by the first of those that hold the brick.
-            work.inputs.clear();
-            for (const BrickInTile& pair : pairs)
-                if (const SharedBrick& b = world.bricks()[static_cast<std::size_t>(pair.brick)];
-                    b.ranks.front() == fb.rank())
-                    work.inputs.push_back({pair.tile, b.brick.id, 0});
-            frame.declare(work.inputs);
-        }
+        // The tile, whoever renders it, is declared by the first of those that hold the brick.
+        work.inputs.clear();
+        for (const BrickInTile& pair : pairs)
+            if (const SharedBrick& b = world.bricks()[static_cast<std::size_t>(pair.brick)];
+                b.ranks.front() == fb.rank())
+                work.inputs.push_back({pair.tile, b.brick.id, 0});
+        frame.declare(work.inputs);
         loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
             const BrickInTile& pair = pairs[jobs[i].pair];
             const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
@@ -350,12 +348,11 @@ template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBri
                                                        const typename FrameBuffer::PixelFrameData& pixelData = {})
 {
     params.declared = false;
-    params.declarationKey = 0;
     auto frame = fb.begin(params, tileData, pixelData);
     detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    loop.guard([&] {
-        auto& work = detail::workOf<detail::OrderedWork>(
-            frame, [&](auto& w) { detail::findVisibleTiles(world, camera, fb.layout(), w.pairs); });
+    frame.guard([&] {
+        auto& work = detail::workOf<detail::OrderedWork>(frame);
+        detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
         std::vector<BrickInTile>& pairs = work.pairs;
         const std::vector<detail::MixedJob>& jobs = work.jobs;
         std::vector<int>&place = work.place, &firstPair = work.firstPair, &empty = work.empty;

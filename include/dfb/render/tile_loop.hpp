@@ -6,7 +6,6 @@
 #include <any>
 #include <cstddef>
 #include <cstdint>
-#include <exception>
 #include <memory>
 #include <utility>
 #include <vector>
@@ -47,18 +46,12 @@ struct TileOf<FrameBuffer, InPlace<Find>> {
 };
 
 // What a loop has to do: a `Work`, a type of that loop alone, that it has again in the next frame, with its memory.
-// Calls find(work) for what holds as long as a declaration of inputs: not in the frames that go by the last one.
-template <class Work, class Frame, class Find>
-Work& workOf(const Frame& frame, const Find& find)
+template <class Work, class Frame>
+Work& workOf(const Frame& frame)
 {
     auto* work = std::any_cast<std::shared_ptr<Work>>(&frame.loopMemory());
     if (!work)
         work = &frame.loopMemory().template emplace<std::shared_ptr<Work>>(std::make_shared<Work>());
-    Work* const* found = std::any_cast<Work*>(&frame.declaredFrom());
-    if (!found || *found != work->get()) {
-        find(**work);
-        frame.declaredFrom() = work->get();
-    }
     return **work;
 }
 
@@ -116,7 +109,7 @@ public:
     template <class Job>
     void run(std::size_t count, const Job& job)
     {
-        guard([&] {
+        frame_.guard([&] {
             fb_.executor().parallelFor(count, [&](std::size_t i) {
                 if (frame_.failed())
                     return;
@@ -127,21 +120,10 @@ public:
                 if (!tile)
                     tile.reset(new Tile); // start() clears it
                 tile->tile = -1;
-                guard([&] { job(i, *tile); }, &tile->tile); // the frame may do without that one
+                frame_.guard([&] { job(i, *tile); }, *tile); // the frame may do without that one
                 spare = std::move(tile);
             });
         });
-    }
-
-    // Calls body(); what it throws makes the frame fail. `tile`: which one it was about, once that is known.
-    template <class Body>
-    void guard(const Body& body, const int* tile = nullptr)
-    {
-        try {
-            body();
-        } catch (...) {
-            frame_.abort(std::current_exception(), tile ? *tile : -1);
-        }
     }
 
 private:

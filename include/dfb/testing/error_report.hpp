@@ -13,7 +13,8 @@
 
 namespace dfb::testing {
 
-// All counts are of values, 4 to a pixel. Images are added up, piece by piece, with add().
+// All counts but the last two are of values of colour and alpha, 4 to a pixel. Images are added up, piece by piece,
+// with add().
 struct ErrorReport {
     std::int64_t values = 0;
     double maxAbs = 0; // of finite values
@@ -22,8 +23,9 @@ struct ErrorReport {
     // Distances to the exact value rounded, in floats: 0, 1, 2 to 3, 4 to 7, ..., the last: 2^14 or more, or not finite
     // where the exact value is.
     std::array<std::int64_t, 16> ulps{};
-    std::int64_t bytes = 0, wrongBytes = 0; // of 8-bit values: all, and those that are not the exact value rounded
-    int maxLevels = 0;                      // by which such a value is off
+    std::int64_t bytes = 0, wrongBytes = 0;   // of 8-bit values: all, and those that are not the exact value rounded
+    int maxLevels = 0;                        // by which such a value is off
+    std::int64_t others = 0, wrongOthers = 0; // values of depth and auxiliary channels: all, and those that are wrong
 
     // Of two values that are not finite both, nothing is said.
     void add(float measured, Exact exact)
@@ -54,6 +56,13 @@ struct ErrorReport {
         maxLevels = std::max(maxLevels, std::abs(int{measured} - int{expected}));
     }
 
+    // Of depth or an auxiliary channel.
+    void addOther(bool isWrong)
+    {
+        ++others;
+        wrongOthers += isWrong;
+    }
+
     void add(const ErrorReport& other)
     {
         values += other.values;
@@ -65,6 +74,8 @@ struct ErrorReport {
         bytes += other.bytes;
         wrongBytes += other.wrongBytes;
         maxLevels = std::max(maxLevels, other.maxLevels);
+        others += other.others;
+        wrongOthers += other.wrongOthers;
     }
 
     double rmse() const { return values > 0 ? std::sqrt(sumSquares / static_cast<double>(values)) : 0.0; }
@@ -89,7 +100,8 @@ struct ErrorReport {
         for (const std::int64_t count : ulps)
             all += ' ' + std::to_string(count);
         return all + "; " + std::to_string(wrongBytes) + " of " + std::to_string(bytes) + " bytes wrong, by up to "
-               + std::to_string(maxLevels);
+               + std::to_string(maxLevels) + "; " + std::to_string(wrongOthers) + " of " + std::to_string(others)
+               + " values of depth and auxiliary channels wrong";
     }
 };
 

@@ -108,6 +108,11 @@ public:
     {
     }
 
+    static bool mayHaveThread(const Communicator& communicator)
+    {
+        return dfb::detail::resolved<Base>(Progress::Auto, communicator.communicator) == Progress::Thread;
+    }
+
     int rank() const { return base_.rank(); }
     int size() const { return base_.size(); }
     bool needsPolling() const
@@ -188,6 +193,11 @@ public:
     auto abort(const std::string& text) -> decltype(std::declval<B&>().abort(text))
     {
         base_.abort(text);
+    }
+    template <class B = Base>
+    auto sharingRanks() const -> decltype(std::declval<const B&>().sharingRanks())
+    {
+        return base_.sharingRanks();
     }
     template <class B = Base>
     auto lendsTo(int other) const -> decltype(std::declval<const B&>().lendsTo(other))

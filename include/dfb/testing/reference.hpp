@@ -22,17 +22,52 @@ __extension__ typedef __float128 Exact; // 113 bits
 using Exact = long double;
 #endif
 
+inline constexpr std::uint32_t noIdOfPixel = 0xffffffffu;
+
+// What an input may have in a pixel beside colour and depth.
+struct AuxSample {
+    std::array<float, 3> normal{}, albedo{}; // premultiplied
+    std::array<float, 3> position{};
+    std::uint32_t primitiveId = noIdOfPixel, instanceId = noIdOfPixel;
+};
+
 // One input of a pixel.
 struct Sample {
     std::array<float, 4> rgba{}; // premultiplied
     float depth = std::numeric_limits<float>::infinity();
     std::uint32_t source = 0;
     std::uint16_t part = 0;
+    AuxSample aux{};
+};
+
+// What is taken of one input, and the depth of that.
+template <class Value>
+struct Taken {
+    Value value{};
+    float depth = 0;
+    bool isTaken = false;
+
+    void takeFirst(const Value& its, float itsDepth)
+    {
+        if (!isTaken)
+            *this = {its, itsDepth, true};
+    }
+    void takeNearest(const Taken& other)
+    {
+        if (other.isTaken && (!isTaken || other.depth < depth))
+            *this = other;
+    }
 };
 
 struct Pixel {
     std::array<Exact, 4> rgba{};
-    float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0
+    float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0, or of nearest()
+    // Sums weighted by what is let through, without the background, of which the alpha is the last; and the same of
+    // the largest magnitudes.
+    std::array<Exact, 3> normal{}, albedo{};
+    Exact weight = 0, magnitude = 0;
+    Taken<std::array<float, 3>> position; // of the first input with alpha > 0, or of nearest()
+    Taken<std::uint32_t> primitiveId{noIdOfPixel}, instanceId{noIdOfPixel}; // the same, of the first that has one
 };
 
 using Color = std::array<float, 4>;
@@ -46,18 +81,34 @@ inline bool isInFront(const Sample& a, const Sample& b)
            < std::make_tuple(comparable(b.depth), b.source, b.part);
 }
 
-// OrderedBlend: in the order of the samples, front to back: A += T a, T *= 1 - a; the background last.
-inline Pixel compositeInOrder(const std::vector<Sample>& samples, const Color& background)
+// OrderedBlend and ImageParallel: in the order of the samples, front to back: A += T a, T *= 1 - a; the background
+// last. `anyAlpha`: all give depth, position and ids, not only those with alpha > 0.
+inline Pixel compositeInOrder(const std::vector<Sample>& samples, const Color& background, bool anyAlpha = false)
 {
     Pixel result;
     Exact transmittance = 1;
     for (const Sample& s : samples) {
         for (std::size_t c = 0; c < 4; ++c)
             result.rgba[c] += transmittance * static_cast<Exact>(s.rgba[c]);
+        float largest = 0;
+        for (std::size_t c = 0; c < 3; ++c) {
+            result.normal[c] += transmittance * static_cast<Exact>(s.aux.normal[c]);
+            result.albedo[c] += transmittance * static_cast<Exact>(s.aux.albedo[c]);
+            largest = std::max({largest, std::fabs(s.aux.normal[c]), std::fabs(s.aux.albedo[c])});
+        }
+        result.magnitude += transmittance * static_cast<Exact>(largest);
         transmittance *= 1 - static_cast<Exact>(s.rgba[3]);
-        if (s.rgba[3] > 0.0f)
-            result.depth = std::min(result.depth, comparable(s.depth));
+        if (!anyAlpha && !(s.rgba[3] > 0.0f))
+            continue;
+        const float depth = comparable(s.depth);
+        result.depth = std::min(result.depth, depth);
+        result.position.takeFirst(s.aux.position, depth);
+        if (s.aux.primitiveId != noIdOfPixel)
+            result.primitiveId.takeFirst(s.aux.primitiveId, depth);
+        if (s.aux.instanceId != noIdOfPixel)
+            result.instanceId.takeFirst(s.aux.instanceId, depth);
     }
+    result.weight = result.rgba[3];
     for (std::size_t c = 0; c < 4; ++c)
         result.rgba[c] += transmittance * static_cast<Exact>(background[c]);
     return result;
@@ -70,26 +121,51 @@ inline Pixel composite(std::vector<Sample> samples, const Color& background)
     return compositeInOrder(samples, background);
 }
 
-// DepthComposite: the first of these alone.
+// DepthComposite: the first of these alone, if it has a depth, whatever its alpha.
 inline Pixel nearest(const std::vector<Sample>& samples, const Color& background)
 {
-    if (samples.empty())
+    const auto first = std::min_element(samples.begin(), samples.end(), isInFront);
+    if (first == samples.end() || comparable(first->depth) == std::numeric_limits<float>::infinity())
         return compositeInOrder({}, background);
-    return compositeInOrder({*std::min_element(samples.begin(), samples.end(), isInFront)}, background);
+    return compositeInOrder({*first}, background, true);
 }
 
-// The mean of passes that were composited each by itself; the nearest of their depths.
+// The mean of passes that were composited each by itself; the nearest of their depths, and what the nearest have.
 inline Pixel mean(const std::vector<Pixel>& passes)
 {
     Pixel result;
     for (const Pixel& pass : passes) {
         for (std::size_t c = 0; c < 4; ++c)
             result.rgba[c] += pass.rgba[c];
+        for (std::size_t c = 0; c < 3; ++c) {
+            result.normal[c] += pass.normal[c];
+            result.albedo[c] += pass.albedo[c];
+        }
+        result.weight += pass.weight;
+        result.magnitude += pass.magnitude;
         result.depth = std::min(result.depth, pass.depth);
+        result.position.takeNearest(pass.position);
+        result.primitiveId.takeNearest(pass.primitiveId);
+        result.instanceId.takeNearest(pass.instanceId);
     }
     for (Exact& value : result.rgba)
         value /= static_cast<Exact>(passes.size());
     return result;
+}
+
+// Whether a normal or albedo of the image is wrong. `sum`: the one of the pixel that it is the mean of. They have
+// either sign: what cancels is off by the rounding of what was summed, 2^-36 of that (see compositing.hpp), and rounded
+// to float at the end.
+inline bool isWrongMean(float measured, Exact sum, const Pixel& pixel)
+{
+    if (!(pixel.weight > 0))
+        return measured != 0.0f;
+    const auto expected = static_cast<double>(sum / pixel.weight);
+    if (!std::isfinite(expected)) // nothing is said of it
+        return false;
+    const auto spread = static_cast<double>(pixel.magnitude / pixel.weight);
+    return !(std::fabs(static_cast<double>(measured) - expected)
+             <= 0x1p-24 * std::fabs(expected) + 0x1p-36 * spread + 0x1p-150);
 }
 
 inline float toFloat(Exact value) { return static_cast<float>(value); }

@@ -102,8 +102,7 @@ TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::
     info.wanted = withDepth ? depthChannel : 0;
     info.background = in.background;
     info.minTransmittance = wire.minTransmittance;
-    info.depthIsRounded = wire.precision.depth != WireFormat::Float32;
-    const d::WireCoder coder(wire.precision);
+    const d::WireCoder coder(wire.precision, d::ActiveByDepth<Op>::value);
     const auto wanted = static_cast<ChannelMask>(d::NeededChannelsOf<Op>::value | (withDepth ? depthChannel : 0));
     Op op;
     TileOutput out;

@@ -1,17 +1,18 @@
-// Verified: a tile operation of the library that checks itself: each finished tile against the reference of the inputs
-// that it got, as they were decoded. For tests and for users who want to see it; slow. Dithered values are not the
-// exact ones rounded, and are counted as wrong.
+// Verified: a tile operation of the library that checks itself: each finished tile, in all channels that the image has,
+// against the reference of the inputs that it got, as they were decoded. For tests and for users who want to see it;
+// slow. Dithered values are not the exact ones rounded, and are counted as wrong.
 //
 //   dfb::testing::Verification verification;      // one per rank
 //   DistributedFrameBuffer<dfb::testing::Verified<dfb::AlphaBlend>> fb(...);
 //   renderDataParallel(fb, world, camera, renderBrick, params, &verification);
-//   verification.report()
+//   verification.report()                         // of colour: wrongBytes, ulps; of all else: wrongOthers
 #pragma once
 
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/error_report.hpp>
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -47,6 +48,7 @@ public:
     static constexpr int tileSize = Base::tileSize;
     static constexpr ChannelMask channels = Base::channels;
     static constexpr ChannelMask neededChannels = Base::neededChannels;
+    static constexpr bool activeByDepth = Base::activeByDepth;
     using FrameData = Verification*; // null: nothing is checked
 
     void newFrame(const TileInfo& info, Verification* verification)
@@ -98,11 +100,29 @@ private:
                     sample.depth = row.depth ? row.depth[k] : 0.0f;
                     sample.source = h.source;
                     sample.part = h.part;
+                    sample.aux = auxOf(row, k);
                     input.samples.emplace_back(
                         static_cast<std::size_t>(y) * width + static_cast<std::size_t>(row.spans[s].x + i), sample);
                 }
         }
         inputs_.push_back(std::move(input));
+    }
+
+    static AuxSample auxOf(const FragmentRow& row, std::size_t k)
+    {
+        AuxSample aux;
+        const auto three = [k](const float* from, std::array<float, 3>& to) {
+            if (from)
+                std::copy_n(from + 3 * k, 3, to.begin());
+        };
+        three(row.normal(), aux.normal);
+        three(row.albedo(), aux.albedo);
+        three(row.position(), aux.position);
+        if (row.primitiveId())
+            aux.primitiveId = row.primitiveId()[k];
+        if (row.instanceId())
+            aux.instanceId = row.instanceId()[k];
+        return aux;
     }
 
     ErrorReport check(const FinishedTile& out)
@@ -121,7 +141,9 @@ private:
                 std::vector<Pixel> pixels;
                 for (std::size_t pass = 0; pass < passes; ++pass)
                     pixels.push_back(exactOf(samples[(pass * height + y) * width + x]));
-                addPixel(report, out, static_cast<int>(y), x, mean(pixels));
+                const Pixel exact = mean(pixels);
+                addPixel(report, out, static_cast<int>(y), x, exact);
+                addOthers(report, out, static_cast<int>(y), x, exact);
             }
         return report;
     }
@@ -150,6 +172,25 @@ private:
                                                                               : toUnorm8(exact.rgba[c]));
             }
         }
+    }
+
+    static void addOthers(ErrorReport& report, const FinishedTile& out, int y, std::size_t x, const Pixel& exact)
+    {
+        const AuxRow row = out.auxRow(y);
+        if (const float* depth = out.depthRow(y))
+            report.addOther(depth[x] != exact.depth);
+        for (std::size_t c = 0; c < 3; ++c) {
+            if (row.normal)
+                report.addOther(isWrongMean(row.normal[3 * x + c], exact.normal[c], exact));
+            if (row.albedo)
+                report.addOther(isWrongMean(row.albedo[3 * x + c], exact.albedo[c], exact));
+            if (row.position)
+                report.addOther(ulpsBetween(row.position[3 * x + c], exact.position.value[c]) != 0);
+        }
+        if (row.primitiveId)
+            report.addOther(row.primitiveId[x] != exact.primitiveId.value);
+        if (row.instanceId)
+            report.addOther(row.instanceId[x] != exact.instanceId.value);
     }
 
     Base base_;

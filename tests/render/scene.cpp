@@ -1,0 +1,129 @@
+// What a rank holds of a scene, and what it tells the user of it.
+#include "support.hpp"
+#include "together.hpp"
+
+#include <rank_scene.hpp>
+
+#include <dfb/tile.hpp>
+
+#include <memory>
+#include <string>
+#include <vector>
+
+namespace scene_cases {
+
+using namespace example;
+
+namespace {
+
+Options optionsFor(const std::vector<std::string>& words)
+{
+    std::vector<const char*> arguments{"dfb_render"};
+    for (const std::string& word : words)
+        arguments.push_back(word.c_str());
+    const ParsedOptions parsed = parseOptions(static_cast<int>(arguments.size()), arguments.data());
+    INFO(parsed.message);
+    REQUIRE(parsed.options);
+    return *parsed.options;
+}
+
+const std::string tetrahedron = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n";
+
+} // namespace
+
+TEST_CASE("All ranks have the same notes for the user", "[scene]")
+{
+    const test::TemporaryFolder folder;
+    const std::string blank = folder.write("blank_4x4x4_uint8.raw", std::string(64, '\0')),
+                      atoms = folder.write("atoms.xyz", "2\n\nXx 0 0 0\nXx 9 9 9\n");
+    const Options both = optionsFor({blank, atoms});
+    for (const int ranks : {1, 3})
+        for (const Notes& notes : test::ofRanks<Notes>(
+                 ranks, [&](const Loaders& loaders) { return loadRankScene(both, loaders).notes; })) {
+            REQUIRE(notes.size() == 2);
+            CHECK(test::contains(notes[0], "blank_4x4x4_uint8.raw: there is nothing to see"));
+            CHECK(test::contains(notes[1], "Xx (2)"));
+        }
+    CHECK(loadRankScene(optionsFor({"demo"}), {}).notes.empty());
+    CHECK(loadRankScene(optionsFor({"synthetic"}), {}).notes.empty());
+}
+
+TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
+{
+    const test::TemporaryFolder folder;
+    const std::string volume = folder.write("v_4x4x4_uint8.raw", std::string(64, 'v')),
+                      mesh = folder.write("mesh.obj", tetrahedron);
+    const auto notesOf = [](std::vector<std::string> words) {
+        words.insert(words.end(), {"--mode", "image"});
+        return loadRankScene(optionsFor(words), {}).notes;
+    };
+    REQUIRE(notesOf({volume, "--path", "2"}).size() == 1);
+    CHECK(test::contains(notesOf({volume, "--path", "2"})[0], "nothing to see"));
+    CHECK(test::contains(notesOf({volume, "--path", "2"})[0], "--path"));
+    REQUIRE(notesOf({volume, mesh, "--path", "2"}).size() == 1);
+    CHECK(test::contains(notesOf({volume, mesh, "--path", "2"})[0], "--path leaves volumes out"));
+    CHECK(notesOf({mesh, "--path", "2"}).empty());
+    CHECK(notesOf({volume}).empty());
+}
+
+TEST_CASE("The frame of an XYZ file is that of the option", "[scene]")
+{
+    const test::TemporaryFolder folder;
+    const std::string file = folder.write("a.xyz", "1\n\nC 0 0 0\n1\n\nC 7 0 0\n");
+    const auto centerOf = [&](std::vector<std::string> words) {
+        words.insert(words.end(), {file, "--no-fit"});
+        return loadRankScene(optionsFor(words), {}).info.bounds.center().x;
+    };
+    CHECK(centerOf({}) == 0.0f);
+    CHECK(centerOf({"--xyz-frame", "1"}) == 0.0f);
+    CHECK(centerOf({"--xyz-frame", "2"}) == 7.0f);
+    CHECK(test::isLineWith(test::errorOf([&] { centerOf({"--xyz-frame", "3"}); }), "expected a frame 3"));
+}
+
+TEST_CASE("The colours of vertices are in the image, cut or whole", "[scene]")
+{
+    // Red at the left, blue at the right, with more in the file that nothing uses.
+    Mesh mesh;
+    mesh.positions = {{9, 9, 9}, {0, 0, 0}, {1, 0, 0}, {1, 1, 0}, {0, 1, 0}};
+    mesh.colors = {{0, 1, 0}, {1, 0, 0}, {0, 0, 1}, {0, 0, 1}, {1, 0, 0}};
+    mesh.triangles = {{1, 2, 3}, {1, 3, 4}};
+    Scene scene;
+    scene.add(mesh, false);
+    RenderSettings settings;
+    settings.width = settings.height = 64;
+    settings.opacity = 1;
+    settings.view.azimuth = settings.view.elevation = 0;
+    const SceneInfo info(scene);
+    using Tile = dfb::Tile<dfb::allChannels & ~dfb::farChannel, 64>;
+    const auto render = [&](const Box& cell) {
+        auto tile = std::make_unique<Tile>();
+        tile->region = {0, 0, 64, 64};
+        tile->clear();
+        Renderer(loadBrick(scene, 0, cell), info, settings).renderTile(*tile, 0);
+        return tile;
+    };
+    const auto whole = render(scene.bounds);
+    std::vector<std::unique_ptr<Tile>> parts;
+    for (const Box& cell : cutScene(scene, 4))
+        parts.push_back(render(cell));
+    int seen = 0, wrong = 0;
+    float before = 1;
+    for (int x = 0; x < 64; ++x) {
+        const int at = 64 * 32 + x;
+        if (!(whole->color[4 * at + 3] > 0))
+            continue;
+        ++seen;
+        const float* albedo = whole->albedo + 3 * at;
+        wrong += !(albedo[0] < before && albedo[1] < 1e-6f && std::fabs(albedo[0] + albedo[2] - 1) < 1e-5f);
+        before = albedo[0];
+        int same = 0;
+        for (const auto& part : parts)
+            same += part->albedo[3 * at] == albedo[0] && part->albedo[3 * at + 2] == albedo[2];
+        wrong += same != 1;
+    }
+    CHECK(seen > 20);
+    CHECK(before < 0.1f);
+    CHECK(wrong == 0);
+}
+
+} // namespace scene_cases
