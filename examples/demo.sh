@@ -53,7 +53,8 @@ say "rendering $* on $ranks ranks"
 rm -f "$picture"
 started=$(date +%s)
 # shellcheck disable=SC2086 # one word per flag
-"$mpiexec" -n $ranks $flags "$build/examples/embree/dfb_render" "$@" --mode data --size $size --output "$picture"
+"$mpiexec" -n $ranks $flags "$build/examples/embree/dfb_render" "$@" --mode data --size $size --background 0,0,0 \
+    --output "$picture"
 if [ ! -s "$picture" ]; then
     echo "demo.sh: dfb_render has written no picture" >&2
     exit 1

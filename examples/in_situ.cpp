@@ -267,7 +267,8 @@ constexpr const char* usage = "usage: in_situ [OPTION VALUE]...\n"
                               "  --steps N     of the simulation (1600)\n"
                               "  --every N     steps from one picture to the next (80)\n"
                               "  --slabs N     parts of the grid, which are dealt to the ranks (8)\n"
-                              "  --out PREFIX  of the pictures: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ)\n";
+                              "  --out PREFIX  of the pictures: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ)\n"
+                              "Exit code: 0: done, 1: the run failed, 2: the command line is wrong.\n";
 
 // Throws std::invalid_argument.
 Options parse(int argc, char** argv)
@@ -385,6 +386,7 @@ int main(int argc, char** argv)
     MPI_Comm_split(mpi.communicator(), known ? *program : 0, mpi.rank(), &comm);
     MPI_Comm_rank(comm, &rank);
     std::string error;
+    int code = 1;
     try {
         if (argc != 2 || std::string(argv[1]) != "--help")
             error = run(comm, parse(argc, argv));
@@ -392,11 +394,12 @@ int main(int argc, char** argv)
             std::cout << usage;
     } catch (const std::invalid_argument& wrong) { // the same on all ranks, as they have the same options
         error = wrong.what();
+        code = 2;
     } catch (const dfb::FrameError& failure) { // the same on all ranks
         error = failure.what();
     }
     if (!error.empty() && rank == 0)
         std::cerr << "in_situ: " << error << '\n';
     MPI_Comm_free(&comm);
-    return error.empty() ? 0 : 1;
+    return error.empty() ? 0 : code;
 }

@@ -73,7 +73,7 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
 {
     const dfb::MpiSession mpi(argc, argv);
     const int rank = mpi.rank();
-    int code = 1;
+    int code = exitFailed;
     try {
         if (!parsed.options) {
             code = rank == 0 ? report(parsed) : parsed.exitCode;
@@ -89,7 +89,7 @@ int runWithMpi(int argc, char** argv, const ParsedOptions& parsed)
             std::fprintf(stderr, "dfb_render: %s\n", e.what());
     } catch (const std::exception& e) {
         std::fprintf(stderr, "dfb_render: rank %d: %s\n", rank, e.what());
-        MPI_Abort(MPI_COMM_WORLD, 1); // the others may wait for this rank
+        MPI_Abort(MPI_COMM_WORLD, exitFailed); // the others may wait for this rank
     }
     return code;
 }
@@ -110,7 +110,7 @@ int main(int argc, char** argv)
             if (fromLauncher("PMI_RANK", "OMPI_COMM_WORLD_RANK", 0) == 0)
                 std::fprintf(stderr, "dfb_render: --ranks makes ranks of threads; start it without mpirun, or leave "
                                      "--ranks out\n");
-            return 2;
+            return exitUsage;
         }
 #endif
         if (!parsed.options)
@@ -118,6 +118,6 @@ int main(int argc, char** argv)
         return runInThreads(*parsed.options, std::max(1, parsed.options->ranks));
     } catch (const std::exception& e) {
         std::fprintf(stderr, "dfb_render: %s\n", e.what());
-        return 1;
+        return exitFailed;
     }
 }

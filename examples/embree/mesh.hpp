@@ -23,6 +23,14 @@ struct Mesh {
     std::vector<Vec3> colors{}; // of each vertex, linear RGB; or none
 };
 
+// For Loaders::fromFirst(): all that a mesh is made of. Does not compile if there is anything else in it.
+template <class Function>
+void arraysOf(Mesh& mesh, const Function& function)
+{
+    auto& [positions, triangles, colors] = mesh;
+    function(positions, triangles, colors);
+}
+
 // The whole file. Throws std::runtime_error if it cannot be read or is empty.
 inline std::string readFile(const std::string& path)
 {

@@ -2,18 +2,23 @@
 #pragma once
 
 #include "camera.hpp"
+#include "frame_pattern.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire_format.hpp>
 
 #include <CLI/CLI.hpp>
 
+#include <algorithm>
 #include <array>
 #include <cstdint>
 #include <cstdlib>
+#include <map>
 #include <optional>
 #include <sstream>
+#include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace example {
@@ -68,11 +73,23 @@ struct Options {
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
-    std::string output, alpha, depth, aux, stats; // empty: not written
+    std::string output, alpha, depth, aux, stats; // empty: not written. All but stats may be patterns
+
+    // All options but the scene as they count, by name and as words of the command line; without those that are empty.
+    std::vector<std::pair<std::string, std::string>> values;
+
+    bool writesNothing() const
+    {
+        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty();
+    }
 };
 
+// What the program exits with, beside 0.
+inline constexpr int exitFailed = 1; // the run has failed
+inline constexpr int exitUsage = 2;  // the command line is wrong
+
 // Either options to run with, or a message to print (on one rank) and a code to exit with: the help and 0, or one
-// line on what is wrong and something else.
+// line on what is wrong and exitUsage.
 struct ParsedOptions {
     std::optional<Options> options;
     int exitCode = 0;
@@ -168,13 +185,47 @@ inline void parseSize(const std::string& name, const std::string& text, int most
                                              + std::to_string(most));
 }
 
+// R,G,B
+inline std::array<float, 3> parseColor(const std::string& name, const std::string& text)
+{
+    std::array<float, 3> color{};
+    std::size_t begin = 0;
+    for (std::size_t c = 0; c < 3; ++c) {
+        const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
+        std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
+        if (part.empty() || part[0] == ' ' || !number(0, 1)(part).empty())
+            throw CLI::ValidationError(name, "'" + text + "' is not R,G,B with three numbers from 0 to 1");
+        color[c] = std::strtof(part.c_str(), nullptr);
+        begin = end + 1;
+    }
+    return color;
+}
+
+// All options as they count, for the record; without those that have no value.
+inline std::vector<std::pair<std::string, std::string>>
+valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std::string>>& wordsOf)
+{
+    std::vector<std::pair<std::string, std::string>> values;
+    for (const CLI::Option* option : app.get_options()) {
+        if (option->get_positional() || option == app.get_help_ptr())
+            continue;
+        std::string text = option->count() > 0 ? option->results().back() : option->get_default_str();
+        if (option->get_expected_max() == 0) // a flag
+            text = option->count() > 0 ? "true" : "false";
+        if (const auto words = wordsOf.find(option); words != wordsOf.end())
+            text = words->second.at(static_cast<std::size_t>(std::atoi(text.c_str())));
+        if (!text.empty())
+            values.emplace_back(option->get_name().substr(2), text);
+    }
+    return values;
+}
+
 } // namespace detail
 
 inline ParsedOptions parseOptions(int argc, const char* const* argv)
 {
     Options options;
-    std::string size, wall;
-    std::vector<float> background;
+    std::string size = std::to_string(options.width) + 'x' + std::to_string(options.height), wall, background;
     CLI::App app("Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render");
     app.set_help_flag("-h,--help", "Print this and exit");
     app.get_formatter()->column_width(36);
@@ -185,6 +236,17 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                    "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz")
         ->required()
         ->option_text("SCENE...");
+    app.option_defaults()->take_last(); // of an option that is given twice the last counts
+    std::map<const CLI::Option*, std::vector<std::string>> wordsOf;
+    // An option whose value is one of some words, which becomes the enumerator of that place.
+    const auto words = [&](const char* name, auto& value, const std::vector<std::string>& all, const char* what) {
+        CLI::Option* option = app.add_option(name, value, what)->transform(detail::choice(all));
+        std::string text;
+        for (const std::string& word : all)
+            text += (text.empty() ? "" : "|") + word;
+        wordsOf[option] = all;
+        return option->option_text(text);
+    };
     bool noFit = false;
     app.add_flag("--no-fit", noFit,
                  "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
@@ -194,33 +256,25 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->option_text("N");
 
     const char* how = "Distribution";
-    app.add_option("--mode", options.mode,
-                   "data: each rank holds some bricks of the scene; image: each rank holds all and renders some "
-                   "tiles; mixed: several ranks hold each brick and share its tiles; default data")
-        ->transform(detail::choice({"data", "image", "mixed"}))
-        ->option_text("data|image|mixed")
+    words("--mode", options.mode, {"data", "image", "mixed"},
+          "data: each rank holds some bricks of the scene; image: each rank holds all and renders some "
+          "tiles; mixed: several ranks hold each brick and share its tiles; default data")
         ->group(how);
     app.add_option("--replicate", options.replicate, "Ranks that hold each brick, with --mode mixed; default 2")
         ->check(detail::number(1, most))
         ->option_text("K")
         ->group(how);
-    app.add_option("--balance", options.balance,
-                   "How the ranks that hold a brick share its tiles: by what they cost in the last frame, or in turn; "
-                   "default cost")
-        ->transform(detail::choice({"cost", "round-robin"}))
-        ->option_text("cost|round-robin")
+    words("--balance", options.balance, {"cost", "round-robin"},
+          "How the ranks that hold a brick share its tiles: by what they cost in the last frame, or in turn; "
+          "default cost")
         ->group(how);
-    app.add_option("--blend", options.blend,
-                   "How the bricks of a pixel become one: sorted by depth; in the order of the bricks from the eye, "
-                   "without sorting or depth; or the nearest alone, for opaque scenes; default sort")
-        ->transform(detail::choice({"sort", "order", "nearest"}))
-        ->option_text("sort|order|nearest")
+    words("--blend", options.blend, {"sort", "order", "nearest"},
+          "How the bricks of a pixel become one: sorted by depth; in the order of the bricks from the eye, "
+          "without sorting or depth; or the nearest alone, for opaque scenes; default sort")
         ->group(how);
-    app.add_option("--distribution", options.distribution,
-                   "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on "
-                   "demand; default owned")
-        ->transform(detail::choice({"owned", "linear", "round-robin", "dynamic"}))
-        ->option_text("owned|linear|round-robin|dynamic")
+    words("--distribution", options.distribution, {"owned", "linear", "round-robin", "dynamic"},
+          "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on "
+          "demand; default owned")
         ->group(how);
     app.add_option(
            "--interleave", options.interleave,
@@ -258,18 +312,13 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, most))
         ->option_text("SECONDS")
         ->group(how);
-    app.add_option(
-           "--compression", options.compression,
-           "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
-           "faster; default none")
-        ->transform(detail::choice({"none", "snappy", "auto"}))
-        ->option_text("none|snappy|auto")
+    words("--compression", options.compression, {"none", "snappy", "auto"},
+          "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
+          "faster; default none")
         ->group(how);
-    app.add_option("--wire", options.wire,
-                   "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
-                   "tiles stay float32, as do depth and what --aux writes; default float32")
-        ->transform(detail::choice({"float32", "float16", "unorm16", "unorm8"}))
-        ->option_text("float32|float16|unorm16|unorm8")
+    words("--wire", options.wire, {"float32", "float16", "unorm16", "unorm8"},
+          "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
+          "tiles stay float32, as do depth and what --aux writes; default float32")
         ->group(how);
     app.add_option("--error-budget", options.errorBudget,
                    "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
@@ -286,9 +335,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                  "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
                  "was made of; slow")
         ->group(how);
-    app.add_option("--owner-map", options.ownerMap, "Which rank owns which tile; default lattice")
-        ->transform(detail::choice({"lattice", "linear", "hash"}))
-        ->option_text("lattice|linear|hash")
+    words("--owner-map", options.ownerMap, {"lattice", "linear", "hash"}, "Which rank owns which tile; default lattice")
         ->group(how);
     app.add_option("--in-flight", options.inFlight,
                    "Frames under way at once: a rank that has rendered its part of one begins the next while others "
@@ -336,13 +383,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1000))
         ->option_text("N")
         ->group(picture);
-    app.add_option(
-           "--camera", options.view.kind,
-           "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
-           "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
-           "dof and motion want --spp 16 or more")
-        ->transform(detail::choice({"perspective", "dof", "motion", "stereo", "dome"}))
-        ->option_text("perspective|dof|motion|stereo|dome")
+    words("--camera", options.view.kind, {"perspective", "dof", "motion", "stereo", "dome"},
+          "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
+          "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
+          "dof and motion want --spp 16 or more")
         ->group(picture);
     app.add_option("--aperture", options.view.aperture,
                    "Radius of the lens of dof, in units of the largest extent of what there is to see; default 0.05")
@@ -413,10 +457,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
     app.add_option("--background", background,
                    "Opaque colour behind the scene, linear, each 0 to 1; default: none, "
-                   "the image stays transparent")
-        ->delimiter(',')
-        ->expected(3)
-        ->check(detail::number(0, 1))
+                   "the image stays transparent, and a .png has alpha")
         ->option_text("R,G,B")
         ->group(picture);
     app.add_option("--exposure", options.exposure, "Tone-map with this factor, above 0; default 0: off")
@@ -427,16 +468,19 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
 
     const char* files = "Files to write";
-    app.add_option("--output", options.output, "The last frame: sRGB in a .png, linear colour in a .pfm; default none")
+    app.add_option("--output", options.output,
+                   "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
+                   "black in a .pfm. %d, or %04d for 4 digits, in the name stands for the number of the frame, from 0 "
+                   "on; without it the last frame is written. Also in the next three; default none")
         ->check(detail::ending({".png", ".pfm"}))
         ->option_text("FILE")
         ->group(files);
-    app.add_option("--alpha", options.alpha, "Its opacity, as a greyscale .pfm; default none")
+    app.add_option("--alpha", options.alpha, "The opacity, as a greyscale .pfm; default none")
         ->check(detail::ending({".pfm"}))
         ->option_text("FILE")
         ->group(files);
     app.add_option("--depth", options.depth,
-                   "Its distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
+                   "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
                    "nothing; default none")
         ->check(detail::ending({".pfm"}))
         ->option_text("FILE")
@@ -448,18 +492,24 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(files);
     app.add_option(
            "--stats", options.stats,
-           "Times in ms, bytes, messages, tiles and samples of each rank, samples saved, and a hash of the image; "
-           "default none")
+           "Where the time has gone, in ms, on each rank and the slowest: total = load + render + compositing (with "
+           "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of the image, "
+           "the options; default none")
         ->check(detail::ending({".json"}))
         ->option_text("FILE")
         ->group(files);
 
-    for (CLI::Option* option : app.get_options())
+    for (CLI::Option* option : app.get_options()) {
+        option->capture_default_str();
         option->description(detail::wrapped(option->get_description()));
+    }
     app.footer("Examples:\n"
                "  dfb_render demo --ranks 4 --output demo.png\n"
                "  mpiexec -n 8 dfb_render synthetic --size 2048x2048 --frames 8 --stats stats.json\n"
-               "  mpiexec -n 4 dfb_render bunny.ply neghip_64x64x64_uint8.raw --spp 4 --output both.png");
+               "  mpiexec -n 4 dfb_render bunny.ply neghip_64x64x64_uint8.raw --spp 4 --output both.png\n"
+               "  mpiexec -n 4 dfb_render demo --frames 36 --output turn_%02d.png\n"
+               "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. Of an option that is given twice "
+               "the last counts.");
     try {
         app.parse(argc, argv);
         options.fit = !noFit;
@@ -470,6 +520,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             detail::parseSize("--size", size, 65536, options.width, options.height);
         if (app.count("--wall") > 0)
             detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
+        if (app.count("--background") > 0)
+            options.background = detail::parseColor("--background", background);
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
@@ -504,8 +556,26 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             refuse(options.inFlight > 1, other, "does not go with --in-flight");
         for (const char* file : {"--alpha", "--depth", "--aux"})
             refuse(options.wallColumns > 0, file, "is not written for a wall");
-        if (background.size() == 3)
-            options.background = {{background[0], background[1], background[2]}};
+        if (options.wallColumns > 0) {
+            const int shownX = options.width - (options.wallColumns - 1) * options.bezel,
+                      shownY = options.height - (options.wallRows - 1) * options.bezel;
+            if (shownX < options.wallColumns || shownY < options.wallRows || shownX % options.wallColumns != 0
+                || shownY % options.wallRows != 0)
+                throw CLI::ValidationError("--wall", "an image of " + size + " pixels cannot be shared by " + wall
+                                                         + " equal displays with bezels of "
+                                                         + std::to_string(options.bezel));
+        }
+        for (const auto& [name, text] : {std::pair{"--output", &options.output}, std::pair{"--alpha", &options.alpha},
+                                         std::pair{"--depth", &options.depth}, std::pair{"--aux", &options.aux}}) {
+            try {
+                FramePattern{*text};
+            } catch (const std::invalid_argument& wrong) {
+                throw CLI::ValidationError(name, wrong.what());
+            }
+        }
+        if (options.stats.find('%') != std::string::npos)
+            throw CLI::ValidationError("--stats", "'" + options.stats + "': one file for all frames, without %");
+        options.values = detail::valuesOf(app, wordsOf);
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options.scene.size() > 1)
@@ -519,8 +589,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     } catch (const CLI::ParseError& error) {
         std::string message = error.what();
         std::replace(message.begin(), message.end(), '\n', ' ');
-        return {std::nullopt, error.get_exit_code() != 0 ? error.get_exit_code() : 1,
-                "dfb_render: " + message + " (see --help)"};
+        return {std::nullopt, exitUsage, "dfb_render: " + message + " (see --help)"};
     }
     return {options, 0, {}};
 }

@@ -1,11 +1,14 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
+#include <dfb/dither.hpp>
+
 #include <nlohmann/json.hpp>
 #include <png.h>
 #define XXH_INLINE_ALL
 #include <xxhash.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstddef>
 #include <cstdint>
@@ -16,6 +19,7 @@
 #include <stdexcept>
 #include <string>
 #include <system_error>
+#include <utility>
 #include <vector>
 
 namespace example {
@@ -64,28 +68,60 @@ inline void requireWritable(const std::string& path)
         std::filesystem::remove(path, ignored);
 }
 
-// An 8-bit RGB PNG of RGBA pixels that are sRGB-encoded, row 0 on top. Alpha is left out: premultiplied colour is
-// the image over black.
-inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba)
+// An 8-bit PNG of RGBA pixels whose colour is sRGB-encoded, row 0 on top. With `hasAlpha` their alpha is straight, as
+// PNG has it, and is written; else it is left out: premultiplied colour is the image over black.
+inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha)
 {
     const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    std::vector<std::uint8_t> rgb(3 * pixels);
-    for (std::size_t i = 0; i < pixels; ++i)
-        std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
+    std::vector<std::uint8_t> rgb;
+    if (!hasAlpha) {
+        rgb.resize(3 * pixels);
+        for (std::size_t i = 0; i < pixels; ++i)
+            std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
+    }
     png_image image{};
     image.version = PNG_IMAGE_VERSION;
     image.width = static_cast<png_uint_32>(width);
     image.height = static_cast<png_uint_32>(height);
-    image.format = PNG_FORMAT_RGB;
+    image.format = hasAlpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
     // Not png_image_write_to_file: when that fails it deletes what was at the path, be it a device.
     errno = 0;
     std::FILE* file = std::fopen(path.c_str(), "wb");
     if (file == nullptr)
         detail::failToWrite(path, std::strerror(errno));
-    const bool written = png_image_write_to_stdio(&image, file, 0, rgb.data(), 0, nullptr) != 0;
+    const void* first = hasAlpha ? static_cast<const void*>(srgba) : rgb.data();
+    const bool written = png_image_write_to_stdio(&image, file, 0, first, 0, nullptr) != 0;
     const bool closed = std::fclose(file) == 0;
     if (!written || !closed)
         detail::failToWrite(path, written ? std::strerror(errno) : image.message);
+}
+
+// Pixels of a PNG from linear premultiplied RGBA of an image, row 0 on top: sRGB-encoded colour with straight alpha.
+// Alpha is round(255 * alpha). The colour is that of colour / alpha, divided in double and clamped to 1, at the nearest
+// sRGB level or dithered; it is 0 where alpha is 0 or less, which loses colour that has no alpha. Over black the
+// picture is the premultiplied image again, but for the rounding of both to 8 bits.
+inline std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither)
+{
+    const std::size_t rowSize = 4 * static_cast<std::size_t>(width);
+    std::vector<std::uint8_t> pixels(rowSize * static_cast<std::size_t>(height)), alphas(rowSize);
+    std::vector<double> row(rowSize);
+    for (int y = 0; y < height; ++y, rgba += rowSize) {
+        for (std::size_t i = 0; i < rowSize; i += 4) {
+            const double alpha = std::min(static_cast<double>(rgba[i + 3]), 1.0);
+            for (std::size_t c = i; c < i + 3; ++c)
+                row[c] = alpha > 0 ? static_cast<double>(rgba[c]) / alpha : 0.0;
+            row[i + 3] = 1; // dithering keeps colours below alpha, which is for premultiplied ones
+        }
+        std::uint8_t* out = pixels.data() + static_cast<std::size_t>(y) * rowSize;
+        if (dither)
+            dfb::ditherPixels(row.data(), width, dfb::OutputFormat::SRGBA8, 0, y, reinterpret_cast<std::byte*>(out));
+        else
+            dfb::convertPixels(row.data(), width, dfb::OutputFormat::SRGBA8, reinterpret_cast<std::byte*>(out));
+        dfb::convertPixels(rgba, width, dfb::OutputFormat::RGBA8, reinterpret_cast<std::byte*>(alphas.data()));
+        for (std::size_t i = 3; i < rowSize; i += 4)
+            out[i] = alphas[i];
+    }
+    return pixels;
 }
 
 // Linear RGB as a colour PFM, from RGBA pixels, row 0 on top.
@@ -116,7 +152,7 @@ inline void writeIdPng(const std::string& path, int width, int height, const std
         for (std::size_t c = 0; c < 3 && ids[i] != 0xffffffffu; ++c)
             rgba[4 * i + c] = static_cast<std::uint8_t>(64 + (hash >> (8 * c)) % 192);
     }
-    writePng(path, width, height, rgba.data());
+    writePng(path, width, height, rgba.data(), false);
 }
 
 // XXH3 of the pixels as they are in memory, 16 hexadecimal digits.
@@ -136,17 +172,30 @@ inline double meanAlpha(const float* rgba, std::size_t pixelCount)
     return pixelCount > 0 ? sum / static_cast<double>(pixelCount) : 0;
 }
 
+// Where the time of a rank has gone. Times are this rank's own; waiting for slower ranks counts as compositing.
+struct Times {
+    double loadMs = 0;        // setting up, reading and preparing its part of the scene
+    double renderMs = 0;      // rendering, and compositing of what came in between
+    double compositingMs = 0; // from the end of its rendering to the finished image
+    double writeMs = 0;       // writing files, but for the statistics
+
+    double totalMs() const { return loadMs + renderMs + compositingMs + writeMs; }
+};
+
+// Of a rank in one frame; it loads nothing then.
+struct RankFrameStats {
+    Times times;
+    // Tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
+    std::uint64_t tilesRendered = 0, work = 0;
+};
+
 struct FrameStats {
-    double totalMs = 0;               // from the start of rendering to the finished image
-    double renderMsMax = 0;           // of the slowest rank
-    double compositingOverheadMs = 0; // from the end of the slowest rendering to the finished image
-    std::uint64_t bytesSent = 0;      // by all ranks
+    std::vector<RankFrameStats> ranks;
+    std::uint64_t bytesSent = 0; // by all ranks
     std::uint64_t messagesSent = 0;
     std::uint64_t tilesTotal = 0;
     std::uint64_t tilesTouched = 0;
     std::uint64_t peakMemoryBytes = 0; // of the rank with the most
-    // Of each rank: tiles rendered (of a brick, and of each sample) and work, counted in samples of volumes and rays.
-    std::vector<std::uint64_t> tilesRendered, workOfRanks;
     std::uint64_t orderUndefinedPixels = 0;
     double mergeErrorBound = 0;
     std::string wireColor; // the format of the colour on its way
@@ -155,9 +204,19 @@ struct FrameStats {
     std::int64_t compressedLinks = 0;
 };
 
+// Of a rank in the whole run.
+struct RankStats {
+    Times times;
+    double totalMs = 0; // by the clock, from its start to when all files but the statistics were written
+    int threads = 1;
+    std::uint64_t bytesRead = 0; // of files
+};
+
 struct RunStats {
-    int ranks = 1;
-    std::string transport, mode;
+    std::vector<RankStats> ranks;
+    std::vector<std::string> scene;
+    std::vector<std::pair<std::string, std::string>> options; // name and value, as on the command line
+    std::string version, transport, mode;
     int width = 0, height = 0;
     std::string imageHash; // of the last frame
     double meanAlpha = 0;
@@ -166,25 +225,79 @@ struct RunStats {
     std::vector<FrameStats> frames;
 };
 
+// The rank that rendered last, and so waited least for others. (No clocks of different ranks are compared.)
+template <class Rank>
+std::size_t slowestOf(const std::vector<Rank>& ranks)
+{
+    const auto least = std::min_element(ranks.begin(), ranks.end(), [](const Rank& a, const Rank& b) {
+        return a.times.compositingMs < b.times.compositingMs;
+    });
+    return static_cast<std::size_t>(least - ranks.begin());
+}
+
+namespace detail {
+
+// The `value` of each rank.
+template <class Rank, class Value>
+nlohmann::ordered_json ofRanks(const std::vector<Rank>& ranks, const Value& value)
+{
+    nlohmann::ordered_json all = nlohmann::ordered_json::array();
+    for (const Rank& rank : ranks)
+        all.push_back(value(rank));
+    return all;
+}
+
+// An option's value: a number, true or false where it is one, else a text.
+inline nlohmann::ordered_json valueOf(const std::string& text)
+{
+    const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);
+    return value.is_number() || value.is_boolean() ? value : nlohmann::ordered_json(text);
+}
+
+} // namespace detail
+
 inline nlohmann::ordered_json toJson(const RunStats& run)
 {
+    using detail::ofRanks;
     nlohmann::ordered_json json;
-    json["ranks"] = run.ranks;
+    json["version"] = run.version;
+    json["scene"] = run.scene;
+    json["options"] = nlohmann::ordered_json::object();
+    for (const auto& [name, text] : run.options)
+        json["options"][name] = detail::valueOf(text);
+    json["ranks"] = run.ranks.size();
+    json["threads_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.threads; });
     json["transport"] = run.transport;
     json["mode"] = run.mode;
     json["width"] = run.width;
     json["height"] = run.height;
     json["image_hash"] = run.imageHash;
     json["mean_alpha"] = run.meanAlpha;
+    const std::size_t slowest = slowestOf(run.ranks);
+    json["slowest_rank"] = slowest;
+    const auto add = [](auto& to, const auto& ranks, std::size_t which, const char* name, const auto& value) {
+        to[name] = value(ranks[which]);
+        to[std::string(name) + "_of_ranks"] = ofRanks(ranks, value);
+    };
+    add(json, run.ranks, slowest, "total_ms", [](const RankStats& r) { return r.totalMs; });
+    add(json, run.ranks, slowest, "load_ms", [](const RankStats& r) { return r.times.loadMs; });
+    add(json, run.ranks, slowest, "render_ms", [](const RankStats& r) { return r.times.renderMs; });
+    add(json, run.ranks, slowest, "compositing_ms", [](const RankStats& r) { return r.times.compositingMs; });
+    add(json, run.ranks, slowest, "write_ms", [](const RankStats& r) { return r.times.writeMs; });
+    json["bytes_read_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.bytesRead; });
     json["run_ms"] = run.runMs;
     json["samples_taken"] = run.samplesTaken;
     json["samples_saved"] = run.samplesSaved;
     json["frames"] = nlohmann::ordered_json::array();
     for (const FrameStats& frame : run.frames) {
         nlohmann::ordered_json entry;
-        entry["total_ms"] = frame.totalMs;
-        entry["render_ms_max"] = frame.renderMsMax;
-        entry["compositing_overhead_ms"] = frame.compositingOverheadMs;
+        using Rank = RankFrameStats;
+        const std::size_t last = slowestOf(frame.ranks);
+        entry["slowest_rank"] = last;
+        add(entry, frame.ranks, last, "total_ms", [](const Rank& r) { return r.times.totalMs(); });
+        add(entry, frame.ranks, last, "render_ms", [](const Rank& r) { return r.times.renderMs; });
+        add(entry, frame.ranks, last, "compositing_ms", [](const Rank& r) { return r.times.compositingMs; });
+        add(entry, frame.ranks, last, "write_ms", [](const Rank& r) { return r.times.writeMs; });
         entry["bytes_sent"] = frame.bytesSent;
         entry["messages_sent"] = frame.messagesSent;
         entry["tiles_total"] = frame.tilesTotal;
@@ -196,8 +309,8 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
         entry["wire_error_bound"] = frame.wireErrorBound;
         entry["compressed"] = frame.compressed;
         entry["compressed_links"] = frame.compressedLinks;
-        entry["tiles_rendered"] = frame.tilesRendered;
-        entry["work_of_ranks"] = frame.workOfRanks;
+        entry["tiles_rendered"] = ofRanks(frame.ranks, [](const Rank& r) { return r.tilesRendered; });
+        entry["work_of_ranks"] = ofRanks(frame.ranks, [](const Rank& r) { return r.work; });
         json["frames"].push_back(entry);
     }
     return json;

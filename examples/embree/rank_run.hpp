@@ -3,6 +3,7 @@
 
 #include "options.hpp"
 #include "output.hpp"
+#include "phase_clock.hpp"
 #include "progress_line.hpp"
 #include "rank_scene.hpp"
 
@@ -50,10 +51,11 @@ inline constexpr bool is_adaptive_v = std::is_same_v<TileOp, AdaptiveBlend> || s
 template <class TileOp>
 inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 
+// Unless 8 bits per channel are all that is written. They lose too much to divide by alpha, as a PNG with alpha wants.
 inline bool wantsFloat(const Options& o)
 {
-    return !o.stats.empty() || !o.alpha.empty()
-           || (o.output.size() > 4 && o.output.substr(o.output.size() - 4) == ".pfm");
+    return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background)
+           || detail::endingOf(o.output) == ".pfm";
 }
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
@@ -117,11 +119,6 @@ inline dfb::WallLayout wallOf(const Options& o, int rankCount)
     layout.bezelX = layout.bezelY = o.bezel;
     layout.displayWidth = (o.width - (o.wallColumns - 1) * o.bezel) / o.wallColumns;
     layout.displayHeight = (o.height - (o.wallRows - 1) * o.bezel) / o.wallRows;
-    if (layout.width() != o.width || layout.height() != o.height || layout.displayWidth < 1 || layout.displayHeight < 1)
-        throw dfb::InvalidArgument("an image of " + std::to_string(o.width) + 'x' + std::to_string(o.height)
-                                   + " pixels can not be shared by " + std::to_string(o.wallColumns) + 'x'
-                                   + std::to_string(o.wallRows) + " equal displays with bezels of "
-                                   + std::to_string(o.bezel));
     for (int d = 0; d < layout.displayCount(); ++d)
         layout.ranks.push_back(d % rankCount);
     return layout;
@@ -134,14 +131,16 @@ inline std::string numbered(const std::string& path, int number)
     return path.substr(0, dot) + '.' + std::to_string(number) + path.substr(dot);
 }
 
-inline void writeImage(const std::string& path, const dfb::Image& image, bool dither = false)
+// A .pfm, or a .png that has alpha unless the image is opaque.
+inline void writeImage(const std::string& path, const dfb::Image& image, bool isOpaque, bool dither)
 {
-    const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
     const int width = image.width(), height = image.height();
-    if (!isFloat) {
-        writePng(path, width, height, image.rgba8());
-    } else if (path.substr(path.size() - 4) == ".pfm") {
+    if (image.format() != dfb::OutputFormat::RGBA32F) {
+        writePng(path, width, height, image.rgba8(), false);
+    } else if (detail::endingOf(path) == ".pfm") {
         writePfm(path, width, height, image.rgba32f());
+    } else if (!isOpaque) {
+        writePng(path, width, height, straightPixels(width, height, image.rgba32f(), dither).data(), true);
     } else {
         std::vector<std::byte> srgb(4 * image.pixelCount());
         for (int y = 0; y < height; ++y) {
@@ -151,27 +150,8 @@ inline void writeImage(const std::string& path, const dfb::Image& image, bool di
             else
                 dfb::convertPixels(image.rgba32f() + first, width, dfb::OutputFormat::SRGBA8, srgb.data() + first);
         }
-        writePng(path, width, height, reinterpret_cast<const std::uint8_t*>(srgb.data()));
+        writePng(path, width, height, reinterpret_cast<const std::uint8_t*>(srgb.data()), false);
     }
-}
-
-inline void writeFiles(const Options& o, const dfb::Image& image, const RunStats& stats)
-{
-    if (!o.output.empty() && !image.empty())
-        writeImage(o.output, image, o.dither);
-    if (!o.alpha.empty())
-        writeGreyPfm(o.alpha, o.width, o.height, image.rgba32f() + 3, 4);
-    if (!o.depth.empty())
-        writeGreyPfm(o.depth, o.width, o.height, image.depth(), 1);
-    if (!o.aux.empty()) {
-        writeVectorPfm(o.aux + ".normal.pfm", o.width, o.height, image.normal());
-        writeVectorPfm(o.aux + ".albedo.pfm", o.width, o.height, image.albedo());
-        writeVectorPfm(o.aux + ".position.pfm", o.width, o.height, image.position());
-        writeIdPng(o.aux + ".primitive.png", o.width, o.height, image.primitiveId());
-        writeIdPng(o.aux + ".instance.png", o.width, o.height, image.instanceId());
-    }
-    if (!o.stats.empty())
-        writeStats(o.stats, stats);
 }
 
 template <class TileOp, class PixelOp, class Transport>
@@ -185,9 +165,10 @@ class RankRun {
 
 public:
     RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
-        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o)))
+        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o))),
+          threads_(threads > 0 ? threads : messenger_->threadShare())
     {
-        dfb::FrameBufferConfig config = configOf(o, threads > 0 ? threads : messenger_->threadShare());
+        dfb::FrameBufferConfig config = configOf(o, threads_);
         PixelOp pixelOp{};
         if constexpr (hasWall) {
             // Of what a wall shows no rank has the whole.
@@ -215,9 +196,11 @@ public:
         if (!onAllRanks([&] {
                 if (fb_->isDisplayRank())
                     requireFilesWritable();
-                scene_ = std::make_unique<RankScene>(loadRankScene(o_, fb_->rank(), fb_->size()));
             }))
-            return 1;
+            return exitFailed;
+        clock_.enter(Phase::Load);
+        if (!onAllRanks([&] { load(); }))
+            return exitFailed;
         for (const std::string& note : scene_->notes)
             if (fb_->isDisplayRank())
                 std::fprintf(stderr, "dfb_render: %s\n", note.c_str());
@@ -231,27 +214,25 @@ public:
             shared_.emplace(*fb_, world);
         ProgressLine progress(fb_->isDisplayRank(), o_.frames);
         const auto begin = std::chrono::steady_clock::now();
-        std::deque<typename FrameBuffer::Frame> open;
-        for (int frame = 0; frame < o_.frames; ++frame) {
-            progress.beginFrame(frame);
-            tiles_ = work_ = 0;
-            if constexpr (is_adaptive_v<TileOp>) {
-                reports_.push_back(renderAdaptively(frame, world, progress));
-            } else {
-                if (static_cast<int>(open.size()) == fb_->config().framesInFlight)
-                    endFirst(open);
-                open.push_back(startFrame(frame, world, params_, progress));
-            }
-            rendered_.insert(rendered_.end(), {tiles_, work_});
+        try {
+            renderFrames(world, progress);
+        } catch (const CannotWrite&) { // on all ranks; finish() says why
         }
-        while (!open.empty())
-            endFirst(open);
         runMs_ = std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - begin).count();
         progress.end();
-        return finish() ? 0 : 1;
+        return finish() ? 0 : exitFailed;
     }
 
 private:
+    // This rank's part of a frame.
+    struct FrameCounts {
+        std::int64_t renderNs = 0, compositingNs = 0, writeNs = 0, tiles = 0, work = 0;
+    };
+    // A rank could not write a file of an earlier frame. Thrown on all ranks at the end of the same frame.
+    struct CannotWrite {};
+    // Of Frame::addFigure(), for that. No brick and tile have it.
+    static constexpr std::uint64_t cannotWriteKey = ~std::uint64_t{0};
+
     // Runs `step` on every rank. If it throws on any, the lowest of those says why, and all return false.
     template <class Step>
     bool onAllRanks(const Step& step)
@@ -264,32 +245,142 @@ private:
             error = e.what();
             failed = true;
         }
+        clock_.enter(Phase::Compositing); // waiting for others
         const auto lowest = fb_->allReduce({failed ? fb_->rank() : fb_->size()}, Reduce::Min).front();
         if (lowest == fb_->rank())
             std::fprintf(stderr, "dfb_render: %s\n", error.c_str());
         return lowest == fb_->size();
     }
 
-    std::vector<std::string> files() const
+    void load()
+    {
+        const Loaders loaders(fb_->rank(), fb_->size(),
+                              [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); });
+        scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
+        bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
+    }
+
+    // The files of a frame whose names have its number; or those that are written of the last frame alone.
+    std::vector<std::string> files(int frame, bool areNumbered) const
     {
         std::vector<std::string> all;
-        if (!o_.output.empty() && !hasWall)
-            all.push_back(o_.output);
-        for (int d = 0; !o_.output.empty() && d < o_.wallColumns * o_.wallRows; ++d)
-            all.push_back(numbered(o_.output, d));
-        for (const std::string* path : {&o_.alpha, &o_.depth, &o_.stats})
-            if (!path->empty())
-                all.push_back(*path);
-        if (!o_.aux.empty())
+        const auto isOne = [&](const FramePattern& name) {
+            return name.isPattern() == areNumbered && !name.path(frame).empty();
+        };
+        const FramePattern output(o_.output), aux(o_.aux);
+        if (isOne(output) && !hasWall)
+            all.push_back(output.path(frame));
+        for (int d = 0; isOne(output) && d < o_.wallColumns * o_.wallRows; ++d)
+            all.push_back(numbered(output.path(frame), d));
+        for (const std::string* text : {&o_.alpha, &o_.depth})
+            if (const FramePattern name(*text); isOne(name))
+                all.push_back(name.path(frame));
+        if (isOne(aux))
             for (const char* ending :
                  {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
-                all.push_back(o_.aux + ending);
+                all.push_back(aux.path(frame) + ending);
+        if (!areNumbered && !o_.stats.empty())
+            all.push_back(o_.stats);
         return all;
     }
     void requireFilesWritable() const
     {
-        for (const std::string& path : files())
-            requireWritable(path);
+        for (const bool areNumbered : {false, true})
+            for (const std::string& path : files(0, areNumbered))
+                requireWritable(path);
+    }
+
+    // Writes what this rank has of the files of the frame that ended last. If that fails, what is wrong is kept and no
+    // other file written.
+    void writeFrame(int frame)
+    {
+        clock_.enter(Phase::Write);
+        try {
+            if (writeError_.empty())
+                writeFiles(frame);
+        } catch (const std::exception& e) {
+            writeError_ = e.what();
+        }
+        frames_[static_cast<std::size_t>(frame)].writeNs = clock_.enter(Phase::Compositing);
+    }
+    void writeFiles(int frame) const
+    {
+        // The path that a file of this frame has; empty if there is none.
+        const auto pathOf = [&](const std::string& text) {
+            const FramePattern name(text);
+            return name.isPattern() || frame == o_.frames - 1 ? name.path(frame) : std::string();
+        };
+        const std::string output = pathOf(o_.output), alpha = pathOf(o_.alpha), depth = pathOf(o_.depth),
+                          aux = pathOf(o_.aux);
+        const bool isOpaque = o_.background.has_value();
+        if constexpr (hasWall) {
+            for (int d = 0; !output.empty() && d < wall_->layout().displayCount(); ++d)
+                if (wall_->layout().ranks[static_cast<std::size_t>(d)] == fb_->rank())
+                    writeImage(numbered(output, d), wall_->image(d), isOpaque, false);
+            return;
+        }
+        if (!fb_->isDisplayRank())
+            return;
+        const dfb::Image& image = fb_->image();
+        if (!output.empty())
+            writeImage(output, image, isOpaque, o_.dither);
+        if (!alpha.empty())
+            writeGreyPfm(alpha, o_.width, o_.height, image.rgba32f() + 3, 4);
+        if (!depth.empty())
+            writeGreyPfm(depth, o_.width, o_.height, image.depth(), 1);
+        if (!aux.empty()) {
+            writeVectorPfm(aux + ".normal.pfm", o_.width, o_.height, image.normal());
+            writeVectorPfm(aux + ".albedo.pfm", o_.width, o_.height, image.albedo());
+            writeVectorPfm(aux + ".position.pfm", o_.width, o_.height, image.position());
+            writeIdPng(aux + ".primitive.png", o_.width, o_.height, image.primitiveId());
+            writeIdPng(aux + ".instance.png", o_.width, o_.height, image.instanceId());
+        }
+    }
+
+    void renderFrames(const dfb::World& world, ProgressLine& progress)
+    {
+        frames_.resize(static_cast<std::size_t>(o_.frames));
+        std::deque<typename FrameBuffer::Frame> open;
+        for (int frame = 0; frame < o_.frames; ++frame) {
+            progress.beginFrame(frame);
+            tiles_ = work_ = 0;
+            if constexpr (is_adaptive_v<TileOp>) {
+                reports_.push_back(renderAdaptively(frame, world, progress));
+                writeFrame(frame);
+            } else {
+                if (static_cast<int>(open.size()) == fb_->config().framesInFlight)
+                    endFirst(open);
+                open.push_back(start(frame, world, params_, progress));
+            }
+            frames_[static_cast<std::size_t>(frame)].tiles = tiles_;
+            frames_[static_cast<std::size_t>(frame)].work = work_;
+        }
+        while (!open.empty())
+            endFirst(open);
+    }
+
+    typename FrameBuffer::Frame start(int frame, const dfb::World& world, const dfb::FrameParams& params,
+                                      ProgressLine& progress)
+    {
+        clock_.enter(Phase::Render);
+        typename FrameBuffer::Frame started = startFrame(frame, world, params, progress);
+        frames_[static_cast<std::size_t>(frame)].renderNs += clock_.enter(Phase::Compositing);
+        return started;
+    }
+
+    dfb::FrameReport end(typename FrameBuffer::Frame& open, int frame)
+    {
+        if (!writeError_.empty())
+            open.addFigure(cannotWriteKey, 1);
+        clock_.enter(Phase::Compositing);
+        dfb::FrameReport report = open.end();
+        if constexpr (hasWall)
+            wall_->finish(report.frame);
+        frames_[static_cast<std::size_t>(frame)].compositingNs += clock_.enter(Phase::Compositing);
+        if (std::any_of(report.figures.begin(), report.figures.end(),
+                        [](const dfb::Figure& figure) { return figure.key == cannotWriteKey; }))
+            throw CannotWrite();
+        return report;
     }
 
     // Renders what this rank has to.
@@ -348,12 +439,12 @@ private:
 
     void endFirst(std::deque<typename FrameBuffer::Frame>& open)
     {
-        reports_.push_back(open.front().end());
+        const int frame = static_cast<int>(reports_.size());
+        reports_.push_back(end(open.front(), frame));
         open.pop_front();
         if (o_.mode == Mode::Mixed && o_.balance == Balance::Cost)
             byCost_.update(reports_.back());
-        if constexpr (hasWall)
-            wall_->finish(reports_.back().frame);
+        writeFrame(frame);
     }
 
     dfb::FrameReport renderAdaptively(int frame, const dfb::World& world, ProgressLine& progress)
@@ -364,15 +455,13 @@ private:
             sampler_->reset();
         std::optional<dfb::FrameReport> sum;
         while (!sampler_->done()) {
-            const dfb::FrameReport report = startFrame(frame, world, sampler_->next(params_), progress).end();
+            auto open = start(frame, world, sampler_->next(params_), progress);
+            const dfb::FrameReport report = end(open, frame);
             sampler_->update(report);
             if (!sum) {
                 sum = report;
                 continue;
             }
-            sum->totalMs += report.totalMs;
-            sum->renderMsMax += report.renderMsMax;
-            sum->compositingOverheadMs += report.compositingOverheadMs;
             sum->bytesSent += report.bytesSent;
             sum->messagesSent += report.messagesSent;
             sum->peakMemoryBytes = std::max(sum->peakMemoryBytes, report.peakMemoryBytes);
@@ -380,15 +469,15 @@ private:
         return *sum;
     }
 
-    // What `rendered_` is on each rank.
-    std::vector<std::vector<std::int64_t>> renderedByAll()
+    // The numbers of each rank, which has as many of them as this one.
+    std::vector<std::vector<std::int64_t>> gathered(const std::vector<std::int64_t>& numbers)
     {
-        const auto* first = reinterpret_cast<const std::byte*>(rendered_.data());
+        const auto* first = reinterpret_cast<const std::byte*>(numbers.data());
         std::vector<std::vector<std::int64_t>> all;
-        for (const auto& bytes : fb_->allGather({first, first + rendered_.size() * sizeof(std::int64_t)})) {
-            if (bytes.size() != rendered_.size() * sizeof(std::int64_t))
+        for (const auto& bytes : fb_->allGather({first, first + numbers.size() * sizeof(std::int64_t)})) {
+            if (bytes.size() != numbers.size() * sizeof(std::int64_t))
                 throw std::runtime_error("ranks have counted different numbers of frames");
-            all.emplace_back(rendered_.size());
+            all.emplace_back(numbers.size());
             std::memcpy(all.back().data(), bytes.data(), bytes.size());
         }
         return all;
@@ -396,27 +485,33 @@ private:
 
     bool finish()
     {
-        // Own frame end minus own rendering end, the smallest over ranks: no clocks are compared.
-        std::vector<std::int64_t> overheadNs, totalNs;
-        for (const dfb::FrameReport& r : reports_) {
-            overheadNs.push_back(static_cast<std::int64_t>(1e6 * r.compositingOverheadMs));
-            totalNs.push_back(static_cast<std::int64_t>(1e6 * r.totalMs));
-        }
-        overheadNs = fb_->allReduce(overheadNs, Reduce::Min);
-        totalNs = fb_->allReduce(totalNs, Reduce::Max);
-        const auto rendered = renderedByAll();
+        if (!onAllRanks([&] {
+                if (!writeError_.empty())
+                    throw std::runtime_error(writeError_);
+            }))
+            return false;
+        clock_.enter(Phase::Compositing);
+        std::vector<std::int64_t> numbers{clock_.totalNs(),
+                                          clock_.ns(Phase::Load),
+                                          clock_.ns(Phase::Render),
+                                          clock_.ns(Phase::Compositing),
+                                          clock_.ns(Phase::Write),
+                                          threads_,
+                                          bytesRead_};
+        for (const FrameCounts& f : frames_)
+            numbers.insert(numbers.end(), {f.renderNs, f.compositingNs, f.writeNs, f.tiles, f.work});
+        const auto ofRanks = gathered(numbers);
         const dfb::testing::ErrorReport checked = verification_.report();
         const auto verified =
             fb_->allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
                             checked.others, checked.wrongOthers},
                            Reduce::Sum);
-        if (hasWall && !o_.output.empty() && !onAllRanks([&] { writeDisplays(); }))
-            return false;
         return onAllRanks([&] {
             if (!fb_->isDisplayRank())
                 return;
-            const RunStats stats = statsOf(overheadNs, totalNs, rendered);
-            writeFiles(o_, fb_->image(), stats);
+            const RunStats stats = statsOf(ofRanks);
+            if (!o_.stats.empty())
+                writeStats(o_.stats, stats);
             say(stats);
             if (o_.verify)
                 std::printf("%lld of %lld values are not the exact result rounded\n",
@@ -427,19 +522,20 @@ private:
         });
     }
 
-    void writeDisplays() const
+    // `ofRanks`: what finish() gathers.
+    RunStats statsOf(const std::vector<std::vector<std::int64_t>>& ofRanks) const
     {
-        if constexpr (hasWall)
-            for (int d = 0; d < wall_->layout().displayCount(); ++d)
-                if (wall_->layout().ranks[static_cast<std::size_t>(d)] == fb_->rank())
-                    writeImage(numbered(o_.output, d), wall_->image(d));
-    }
-
-    RunStats statsOf(const std::vector<std::int64_t>& overheadNs, const std::vector<std::int64_t>& totalNs,
-                     const std::vector<std::vector<std::int64_t>>& rendered) const
-    {
+        const auto ms = [](std::int64_t ns) { return static_cast<double>(ns) / 1e6; };
         RunStats stats;
-        stats.ranks = fb_->size();
+        for (const auto& n : ofRanks)
+            stats.ranks.push_back({{ms(n[1]), ms(n[2]), ms(n[3]), ms(n[4])},
+                                   ms(n[0]),
+                                   static_cast<int>(n[5]),
+                                   static_cast<std::uint64_t>(n[6])});
+        stats.scene = o_.scene;
+        stats.options = o_.values;
+        stats.version = std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR) + '.'
+                        + std::to_string(DFB_VERSION_PATCH);
         stats.transport = Transport::name;
         stats.mode = o_.mode == Mode::Data ? "data" : o_.mode == Mode::Image ? "image" : "mixed";
         stats.width = o_.width;
@@ -448,9 +544,12 @@ private:
         for (std::size_t i = 0; i < reports_.size(); ++i) {
             const dfb::FrameReport& r = reports_[i];
             FrameStats s;
-            s.totalMs = static_cast<double>(totalNs[i]) / 1e6;
-            s.renderMsMax = r.renderMsMax;
-            s.compositingOverheadMs = static_cast<double>(overheadNs[i]) / 1e6;
+            for (const auto& n : ofRanks) {
+                const std::int64_t* f = n.data() + 7 + 5 * i;
+                s.ranks.push_back({{0, ms(f[0]), ms(f[1]), ms(f[2])},
+                                   static_cast<std::uint64_t>(f[3]),
+                                   static_cast<std::uint64_t>(f[4])});
+            }
             s.bytesSent = static_cast<std::uint64_t>(r.bytesSent);
             s.messagesSent = static_cast<std::uint64_t>(r.messagesSent);
             s.tilesTotal = static_cast<std::uint64_t>(r.tilesTotal);
@@ -462,10 +561,6 @@ private:
             s.wireErrorBound = r.wireErrorBound;
             s.compressed = r.compressed;
             s.compressedLinks = r.compressedLinks;
-            for (const auto& ofRank : rendered) {
-                s.tilesRendered.push_back(static_cast<std::uint64_t>(ofRank[2 * i]));
-                s.workOfRanks.push_back(static_cast<std::uint64_t>(ofRank[2 * i + 1]));
-            }
             stats.frames.push_back(s);
         }
         const std::int64_t pixels = static_cast<std::int64_t>(o_.width) * o_.height;
@@ -480,10 +575,13 @@ private:
 
     void say(const RunStats& stats) const
     {
-        std::printf("%d %s of %dx%d on %d %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n",
-                    o_.frames, o_.frames == 1 ? "frame" : "frames", o_.width, o_.height, stats.ranks,
-                    stats.ranks == 1 ? "rank" : "ranks", stats.runMs / o_.frames,
-                    stats.frames.back().compositingOverheadMs);
+        const FrameStats& last = stats.frames.back();
+        const std::size_t ranks = stats.ranks.size();
+        std::printf("%d %s of %dx%d on %zu %s: %.1f ms a frame, %.1f ms of it after the slowest rank had rendered\n",
+                    o_.frames, o_.frames == 1 ? "frame" : "frames", o_.width, o_.height, ranks,
+                    ranks == 1 ? "rank" : "ranks",
+                    (stats.runMs - stats.ranks[static_cast<std::size_t>(fb_->rank())].times.writeMs) / o_.frames,
+                    last.ranks[slowestOf(last.ranks)].times.compositingMs);
         if (sampler_)
             std::printf("%.1f %% of the samples of --spp %d were taken\n",
                         100.0 * static_cast<double>(stats.samplesTaken)
@@ -491,18 +589,38 @@ private:
                         o_.spp);
         if (is_deep_v<TileOp>)
             std::printf("order undefined at %llu pixels; merging changed none by more than %.3g\n",
-                        static_cast<unsigned long long>(stats.frames.back().orderUndefinedPixels),
-                        stats.frames.back().mergeErrorBound);
-        const FrameStats& last = stats.frames.back();
+                        static_cast<unsigned long long>(last.orderUndefinedPixels), last.mergeErrorBound);
         if (last.wireErrorBound > 0)
             std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n", last.wireColor.c_str(),
                         last.wireErrorBound);
-        for (const std::string& path : files())
-            std::printf("wrote %s\n", path.c_str());
+        sayWritten();
     }
 
+    void sayWritten() const
+    {
+        const std::vector<std::string> first = files(0, true), last = files(o_.frames - 1, true);
+        for (std::size_t i = 0; i < first.size(); ++i) {
+            if (o_.frames > 1)
+                std::printf("wrote %s to %s\n", first[i].c_str(), last[i].c_str());
+            else
+                std::printf("wrote %s\n", first[i].c_str());
+        }
+        for (const std::string& path : files(0, false)) {
+            if (o_.frames > 1 && path != o_.stats)
+                std::printf("wrote %s, the last of %d frames; %%04d in the name gives a file for each\n", path.c_str(),
+                            o_.frames);
+            else
+                std::printf("wrote %s\n", path.c_str());
+        }
+        if (o_.writesNothing())
+            std::fprintf(stderr, "dfb_render: nothing was written: there is no --output, --alpha, --depth, --aux or "
+                                 "--stats\n");
+    }
+
+    PhaseClock clock_;
     Options o_;
     std::shared_ptr<dfb::Messenger<Transport>> messenger_;
+    int threads_;
     std::unique_ptr<Wall> wall_; // outlives the framebuffer that sends to it
     std::unique_ptr<FrameBuffer> fb_;
     std::unique_ptr<RankScene> scene_;
@@ -513,7 +631,9 @@ private:
     dfb::RoundRobinBricks inTurn_;
     std::optional<dfb::AdaptiveSampler> sampler_;
     std::atomic<std::int64_t> tiles_{0}, work_{0}; // of this rank in this frame
-    std::vector<std::int64_t> rendered_;           // both, of each frame
+    std::vector<FrameCounts> frames_;
+    std::int64_t bytesRead_ = 0;
+    std::string writeError_; // empty if there is none
     double runMs_ = 0;
     dfb::testing::Verification verification_;
     std::vector<dfb::FrameReport> reports_;

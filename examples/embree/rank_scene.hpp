@@ -25,8 +25,8 @@ inline RenderSettings renderSettings(const Options& options)
     return settings;
 }
 
-// Throws std::runtime_error that names the file.
-inline Scene makeScene(const Options& options, int brickCount)
+// Collective. Throws std::runtime_error that names the file, the same on all ranks.
+inline Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
 {
     if (options.scene.front() == "synthetic")
         return syntheticScene(brickCount, options.seed);
@@ -34,7 +34,7 @@ inline Scene makeScene(const Options& options, int brickCount)
         return demoScene(options.seed);
     Scene scene;
     for (const std::string& path : options.scene)
-        addFile(scene, path, options.fit, options.xyzFrame);
+        addFile(scene, path, options.fit, options.xyzFrame, loaders);
     return scene;
 }
 
@@ -60,12 +60,14 @@ inline bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int c
     return (rank - first + rankCount) % rankCount < copies;
 }
 
-// Not collective: each rank reads what it needs, and all come to the same cells. Throws std::runtime_error.
-inline RankScene loadRankScene(const Options& options, int rank, int rankCount)
+// Collective: each rank reads what it needs, and all come to the same cells. Throws std::runtime_error, on some ranks
+// or all.
+inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
 {
+    const int rank = loaders.rank(), rankCount = loaders.size();
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
-    const Scene scene = makeScene(options, sceneBricks);
+    const Scene scene = makeScene(options, sceneBricks, loaders);
     const RenderSettings settings = renderSettings(options);
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
     if (options.path > 0 && !scene.volumes.empty())

@@ -6,6 +6,7 @@
 // rank knows all of them, and two cells that share a face have the same number for it.
 #pragma once
 
+#include "loaders.hpp"
 #include "obj.hpp"
 #include "ply.hpp"
 #include "shading.hpp"
@@ -95,7 +96,7 @@ struct Scene {
     {
         VolumeObject object(std::move(source), fit);
         grow(object.bounds());
-        const VisibleVoxels visible = visibleVoxels(object.source);
+        const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
         const float slack = static_cast<float>(visible.slack) * object.placement.size();
         lookAt([&](const auto& take) {
             for (const Vec3& p : visible.points)
@@ -166,7 +167,7 @@ private:
                             + "; they count as " + textOf(info.minimum));
         if (!mayBeEmpty)
             return;
-        const auto [lo, hi] = rangeOf(source);
+        const auto [lo, hi] = source.range ? *source.range : rangeOf(source);
         const auto value = [&info](float v) { return (v - info.minimum) / (info.maximum - info.minimum); };
         if (!TransferFunction(1).isTransparent(value(lo), value(hi)))
             return;
@@ -212,18 +213,35 @@ private:
     std::uint32_t nextGeometry_ = 0;
 };
 
-// Reads a file by its ending. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file.
-inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0)
+// Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
+// of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
+// texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
+// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file,
+// the same on all ranks.
+inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    const auto bytes = [&] {
+        std::string all = readFile(path);
+        *loaders.readCounter() += all.size();
+        return all;
+    };
+    const auto parsed = [&](auto kind, const auto& parse) {
+        Notes notes;
+        auto object = loaders.fromFirst<decltype(kind)>([&] { return parse(&notes); });
+        for (std::string& note : loaders.linesOfFirst(notes))
+            scene.notes.push_back(std::move(note));
+        return object;
+    };
     if (ending == ".raw")
-        scene.add(openVolume(path), fit);
+        scene.add(openVolume(path, loaders), fit);
     else if (ending == ".ply")
-        scene.add(parsePly(readFile(path), path, &scene.notes), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit);
     else if (ending == ".obj")
-        scene.add(parseObj(readFile(path), path, &scene.notes), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit);
     else if (ending == ".xyz")
-        scene.add(parseXyz(readFile(path), path, xyzFrame, &scene.notes), fit);
+        scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
+                  fit);
     else
         throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
 }

@@ -20,6 +20,13 @@ struct Sphere {
     Vec3 color; // linear RGB
 };
 
+// For Loaders::fromFirst().
+template <class Function>
+void arraysOf(std::vector<Sphere>& spheres, const Function& function)
+{
+    function(spheres);
+}
+
 namespace detail {
 
 // Reads the frames of an XYZ file one after the other.

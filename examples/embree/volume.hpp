@@ -1,7 +1,8 @@
 // Volume: regular grids of scalars, and the part of one that a brick holds.
 //
 // Files are headerless, name_XxYxZ_type.raw (the Open SciVis convention): x fastest, little-endian, type one of
-// uint8, uint16, float32. Only the rows that are asked for are read.
+// uint8, uint16, float32. Only the rows that are asked for are read: a rank reads its bricks, and its share of what
+// all ranks must know of the whole volume (least and greatest value, where there is something to see).
 //
 // Values are normalised to [0, 1] over a range that is a function of the whole file, and so the same on all ranks:
 // 0..255 for uint8, the least and greatest value for uint16 and float32. A float32 file with values on both sides
@@ -9,17 +10,24 @@
 // the least value and have no part in the range.
 #pragma once
 
+#include "loaders.hpp"
 #include "vec.hpp"
 
+#include <algorithm>
 #include <array>
+#include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <cstring>
 #include <fstream>
 #include <functional>
 #include <istream>
+#include <limits>
 #include <memory>
+#include <optional>
 #include <stdexcept>
 #include <string>
+#include <utility>
 #include <vector>
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
@@ -47,10 +55,19 @@ struct VolumeInfo {
 // Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
 using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* out)>;
 
+// Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
+struct VisibleVoxels {
+    std::vector<Vec3> points; // the ends of rows, in voxels
+    int slack = 0;            // how many voxels beyond these the lattice leaves out
+};
+
 struct VolumeSource {
     VolumeInfo info;
     std::function<RowReader()> open; // each call gives a reader of its own
     std::string name;                // of the file
+    // If they are known; the second only if there are no visible points.
+    std::optional<VisibleVoxels> visible;
+    std::optional<std::array<float, 2>> range;
 };
 
 // ---- files -----------------------------------------------------------------------------------------------------
@@ -120,11 +137,13 @@ std::size_t growRange(const std::byte* bytes, std::size_t count, float& lo, floa
 
 } // namespace detail
 
-// Dimensions and type from the name, the range from one pass over the stream where it is needed; checks that the
-// stream is as long as the name says. Throws std::runtime_error that names the file, the expected and the found.
-inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
+// Dimensions and type from the name; checks that the stream is as long as the name says. Throws std::runtime_error
+// that names the file, the expected and the found.
+inline VolumeInfo checkVolume(std::istream& stream, const std::string& path)
 {
-    VolumeInfo info = parseVolumeName(path);
+    if (!stream)
+        throw std::runtime_error(path + ": cannot be opened");
+    const VolumeInfo info = parseVolumeName(path);
     const std::uint64_t expected = static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
                                    * static_cast<std::uint64_t>(info.dims[2]) * voxelBytes(info.type);
     stream.seekg(0, std::ios::end);
@@ -134,22 +153,72 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
     if (static_cast<std::uint64_t>(got) != expected)
         throw std::runtime_error(path + ": expected " + std::to_string(expected) + " bytes from the name, got "
                                  + std::to_string(got));
-    if (info.type == VoxelType::UInt8)
-        return info;
+    return info;
+}
 
+// The least and the greatest of the finite values of some voxels; infinity and minus infinity if there are none.
+struct VoxelRange {
     float lo = std::numeric_limits<float>::infinity(), hi = -lo;
-    std::vector<std::byte> chunk(1 << 20);
-    stream.seekg(0);
-    for (std::uint64_t done = 0; done < expected;) {
-        const std::size_t bytes = static_cast<std::size_t>(std::min<std::uint64_t>(chunk.size(), expected - done));
-        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(bytes)))
-            throw std::runtime_error(path + ": reading failed after " + std::to_string(done) + " bytes");
-        if (info.type == VoxelType::UInt16)
-            detail::growRange<std::uint16_t>(chunk.data(), bytes / 2, lo, hi);
+    std::uint64_t notFinite = 0;
+
+    void grow(VoxelType type, const std::byte* bytes, std::size_t count)
+    {
+        if (type == VoxelType::UInt8)
+            detail::growRange<std::uint8_t>(bytes, count, lo, hi);
+        else if (type == VoxelType::UInt16)
+            detail::growRange<std::uint16_t>(bytes, count, lo, hi);
         else
-            info.notFinite += detail::growRange<float>(chunk.data(), bytes / 4, lo, hi);
-        done += bytes;
+            notFinite += detail::growRange<float>(bytes, count, lo, hi);
     }
+    static VoxelRange of(const std::vector<VoxelRange>& ranges)
+    {
+        VoxelRange all;
+        for (const VoxelRange& range : ranges) {
+            all.lo = std::min(all.lo, range.lo);
+            all.hi = std::max(all.hi, range.hi);
+            all.notFinite += range.notFinite;
+        }
+        return all;
+    }
+};
+
+// Of voxels [begin, end), in file order. Adds what it reads to `bytesRead`.
+inline VoxelRange scanVoxels(std::istream& stream, const std::string& path, VoxelType type, std::uint64_t begin,
+                             std::uint64_t end, std::uint64_t& bytesRead)
+{
+    VoxelRange range;
+    const std::size_t size = voxelBytes(type), most = std::size_t{1} << 20;
+    std::vector<std::byte> chunk;
+    stream.seekg(static_cast<std::streamoff>(begin * size));
+    while (begin < end) {
+        const std::size_t count = static_cast<std::size_t>(std::min<std::uint64_t>(most / size, end - begin));
+        chunk.resize(count * size);
+        if (!stream.read(reinterpret_cast<char*>(chunk.data()), static_cast<std::streamsize>(chunk.size())))
+            throw std::runtime_error(path + ": reading failed after " + std::to_string(begin * size) + " bytes");
+        range.grow(type, chunk.data(), count);
+        begin += count;
+        bytesRead += chunk.size();
+    }
+    return range;
+}
+
+// Collective: checkVolume() of this rank's own stream, and the range, of which each rank looks at a share of the
+// voxels. Throws std::runtime_error, the same on all ranks.
+inline VolumeInfo describeVolume(std::istream& stream, const std::string& path, const Loaders& loaders = {})
+{
+    VolumeInfo info;
+    const VoxelRange range = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
+        info = checkVolume(stream, path);
+        if (info.type == VoxelType::UInt8)
+            return std::vector<VoxelRange>{{0, 255, 0}};
+        const auto [begin, end] =
+            loaders.shareOf(static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
+                            * static_cast<std::uint64_t>(info.dims[2]));
+        return std::vector<VoxelRange>{
+            scanVoxels(stream, path, info.type, begin, end, *loaders.readCounter())};
+    }));
+    const float lo = range.lo, hi = range.hi;
+    info.notFinite = range.notFinite;
     if (lo > hi)
         throw std::runtime_error(path + ": not one of its voxels is finite");
     info.minimum = lo < 0 && hi > 0 ? 0 : lo;
@@ -164,11 +233,12 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path)
     return info;
 }
 
-// Reads rows of a stream that describeVolume has accepted.
-inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::string& path, const VolumeInfo& info)
+// Reads rows of a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
+inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::string& path, const VolumeInfo& info,
+                           std::shared_ptr<std::uint64_t> bytesRead = nullptr)
 {
     std::streamoff position = -1;
-    return [stream, path, info, position](int x0, int x1, int y, int z, std::byte* out) mutable {
+    return [stream, path, info, bytesRead, position](int x0, int x1, int y, int z, std::byte* out) mutable {
         const auto wide = [](int i) { return static_cast<std::streamoff>(i); };
         const std::streamoff begin =
             ((wide(z) * info.dims[1] + y) * info.dims[0] + x0) * static_cast<std::streamoff>(voxelBytes(info.type));
@@ -179,6 +249,8 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
             throw std::runtime_error(path + ": reading row y=" + std::to_string(y) + " z=" + std::to_string(z)
                                      + " failed");
         position = begin + bytes;
+        if (bytesRead)
+            *bytesRead += static_cast<std::uint64_t>(bytes);
         if (info.type == VoxelType::Float32)
             for (int i = 0; i < x1 - x0; ++i) {
                 float value;
@@ -189,32 +261,11 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
     };
 }
 
-inline VolumeSource openVolume(const std::string& path)
-{
-    auto open = [path] {
-        auto stream = std::make_shared<std::ifstream>(path, std::ios::binary);
-        if (!*stream)
-            throw std::runtime_error(path + ": cannot be opened");
-        return stream;
-    };
-    VolumeSource source;
-    source.name = path;
-    source.info = describeVolume(*open(), path);
-    source.open = [open, path, info = source.info] { return rowReader(open(), path, info); };
-    return source;
-}
-
-// Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
-struct VisibleVoxels {
-    std::vector<Vec3> points; // the ends of rows, in voxels
-    int slack = 0;            // how many voxels beyond these the lattice leaves out
-};
-
-inline VisibleVoxels visibleVoxels(const VolumeSource& source)
+// Collective: each rank reads a share of the rows. Throws std::runtime_error, the same on all ranks.
+inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& loaders = {})
 {
     const VolumeInfo& info = source.info;
     const float threshold = info.minimum + 0.1f * (info.maximum - info.minimum);
-    const RowReader read = source.open();
     std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
     const auto value = [&](int x) {
         const auto as = [&](auto voxel) {
@@ -226,10 +277,17 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source)
                                                 : as(float{});
     };
     const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
+    const auto rows = [&](std::size_t axis) {
+        return static_cast<std::uint64_t>(1 + (info.dims[axis] - 1) / stride(axis));
+    };
     VisibleVoxels visible;
     visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
-    for (int z = 0; z < info.dims[2]; z += stride(2))
-        for (int y = 0; y < info.dims[1]; y += stride(1)) {
+    visible.points = loaders.gatherOf<Vec3>([&] {
+        const RowReader read = source.open();
+        std::vector<Vec3> points;
+        const auto [begin, end] = loaders.shareOf(rows(1) * rows(2));
+        for (std::uint64_t i = begin; i < end; ++i) {
+            const int y = static_cast<int>(i % rows(1)) * stride(1), z = static_cast<int>(i / rows(1)) * stride(2);
             read(0, info.dims[0], y, z, row.data());
             int first = -1, last = -1;
             for (int x = 0; x < info.dims[0]; x += stride(0))
@@ -239,30 +297,55 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source)
                 }
             for (const int x : {first, last})
                 if (x >= 0)
-                    visible.points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
+                    points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
         }
+        return points;
+    });
     return visible;
 }
 
-// The least and the greatest of all voxels.
-inline std::array<float, 2> rangeOf(const VolumeSource& source)
+// Collective: the least and the greatest of all voxels, of which each rank reads a share. Throws std::runtime_error,
+// the same on all ranks.
+inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& loaders = {})
 {
-    const VolumeInfo& info = source.info;
-    const RowReader read = source.open();
-    const std::size_t count = static_cast<std::size_t>(info.dims[0]);
-    std::vector<std::byte> row(count * voxelBytes(info.type));
-    float lo = std::numeric_limits<float>::infinity(), hi = -lo;
-    for (int z = 0; z < info.dims[2]; ++z)
-        for (int y = 0; y < info.dims[1]; ++y) {
-            read(0, info.dims[0], y, z, row.data());
-            if (info.type == VoxelType::UInt8)
-                detail::growRange<std::uint8_t>(row.data(), count, lo, hi);
-            else if (info.type == VoxelType::UInt16)
-                detail::growRange<std::uint16_t>(row.data(), count, lo, hi);
-            else
-                detail::growRange<float>(row.data(), count, lo, hi);
+    const VoxelRange all = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
+        const VolumeInfo& info = source.info;
+        const RowReader read = source.open();
+        const std::size_t count = static_cast<std::size_t>(info.dims[0]);
+        std::vector<std::byte> row(count * voxelBytes(info.type));
+        VoxelRange range;
+        const auto rows = static_cast<std::uint64_t>(info.dims[1]);
+        const auto [begin, end] = loaders.shareOf(rows * static_cast<std::uint64_t>(info.dims[2]));
+        for (std::uint64_t i = begin; i < end; ++i) {
+            read(0, info.dims[0], static_cast<int>(i % rows), static_cast<int>(i / rows), row.data());
+            range.grow(info.type, row.data(), count);
         }
-    return {lo, hi};
+        return std::vector<VoxelRange>{range};
+    }));
+    return {all.lo, all.hi};
+}
+
+// Collective: the ranks share what has to be known of the whole volume. Throws std::runtime_error, the same on all
+// ranks.
+inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {})
+{
+    const auto open = [path] {
+        auto stream = std::make_shared<std::ifstream>();
+        // Without a buffer no byte is read that nobody asked for; rows are read as a whole.
+        stream->rdbuf()->pubsetbuf(nullptr, 0);
+        stream->open(path, std::ios::binary);
+        return stream; // one that is not open is a stream that cannot be read
+    };
+    VolumeSource source;
+    source.name = path;
+    source.info = describeVolume(*open(), path, loaders);
+    source.open = [open, path, info = source.info, counter = loaders.readCounter()] {
+        return rowReader(open(), path, info, counter);
+    };
+    source.visible = visibleVoxels(source, loaders);
+    if (source.visible->points.empty())
+        source.range = rangeOf(source, loaders);
+    return source;
 }
 
 // ---- the part in memory ----------------------------------------------------------------------------------------
@@ -279,17 +362,31 @@ public:
         bytes_.resize(nxy_ * static_cast<std::size_t>(hi[2] - lo[2]) * size);
         const RowReader read = source.open();
         const int x0 = std::max(lo[0], 0), x1 = std::min(hi[0], info_.dims[0]);
-        for (int z = lo[2]; z < hi[2]; ++z)
-            for (int y = lo[1]; y < hi[1]; ++y) {
-                std::byte* row = bytes_.data() + index(lo[0], y, z) * size;
-                std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
-                read(x0, x1, std::clamp(y, 0, info_.dims[1] - 1), std::clamp(z, 0, info_.dims[2] - 1), inside);
-                for (int x = lo[0]; x < x0; ++x)
-                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
-                for (int x = x1; x < hi[0]; ++x)
-                    std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
-                                inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
-            }
+        const std::size_t rowBytes = nx_ * size;
+        // Calls f(y, z, the row in the block) for the rows whose voxels are in the volume, or for the others.
+        const auto forRows = [&](bool areInside, const auto& f) {
+            for (int z = lo[2]; z < hi[2]; ++z)
+                for (int y = lo[1]; y < hi[1]; ++y)
+                    if (areInside == (y >= 0 && y < info_.dims[1] && z >= 0 && z < info_.dims[2]))
+                        f(y, z, bytes_.data() + index(lo[0], y, z) * size);
+        };
+        const auto readRow = [&](int y, int z, std::byte* row) {
+            std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
+            read(x0, x1, y, z, inside);
+            for (int x = lo[0]; x < x0; ++x)
+                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
+            for (int x = x1; x < hi[0]; ++x)
+                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
+                            inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
+        };
+        forRows(true, readRow);
+        forRows(false, [&](int y, int z, std::byte* row) {
+            const int nearY = std::clamp(y, 0, info_.dims[1] - 1), nearZ = std::clamp(z, 0, info_.dims[2] - 1);
+            if (nearY >= lo[1] && nearY < hi[1] && nearZ >= lo[2] && nearZ < hi[2])
+                std::memcpy(row, bytes_.data() + index(lo[0], nearY, nearZ) * size, rowBytes);
+            else
+                readRow(nearY, nearZ, row);
+        });
     }
 
     const VolumeInfo& info() const { return info_; }

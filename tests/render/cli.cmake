@@ -8,6 +8,9 @@ set(DFB_TEST_DATA "${PROJECT_SOURCE_DIR}/../shared/data" CACHE PATH
 
 add_executable(dfb_compare_pfm render/tools/compare_pfm.cpp)
 target_link_libraries(dfb_compare_pfm PRIVATE dfb_developer)
+find_package(nlohmann_json CONFIG REQUIRED) # dfb_render has it, too
+add_executable(dfb_check_stats render/tools/check_stats.cpp)
+target_link_libraries(dfb_check_stats PRIVATE dfb_developer nlohmann_json::nlohmann_json)
 
 # The same program, but that rank 1 stops in the middle of its frames.
 if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
@@ -31,6 +34,7 @@ set(_settings ${CMAKE_CURRENT_BINARY_DIR}/render_cli_$<CONFIG>.cmake)
 file(GENERATE OUTPUT ${_settings} CONTENT "# For cli_cases.cmake.
 set(RENDER [==[$<TARGET_FILE:dfb_render>]==])
 set(COMPARE [==[$<TARGET_FILE:dfb_compare_pfm>]==])
+set(CHECK_STATS [==[$<TARGET_FILE:dfb_check_stats>]==])
 set(MPIEXEC [==[${_launch}]==]) # with its flags, up to the one before the number of ranks; empty: no MPI
 set(POSTFLAGS [==[${MPIEXEC_POSTFLAGS}]==])
 set(TIMEOUT_PROGRAM [==[${DFB_TIMEOUT}]==])
@@ -66,6 +70,9 @@ if(UNIX AND NOT APPLE)
 endif()
 _add_cli_case(ordinary ranks3 ranks4 np3 np4)
 _add_cli_case(stats ranks3 np3)
+_add_cli_case(loading ranks1 ranks3 np4)
+_add_cli_case(frames ranks3 np3)
+_add_cli_case(no_output one np3)
 _add_cli_case(algorithms ranks2 ranks7 np2 np4)
 _add_cli_case(precision ranks3 np4)
 _add_cli_case(wall_and_aux ranks3 np2 np4)

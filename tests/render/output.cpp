@@ -58,23 +58,35 @@ Pfm readPfm(const std::string& path)
     return pfm;
 }
 
-std::vector<std::uint8_t> readPng(const std::string& path, int& width, int& height)
+// The bytes as they are in the file, of this format.
+std::vector<std::uint8_t> readPng(const std::string& path, int& width, int& height, png_uint_32 format = PNG_FORMAT_RGB)
 {
     png_image image{};
     image.version = PNG_IMAGE_VERSION;
     REQUIRE(png_image_begin_read_from_file(&image, path.c_str()) != 0);
-    CHECK(image.format == PNG_FORMAT_RGB); // as it is in the file
-    std::vector<std::uint8_t> rgb(PNG_IMAGE_SIZE(image));
-    REQUIRE(png_image_finish_read(&image, nullptr, rgb.data(), 0, nullptr) != 0);
+    CHECK(image.format == format);
+    std::vector<std::uint8_t> bytes(PNG_IMAGE_SIZE(image));
+    REQUIRE(png_image_finish_read(&image, nullptr, bytes.data(), 0, nullptr) != 0);
     width = static_cast<int>(image.width);
     height = static_cast<int>(image.height);
-    return rgb;
+    return bytes;
 }
+
+// By the curve itself, not the thresholds that the library compares with.
+double srgbOf(double linear)
+{
+    return linear <= 0.0031308 ? 12.92 * linear : 1.055 * std::pow(linear, 1 / 2.4) - 0.055;
+}
+double linearOf(double srgb) { return srgb <= 0.04045 ? srgb / 12.92 : std::pow((srgb + 0.055) / 1.055, 2.4); }
 
 RunStats someStats()
 {
     RunStats stats;
-    stats.ranks = 3;
+    stats.scene = {"a.ply", "b.xyz"};
+    stats.options = {{"spp", "4"}, {"mode", "data"}, {"opacity", "0.6"}, {"dither", "true"}, {"size", "640x480"}};
+    stats.version = "1.2.3";
+    // Rank 1 waits least.
+    stats.ranks = {{{10, 20, 60, 5}, 95, 2, 100}, {{30, 50.5, 14.5, 0}, 95, 3, 5000000000u}, {{1, 2, 92, 0}, 95, 2, 0}};
     stats.transport = "inproc";
     stats.mode = "data";
     stats.width = 640;
@@ -82,9 +94,8 @@ RunStats someStats()
     stats.imageHash = "00ff00ff00ff00ff";
     stats.meanAlpha = 0.25;
     stats.frames.resize(2);
-    stats.frames[1].totalMs = 12.5;
-    stats.frames[1].renderMsMax = 10.25;
-    stats.frames[1].compositingOverheadMs = 1.125;
+    stats.frames[0].ranks.resize(3);
+    stats.frames[1].ranks = {{{0, 10.25, 1.125, 2}, 5, 600}, {{0, 1, 10.5, 0}, 7, 800}, {{0, 2, 9.25, 0}, 0, 0}};
     stats.frames[1].bytesSent = 5000000000u;
     stats.frames[1].messagesSent = 77;
     stats.frames[1].tilesTotal = 80;
@@ -130,7 +141,7 @@ TEST_CASE("A PNG holds the pixels that the library converts to sRGB", "[output]"
     std::vector<std::uint8_t> srgba(rgba.size());
     dfb::convertPixels(rgba.data(), width * height, dfb::OutputFormat::SRGBA8,
                        reinterpret_cast<std::byte*>(srgba.data()));
-    writePng(folder / "image.png", width, height, srgba.data());
+    writePng(folder / "image.png", width, height, srgba.data(), false);
 
     int gotWidth = 0, gotHeight = 0;
     const std::vector<std::uint8_t> rgb = readPng(folder / "image.png", gotWidth, gotHeight);
@@ -141,6 +152,75 @@ TEST_CASE("A PNG holds the pixels that the library converts to sRGB", "[output]"
         if (i % 4 != 3)
             expected.push_back(srgba[i]);
     CHECK(rgb == expected);
+}
+
+TEST_CASE("A PNG with alpha has straight colours, each the nearest level", "[output]")
+{
+    const test::TemporaryFolder folder;
+    const int width = 256, height = 40;
+    std::vector<float> rgba = pixels(width, height);
+    for (std::size_t i = 0; i < rgba.size(); i += 4) // most colours at most alpha, the rest as they come
+        for (std::size_t c = i; c < i + 3; ++c)
+            rgba[c] *= i % 16 != 0 ? rgba[i + 3] : 1;
+    const float nan = std::numeric_limits<float>::quiet_NaN();
+    const std::vector<float> special{1,    0.5f, 0,   0,     -1, 0.5f,  2,     0.5f, 0.25f, 0.5f, 1,
+                                     1,    0.5f, 1,   2,     2,  1e-9f, 2e-9f, 0,    1e-8f, 0.5f, 0.5f,
+                                     0.5f, -1,   nan, 0.25f, 0,  0.5f,  1,     1,    1,     nan};
+    std::copy(special.begin(), special.end(), rgba.begin());
+    const auto straight = straightPixels(width, height, rgba.data(), false);
+    writePng(folder / "image.png", width, height, straight.data(), true);
+    int gotWidth = 0, gotHeight = 0;
+    CHECK(readPng(folder / "image.png", gotWidth, gotHeight, PNG_FORMAT_RGBA) == straight);
+    CHECK(gotWidth == width);
+    CHECK(gotHeight == height);
+
+    const std::vector<int> expected{0,  0,   0, 0, 0, 255, 255, 128, 137, 188, 255, 255, 188, 255, 255, 255,
+                                    89, 124, 0, 0, 0, 0,   0,   0,   0,   188, 0,   128, 0,   0,   0,   0};
+    CHECK(std::vector<int>(straight.begin(), straight.begin() + 32) == expected);
+
+    std::size_t wrong = 0;
+    for (std::size_t i = 32; i < rgba.size(); i += 4) {
+        const double alpha = static_cast<double>(rgba[i + 3]);
+        wrong += std::abs(straight[i + 3] - 255 * alpha) > 0.5 + 1e-9;
+        for (std::size_t c = i; c < i + 3; ++c) {
+            const double color = std::min(static_cast<double>(rgba[c]) / alpha, 1.0);
+            // The nearest level: the curve above is good to 1e-9 levels, but for a kink of 1e-6 at its foot.
+            wrong += std::abs(straight[c] - 255 * srgbOf(color)) > 0.5 + 1e-5;
+        }
+    }
+    CHECK(wrong == 0);
+}
+
+TEST_CASE("Dithered colours with alpha keep their mean, also below alpha", "[output]")
+{
+    // Colours of one value each in 8x8 pixels: their mean in light is within 1/64 of a level of the colour.
+    const int width = 64, height = 8;
+    for (const float alpha : {1.0f, 0.7f, 0.25f}) {
+        std::vector<float> rgba;
+        for (int y = 0; y < height; ++y)
+            for (int x = 0; x < width; ++x)
+                for (const float color : {0.3f, 0.01f * static_cast<float>(x / 8), 0.9f, 1.0f})
+                    rgba.push_back(alpha * color);
+        const auto straight = straightPixels(width, height, rgba.data(), true);
+        for (int block = 0; block < 8; ++block)
+            for (std::size_t c = 0; c < 3; ++c) {
+                double mean = 0;
+                int least = 255, most = 0;
+                for (int y = 0; y < 8; ++y)
+                    for (int x = 0; x < 8; ++x) {
+                        const int level = straight[4 * static_cast<std::size_t>(y * width + 8 * block + x) + c];
+                        mean += linearOf(level / 255.0) / 64;
+                        least = std::min(least, level);
+                        most = std::max(most, level);
+                    }
+                const std::size_t first = 4 * static_cast<std::size_t>(8 * block);
+                CHECK(straight[first + 3] == static_cast<int>(std::lround(255 * static_cast<double>(alpha))));
+                const double color = static_cast<double>(rgba[first + c]) / static_cast<double>(rgba[first + 3]);
+                const double step = linearOf(most / 255.0) - linearOf(least / 255.0);
+                CHECK(most - least <= 1);
+                CHECK(std::abs(mean - color) <= step / 64 + 1e-6);
+            }
+    }
 }
 
 TEST_CASE("The hash is that of the floats", "[output]")
@@ -186,16 +266,43 @@ TEST_CASE("The statistics have every field that a reader of them looks for", "[o
     CHECK(json.at("height") == 480);
     CHECK(json.at("image_hash") == "00ff00ff00ff00ff");
     CHECK(json.at("mean_alpha") == 0.25);
+    CHECK(json.at("version") == "1.2.3");
+    CHECK(json.at("scene") == nlohmann::json{"a.ply", "b.xyz"});
+    CHECK(json.at("options").at("spp") == 4);
+    CHECK(json.at("options").at("mode") == "data");
+    CHECK(json.at("options").at("opacity") == 0.6);
+    CHECK(json.at("options").at("dither") == true);
+    CHECK(json.at("options").at("size") == "640x480");
+    CHECK(json.at("threads_of_ranks") == nlohmann::json{2, 3, 2});
+    CHECK(json.at("bytes_read_of_ranks") == nlohmann::json{100, 5000000000u, 0});
+    CHECK(json.at("slowest_rank") == 1);
+    CHECK(json.at("total_ms") == 95);
+    CHECK(json.at("load_ms") == 30);
+    CHECK(json.at("render_ms") == 50.5);
+    CHECK(json.at("compositing_ms") == 14.5);
+    CHECK(json.at("write_ms") == 0);
+    CHECK(json.at("total_ms_of_ranks") == nlohmann::json{95, 95, 95});
+    CHECK(json.at("load_ms_of_ranks") == nlohmann::json{10, 30, 1});
+    CHECK(json.at("render_ms_of_ranks") == nlohmann::json{20, 50.5, 2});
+    CHECK(json.at("compositing_ms_of_ranks") == nlohmann::json{60, 14.5, 92});
+    CHECK(json.at("write_ms_of_ranks") == nlohmann::json{5, 0, 0});
     REQUIRE(json.at("frames").is_array());
     REQUIRE(json.at("frames").size() == 2);
     for (const auto& frame : json.at("frames"))
-        for (const char* name : {"total_ms", "render_ms_max", "compositing_overhead_ms", "bytes_sent", "messages_sent",
+        for (const char* name : {"total_ms", "render_ms", "compositing_ms", "write_ms", "bytes_sent", "messages_sent",
                                  "tiles_total", "tiles_touched", "peak_memory_bytes"})
             CHECK(frame.at(name).is_number());
     const auto& frame = json.at("frames").at(1);
-    CHECK(frame.at("total_ms") == 12.5);
-    CHECK(frame.at("render_ms_max") == 10.25);
-    CHECK(frame.at("compositing_overhead_ms") == 1.125);
+    CHECK(frame.at("slowest_rank") == 0);
+    CHECK(frame.at("total_ms") == 13.375);
+    CHECK(frame.at("render_ms") == 10.25);
+    CHECK(frame.at("compositing_ms") == 1.125);
+    CHECK(frame.at("write_ms") == 2);
+    CHECK(frame.at("total_ms_of_ranks") == nlohmann::json{13.375, 11.5, 11.25});
+    CHECK(frame.at("render_ms_of_ranks") == nlohmann::json{10.25, 1, 2});
+    CHECK(frame.at("compositing_ms_of_ranks") == nlohmann::json{1.125, 10.5, 9.25});
+    CHECK(frame.at("tiles_rendered") == nlohmann::json{5, 7, 0});
+    CHECK(frame.at("work_of_ranks") == nlohmann::json{600, 800, 0});
     CHECK(frame.at("bytes_sent") == 5000000000u);
     CHECK(frame.at("messages_sent") == 77);
     CHECK(frame.at("tiles_total") == 80);
@@ -218,7 +325,7 @@ TEST_CASE("What can not be written is an error that names the file", "[output]")
         const std::string why = path + ": cannot be written: ";
         CHECK(isLineWith(errorOf([&] { writePfm(path, 64, 64, rgba.data()); }), why));
         CHECK(isLineWith(errorOf([&] { writeGreyPfm(path, 64, 64, rgba.data(), 4); }), why));
-        CHECK(isLineWith(errorOf([&] { writePng(path, 64, 64, srgba.data()); }), why));
+        CHECK(isLineWith(errorOf([&] { writePng(path, 64, 64, srgba.data(), true); }), why));
         CHECK(isLineWith(errorOf([&] { writeStats(path, someStats()); }), why));
         if (path != full)
             CHECK(isLineWith(errorOf([&] { requireWritable(path); }), why));

@@ -1,5 +1,6 @@
 // What a rank holds of a scene, and what it tells the user of it.
 #include "support.hpp"
+#include "together.hpp"
 
 #include <rank_scene.hpp>
 
@@ -35,15 +36,16 @@ TEST_CASE("All ranks have the same notes for the user", "[scene]")
     const test::TemporaryFolder folder;
     const std::string blank = folder.write("blank_4x4x4_uint8.raw", std::string(64, '\0')),
                       atoms = folder.write("atoms.xyz", "2\n\nXx 0 0 0\nXx 9 9 9\n");
+    const Options both = optionsFor({blank, atoms});
     for (const int ranks : {1, 3})
-        for (int rank = 0; rank < ranks; ++rank) {
-            const Notes notes = loadRankScene(optionsFor({blank, atoms}), rank, ranks).notes;
+        for (const Notes& notes : test::ofRanks<Notes>(
+                 ranks, [&](const Loaders& loaders) { return loadRankScene(both, loaders).notes; })) {
             REQUIRE(notes.size() == 2);
             CHECK(test::contains(notes[0], "blank_4x4x4_uint8.raw: there is nothing to see"));
             CHECK(test::contains(notes[1], "Xx (2)"));
         }
-    CHECK(loadRankScene(optionsFor({"demo"}), 0, 2).notes.empty());
-    CHECK(loadRankScene(optionsFor({"synthetic"}), 0, 2).notes.empty());
+    CHECK(loadRankScene(optionsFor({"demo"}), {}).notes.empty());
+    CHECK(loadRankScene(optionsFor({"synthetic"}), {}).notes.empty());
 }
 
 TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
@@ -53,7 +55,7 @@ TEST_CASE("Path tracing says that it leaves volumes out", "[scene]")
                       mesh = folder.write("mesh.obj", tetrahedron);
     const auto notesOf = [](std::vector<std::string> words) {
         words.insert(words.end(), {"--mode", "image"});
-        return loadRankScene(optionsFor(words), 0, 1).notes;
+        return loadRankScene(optionsFor(words), {}).notes;
     };
     REQUIRE(notesOf({volume, "--path", "2"}).size() == 1);
     CHECK(test::contains(notesOf({volume, "--path", "2"})[0], "nothing to see"));
@@ -70,7 +72,7 @@ TEST_CASE("The frame of an XYZ file is that of the option", "[scene]")
     const std::string file = folder.write("a.xyz", "1\n\nC 0 0 0\n1\n\nC 7 0 0\n");
     const auto centerOf = [&](std::vector<std::string> words) {
         words.insert(words.end(), {file, "--no-fit"});
-        return loadRankScene(optionsFor(words), 0, 1).info.bounds.center().x;
+        return loadRankScene(optionsFor(words), {}).info.bounds.center().x;
     };
     CHECK(centerOf({}) == 0.0f);
     CHECK(centerOf({"--xyz-frame", "1"}) == 0.0f);

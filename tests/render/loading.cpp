@@ -1,0 +1,192 @@
+// Loading a scene together: each rank reads a part of the files, and all come to what one rank alone comes to.
+#include "support.hpp"
+#include "together.hpp"
+
+#include <scene.hpp>
+
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <random>
+#include <string>
+#include <vector>
+
+using namespace example;
+using test::contains;
+using test::errorOf;
+using test::ofRanks;
+
+namespace {
+
+template <class T>
+std::string bytesOf(const std::vector<T>& values)
+{
+    return std::string(reinterpret_cast<const char*>(values.data()), values.size() * sizeof(T));
+}
+
+std::string describe(const VolumeSource& source)
+{
+    std::string text = std::to_string(source.info.minimum) + " to " + std::to_string(source.info.maximum) + ", "
+                       + std::to_string(source.info.notFinite) + " not finite, "
+                       + std::to_string(source.visible.value().slack);
+    for (const Vec3& p : source.visible->points)
+        text += ", " + std::to_string(p.x) + ' ' + std::to_string(p.y) + ' ' + std::to_string(p.z);
+    if (source.range)
+        text += "; " + std::to_string((*source.range)[0]) + " to " + std::to_string((*source.range)[1]);
+    return text;
+}
+
+const char* const plainObj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n";
+
+} // namespace
+
+TEST_CASE("Shares are equal runs that are all of it", "[loading]")
+{
+    for (const int size : {1, 2, 3, 7})
+        for (const std::uint64_t count :
+             {std::uint64_t{0}, std::uint64_t{1}, std::uint64_t{5}, std::uint64_t{7000}, std::uint64_t{1} << 60}) {
+            std::uint64_t next = 0;
+            for (int rank = 0; rank < size; ++rank) {
+                const auto [begin, end] = Loaders(rank, size, {}).shareOf(count);
+                CHECK(begin == next);
+                CHECK(end - begin >= count / static_cast<std::uint64_t>(size));
+                CHECK(end - begin <= count / static_cast<std::uint64_t>(size) + 1);
+                next = end;
+            }
+            CHECK(next == count);
+        }
+}
+
+TEST_CASE("A volume is the same for any number of ranks, and none reads more than its part", "[loading]")
+{
+    const test::TemporaryFolder folder;
+    std::mt19937 random(3);
+    const Index3 d{20, 70, 130}; // a lattice of every 1st, 2nd and 3rd voxel
+    const std::size_t count = 20 * 70 * 130;
+    std::vector<std::uint8_t> bytes(count);
+    std::vector<std::uint16_t> shorts(count);
+    std::vector<float> floats(count);
+    for (std::size_t i = 0; i < count; ++i) {
+        const bool inside = i % 20 > 3 && i % 20 < 12 && i / 1400 > 30 && i / 1400 < 70;
+        const unsigned noise = static_cast<unsigned>(random());
+        bytes[i] = static_cast<std::uint8_t>(inside ? 40 + noise % 200 : noise % 20);
+        shorts[i] = static_cast<std::uint16_t>(500 + bytes[i]);
+        floats[i] = static_cast<float>(bytes[i]) - 10.5f;
+    }
+    shorts[count / 3] = 100; // the least and the greatest are parts of different ranks
+    shorts[count - 1] = 1200;
+    floats[7] = std::numeric_limits<float>::quiet_NaN();
+    floats[count - 2] = 1e6f;
+    floats[count / 2] = -1e6f;
+    const std::vector<std::string> files{folder.write("b_20x70x130_uint8.raw", bytesOf(bytes)),
+                                         folder.write("s_20x70x130_uint16.raw", bytesOf(shorts)),
+                                         folder.write("f_20x70x130_float32.raw", bytesOf(floats))};
+    for (const std::string& file : files) {
+        INFO(file);
+        const VolumeSource whole = openVolume(file);
+        const std::string alone = describe(whole);
+        const std::size_t size = std::filesystem::file_size(file), rows = size / (70 * 130);
+        for (const int ranks : {1, 2, 3, 5}) {
+            std::vector<std::uint64_t> read(static_cast<std::size_t>(ranks)), withBlocks = read;
+            const auto texts = ofRanks<std::string>(ranks, [&](const Loaders& loaders) {
+                const auto rank = static_cast<std::size_t>(loaders.rank());
+                const VolumeSource source = openVolume(file, loaders);
+                read[rank] = loaders.bytesRead();
+                // A brick, and one with ghosts beyond the volume.
+                const int z = d[2] * loaders.rank() / ranks, end = d[2] * (loaders.rank() + 1) / ranks;
+                const VoxelBlock block(source, {2, 5, z}, {9, 50, end});
+                const VoxelBlock ghosts(source, {-1, -1, -1}, {d[0] + 2, d[1] + 2, d[2] + 2});
+                const std::size_t voxels = static_cast<std::size_t>(7 * 45 * (end - z)) + count;
+                withBlocks[rank] = loaders.bytesRead() - voxels * voxelBytes(source.info.type);
+                return describe(source);
+            });
+            const std::uint64_t lattice = 35 * 44 * rows,
+                                all = lattice + (contains(file, "uint8") ? 0 : size) + (whole.range ? size : 0);
+            std::uint64_t sum = 0;
+            for (std::size_t rank = 0; rank < texts.size(); ++rank) {
+                CHECK(texts[rank] == alone);
+                CHECK(read[rank] == withBlocks[rank]);
+                // A row of the lattice more or less, a voxel, and a row where nothing is visible.
+                CHECK(read[rank] <= all / static_cast<std::uint64_t>(ranks) + 2 * rows + 4);
+                sum += read[rank];
+            }
+            CHECK(sum == all);
+        }
+    }
+}
+
+TEST_CASE("Meshes and spheres are read by one rank alone", "[loading]")
+{
+    const test::TemporaryFolder folder;
+    std::string atoms = "160000\n\n";
+    for (int i = 0; i < 160000; ++i) // of more than one message
+        atoms += (i % 3 == 0 ? "C " : "O ") + std::to_string(i % 1009) + ' ' + std::to_string(i % 887) + " 0.5\n";
+    const std::vector<std::string> files{folder.write("m.obj", plainObj), folder.write("s.xyz", atoms)};
+    Scene alone;
+    for (const std::string& file : files)
+        addFile(alone, file, true);
+    for (const int ranks : {2, 3}) {
+        std::vector<std::uint64_t> read(static_cast<std::size_t>(ranks));
+        const auto scenes = ofRanks<Scene>(ranks, [&](const Loaders& loaders) {
+            Scene scene;
+            for (const std::string& file : files)
+                addFile(scene, file, true, 0, loaders);
+            read[static_cast<std::size_t>(loaders.rank())] = loaders.bytesRead();
+            return scene;
+        });
+        CHECK(read.front() == atoms.size() + std::string(plainObj).size());
+        CHECK(read.back() == 0);
+        for (const Scene& scene : scenes) {
+            REQUIRE(scene.meshes.size() == 1);
+            CHECK(scene.meshes[0].mesh.triangles == alone.meshes[0].mesh.triangles);
+            const auto same = [](const auto& a, const auto& b) {
+                return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof a[0]) == 0;
+            };
+            CHECK(same(scene.meshes[0].mesh.positions, alone.meshes[0].mesh.positions));
+            CHECK(same(scene.meshes[0].normals, alone.meshes[0].normals));
+            REQUIRE(scene.spheres.size() == 1);
+            CHECK(same(scene.spheres[0].spheres, alone.spheres[0].spheres));
+        }
+    }
+}
+
+TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
+{
+    const test::TemporaryFolder folder;
+    const std::string good = folder.write("g_2x3x4_uint16.raw", std::string(48, 'g'));
+    const std::string missing = folder / "m_2x3x4_uint16.raw";
+    for (const int first : {0, 1, 2}) { // from this rank on
+        const auto errors = ofRanks<std::string>(3, [&](const Loaders& loaders) {
+            return errorOf([&] {
+                Scene scene;
+                addFile(scene, good, true, 0, loaders);
+                addFile(scene, loaders.rank() >= first ? missing : good, true, 0, loaders);
+                addFile(scene, good, true, 0, loaders);
+            });
+        });
+        for (const std::string& error : errors)
+            CHECK(error == missing + ": cannot be opened");
+    }
+    // Of a file that rank 0 alone reads.
+    const std::string mesh = folder.write("m.obj", "v 0 0 0\nf 1 2 3\n");
+    for (const std::string& file : {mesh, folder / "none.ply", folder / "none.xyz"}) {
+        const std::string alone = errorOf([&] {
+            Scene scene;
+            addFile(scene, file, true);
+        });
+        CHECK(contains(alone, file));
+        for (const std::string& error : ofRanks<std::string>(2, [&](const Loaders& loaders) {
+                 return errorOf([&] {
+                     Scene scene;
+                     addFile(scene, file, true, 0, loaders);
+                 });
+             }))
+            CHECK(error == alone);
+    }
+    // No voxel is finite, on any rank.
+    const std::vector<float> nan(24, std::numeric_limits<float>::quiet_NaN());
+    const std::string none = folder.write("n_2x3x4_float32.raw", bytesOf(nan));
+    for (const std::string& error :
+         ofRanks<std::string>(3, [&](const Loaders& loaders) { return errorOf([&] { openVolume(none, loaders); }); }))
+        CHECK(contains(error, none + ": not one of its voxels is finite"));
+}

@@ -1,0 +1,67 @@
+// Threads that load a scene together, each as a rank.
+#pragma once
+
+#include <loaders.hpp>
+
+#include <condition_variable>
+#include <functional>
+#include <mutex>
+#include <thread>
+#include <vector>
+
+namespace test {
+
+// Threads that exchange bytes: each gets those of all.
+class Exchange {
+public:
+    explicit Exchange(int size) : parts_(static_cast<std::size_t>(size)) {}
+
+    std::vector<example::Loaders::Bytes> gather(int rank, const example::Loaders::Bytes& own)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        parts_[static_cast<std::size_t>(rank)] = own;
+        const int round = round_;
+        if (++there_ == static_cast<int>(parts_.size())) {
+            there_ = 0;
+            all_ = parts_;
+            ++round_;
+            changed_.notify_all();
+        } else {
+            changed_.wait(lock, [&] { return round_ != round; });
+        }
+        return all_; // nobody writes the next round's before all have left this one and come again
+    }
+
+private:
+    std::mutex mutex_;
+    std::condition_variable changed_;
+    std::vector<example::Loaders::Bytes> parts_, all_;
+    int there_ = 0, round_ = 0;
+};
+
+// Calls `function` with the loaders of each of `size` ranks at the same time.
+inline void together(int size, const std::function<void(const example::Loaders&)>& function)
+{
+    Exchange exchange(size);
+    std::vector<std::thread> threads;
+    for (int rank = 0; rank < size; ++rank)
+        threads.emplace_back([&, rank] {
+            const auto gather = [&, rank](const example::Loaders::Bytes& own) { return exchange.gather(rank, own); };
+            function(example::Loaders(rank, size, gather));
+        });
+    for (std::thread& thread : threads)
+        thread.join();
+}
+
+// What each rank says, by rank.
+template <class Value>
+std::vector<Value> ofRanks(int size, const std::function<Value(const example::Loaders&)>& function)
+{
+    std::vector<Value> values(static_cast<std::size_t>(size));
+    together(size, [&](const example::Loaders& loaders) {
+        values[static_cast<std::size_t>(loaders.rank())] = function(loaders);
+    });
+    return values;
+}
+
+} // namespace test
