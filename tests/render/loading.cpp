@@ -11,6 +11,8 @@
 #include <string>
 #include <vector>
 
+namespace loading_cases {
+
 using namespace example;
 using test::contains;
 using test::errorOf;
@@ -190,3 +192,5 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
          ofRanks<std::string>(3, [&](const Loaders& loaders) { return errorOf([&] { openVolume(none, loaders); }); }))
         CHECK(contains(error, none + ": not one of its voxels is finite"));
 }
+
+} // namespace loading_cases
