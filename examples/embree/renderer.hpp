@@ -68,6 +68,8 @@ public:
         : settings_(settings), scene_(scene), cell_(brick.cell),
           surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres)), mostHits_(mostHits(settings))
     {
+        looksAhead_ = ghostReach(scene, settings) > 0 && mostHits_ < std::numeric_limits<std::size_t>::max()
+                      && !(cell_ == scene.bounds);
         volumes_.reserve(brick.volumes.size());
         for (BrickVolume& volume : brick.volumes)
             volumes_.emplace_back(std::move(volume), scene.step);
@@ -188,7 +190,7 @@ private:
         if (settings.pathBounces > 0)
             return 1;
         double through = 1; // reckoned as in Accumulator
-        for (std::size_t hits = 1; hits <= 1000; ++hits) {
+        for (std::size_t hits = 1; hits <= 100; ++hits) {
             through *= 1 - static_cast<double>(settings.opacity);
             if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
                 return hits;
@@ -205,7 +207,7 @@ private:
         const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
         const Camera& view = camera.pose();
         const Light light{normalize(view.forward * -0.75f + view.up * 0.55f + view.right * -0.40f)};
-        std::vector<Hit> hits;
+        std::vector<Hit> hits, scratch;
         std::vector<VolumeRay> rays(volumes_.size());
         std::int64_t cost = 0;
         for (int y = to.region.y0; y < to.region.y1; ++y)
@@ -214,7 +216,7 @@ private:
                 Vec3 origin, direction;
                 if (!camera.ray(sample.x, sample.y, sample.lens, origin, direction))
                     continue;
-                const Accumulator sum = trace(origin, direction, light, sample.key, hits, rays);
+                const Accumulator sum = trace(origin, direction, light, sample.key, hits, scratch, rays);
                 cost += sum.cost;
                 if (sum.alpha == 0)
                     continue;
@@ -339,7 +341,7 @@ private:
     }
 
     Accumulator trace(const Vec3& origin, const Vec3& direction, const Light& light, std::uint64_t key,
-                      std::vector<Hit>& hits, std::vector<VolumeRay>& rays) const
+                      std::vector<Hit>& hits, std::vector<Hit>& scratch, std::vector<VolumeRay>& rays) const
     {
         Accumulator sum;
         const Vec3 inverse(1 / direction.x, 1 / direction.y, 1 / direction.z);
@@ -352,6 +354,11 @@ private:
         surfaces_.intersect(origin, direction, hits, mostHits_);
         if (hits.size() == mostHits_)
             leave = std::min(leave, hits.back().t);
+        if (looksAhead_ && !hits.empty()) {
+            ++sum.cost;
+            if (surfaces_.blocks(origin, direction, enter, mostHits_, scratch))
+                return sum;
+        }
         if (settings_.pathBounces > 0) {
             if (hits.empty())
                 return sum;
@@ -438,6 +445,8 @@ private:
     Box cell_;
     Surfaces surfaces_;
     std::size_t mostHits_;
+    // Whether hits are left out that ghosts hide, which other bricks show: one ray instead of those of each hit.
+    bool looksAhead_ = false;
     std::vector<VolumeSampler> volumes_;
 };
 

@@ -73,31 +73,21 @@ public:
     void intersect(const Vec3& origin, const Vec3& direction, std::vector<Hit>& hits,
                    std::size_t most = std::numeric_limits<std::size_t>::max()) const
     {
-        hits.clear();
-        if (empty() || most == 0)
-            return;
         Query query;
-        query.origin = origin;
-        query.direction = direction;
         query.cell = &cell_;
-        query.hits = &hits;
-        query.most = most;
-        query.mayEnd = meshes_.empty();
-        RTCRayHit ray{};
-        ray.ray = rayOf(origin, direction, std::numeric_limits<float>::infinity());
-        ray.hit.geomID = RTC_INVALID_GEOMETRY_ID;
-#if RTC_VERSION_MAJOR >= 4
-        rtcInitRayQueryContext(&query.context);
-        RTCIntersectArguments arguments;
-        rtcInitIntersectArguments(&arguments);
-        arguments.context = &query.context;
-        rtcIntersect1(scene_.get(), &ray, &arguments);
-#else
-        rtcInitIntersectContext(&query.context);
-        rtcIntersect1(scene_.get(), &query.context, &ray);
-#endif
+        query.farthest = std::numeric_limits<float>::infinity();
+        find(query, origin, direction, hits, most);
     }
 
+    // Whether a ray meets `most` surfaces, 1 or more, before a distance, in the cell or not. `hits` is for its own use.
+    // From any thread.
+    bool blocks(const Vec3& origin, const Vec3& direction, float before, std::size_t most, std::vector<Hit>& hits) const
+    {
+        Query query;
+        query.farthest = before;
+        find(query, origin, direction, hits, most);
+        return hits.size() == most;
+    }
     // Whether anything is on the ray between two distances, in the cell or not. From any thread.
     bool occluded(const Vec3& origin, const Vec3& direction, float from, float to) const
     {
@@ -123,6 +113,33 @@ public:
     }
 
 private:
+    struct Query;
+
+    void find(Query& query, const Vec3& origin, const Vec3& direction, std::vector<Hit>& hits, std::size_t most) const
+    {
+        hits.clear();
+        if (empty() || most == 0)
+            return;
+        query.origin = origin;
+        query.direction = direction;
+        query.hits = &hits;
+        query.most = most;
+        query.mayEnd = meshes_.empty();
+        RTCRayHit ray{};
+        ray.ray = rayOf(origin, direction, 1.001f * query.farthest); // it is our own distance that decides
+        ray.hit.geomID = RTC_INVALID_GEOMETRY_ID;
+#if RTC_VERSION_MAJOR >= 4
+        rtcInitRayQueryContext(&query.context);
+        RTCIntersectArguments arguments;
+        rtcInitIntersectArguments(&arguments);
+        arguments.context = &query.context;
+        rtcIntersect1(scene_.get(), &ray, &arguments);
+#else
+        rtcInitIntersectContext(&query.context);
+        rtcIntersect1(scene_.get(), &query.context, &ray);
+#endif
+    }
+
     static RTCRay rayOf(const Vec3& origin, const Vec3& direction, float farthest)
     {
         RTCRay ray{};
@@ -146,7 +163,8 @@ private:
     struct Query {
         Context context;
         Vec3 origin, direction;
-        const Box* cell = nullptr;
+        const Box* cell = nullptr;        // hits elsewhere do not count; null: they do
+        float farthest = 0;               // nor do hits from here on
         std::vector<Hit>* hits = nullptr; // front to back
         std::size_t most = 0;
         // Embree need not look behind the last of `most` hits. Not with triangles: their distances, which Embree then
@@ -158,8 +176,8 @@ private:
         void keep(double distance, Hit hit) const
         {
             hit.t = static_cast<float>(distance);
-            if (!(hit.t > 0) || (isFull() && hits->back().t < hit.t)
-                || !cell->contains(pointAt(origin, direction, hit.t)))
+            if (!(hit.t > 0 && hit.t < farthest) || (isFull() && hits->back().t < hit.t)
+                || (cell && !cell->contains(pointAt(origin, direction, hit.t))))
                 return;
             // Embree goes roughly front to back, so the place is near the end.
             auto at = hits->end();

@@ -130,6 +130,12 @@ struct Box {
     }
 };
 
+inline bool operator==(const Box& a, const Box& b)
+{
+    return a.lo.x == b.lo.x && a.lo.y == b.lo.y && a.lo.z == b.lo.z && a.hi.x == b.hi.x && a.hi.y == b.hi.y
+           && a.hi.z == b.hi.z;
+}
+
 inline Box intersection(const Box& a, const Box& b)
 {
     Box box;
