@@ -187,7 +187,7 @@ struct NoPrecision {
         refuses("error budget", [&](auto& c) { c.wire.maxColor = nan; });
         refuses("least transmittance", [&](auto& c) { c.minTransmittance = nan; });
         if (size > 1)
-            refuses("configured differently", [&, rank = rank](auto& c) {
+            refuses("wire.color is float32 on rank 0 and float16 on rank 1", [&, rank = rank](auto& c) {
                 if (rank == 1)
                     c.wire.color = dfb::WireFormat::Float16;
             });

@@ -189,7 +189,7 @@ struct Reset {
             sampler.reset();
         const std::string outcome = scene::outcomeOf(render);
         if (fb.size() > 1) {
-            result.expect(scene::has(outcome, "different parameters"), "the rank was not found: " + outcome);
+            result.expect(scene::has(outcome, "FrameParams::samples"), "the rank was not found: " + outcome);
             if (fb.rank() != 0) {
                 const std::string goingOn = scene::outcomeOf(render);
                 result.expect(scene::has(goingOn, "begin again with sample 0"), "goes on after a failure: " + goingOn);

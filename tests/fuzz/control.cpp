@@ -93,19 +93,19 @@ void manifests(const std::string& bytes)
     d::ManifestExchange exchange;
     const auto isMine = [](int tile) { return tile >= 0 && tile < 6 && tile % 2 == 0; };
     const bool good = !refused([&] { exchange.receive(1, d::ByteReader(fuzz::bytesOf(bytes), bytes.size()), isMine); });
+    int sent = 0;
+    const bool isWaiting = exchange.declare(
+        {{1, 5, 0}, {3, 7, 1}}, 0, [](int tile) { return tile % 2; },
+        [&](int owner, const Bytes& manifest) { sent += owner == 1 && manifest.size() == 20; });
+    fuzz::require(isWaiting && sent == 1 && refused([&] { exchange.acknowledged(0); }), "only who was asked answers");
+    fuzz::require(exchange.acknowledged(1) && refused([&] { exchange.acknowledged(1); }), "and once");
+    exchange.complete();
     std::size_t inputs = 0;
     for (const d::ExpectedInput& input : exchange.expected()) {
         fuzz::require(isMine(input.tile), "a manifest is of this rank's tiles");
         ++inputs;
     }
     fuzz::require(!good || inputs * 10 == bytes.size(), "each input is taken once");
-    int sent = 0;
-    exchange.split(
-        {{1, 5, 0}, {2, 6, 0}, {3, 7, 1}}, 0, [](int tile) { return tile % 2; },
-        [&](int owner, const Bytes& manifest) { sent += owner == 1 && manifest.size() == 20; });
-    fuzz::require(sent == 1 && refused([&] { exchange.acknowledged(0); }), "only who was asked answers");
-    fuzz::require(exchange.acknowledged(1) && refused([&] { exchange.acknowledged(1); }), "and once");
-    exchange.complete();
     fuzz::require(refused([&] { exchange.receive(1, d::ByteReader(nullptr, 0), isMine); }), "none comes later");
 }
 

@@ -430,24 +430,26 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
         options.peerTimeoutMs = peerTimeoutMs;
         FrameBuffer<Blend> fb(communicator, configOf(s), options);
         const auto rank = static_cast<std::size_t>(fb.rank());
-        const auto frame = [&](int limit) {
+        const auto frame = [&](const Scene& shown, int limit) {
             return outcomeOf([&] {
-                Scene timed = s;
+                Scene timed = shown;
                 timed.timeoutMs = limit;
                 const auto report = scene::renderLoop(fb, timed, Loop::Declared);
                 if (fb.isDisplayRank())
-                    result.wrong += scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+                    result.wrong += scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(shown));
             });
         };
-        result.before[rank] = frame(20000);
+        Scene nothing = s; // so that the next frame's inputs have to be declared
+        nothing.bricks.clear();
+        result.before[rank] = frame(nothing, 20000);
         // Nobody is still in that frame, and a message that comes early is for the next.
         armed = true;
         if (--notReady == 0)
             mayGoOn.set_value();
         mayGoOnFuture.wait();
-        result.texts[rank] = frame(timeoutMs);
+        result.texts[rank] = frame(s, timeoutMs);
         // After a TransportError there is no other frame, on any rank.
-        result.after[rank] = has(result.texts[rank], "TransportError") ? "" : frame(20000);
+        result.after[rank] = has(result.texts[rank], "TransportError") ? "" : frame(s, 20000);
     });
     result.done = done;
     return result;
@@ -646,8 +648,12 @@ public:
     void send(int to, dfb::Buffer&& message)
     {
         auto header = dfb::detail::loadAs<MessageHeader>(message.data());
+        if (hasSentBoth_) { // that input has had a number of its own
+            ++header.sequence;
+            std::memcpy(message.data(), &header, sizeof header);
+        }
         inner_.send(to, std::move(message));
-        if (rank() != 1 || header.kind != MessageKind::ReduceUp)
+        if (rank() != 1 || header.kind != MessageKind::ReduceUp || std::exchange(hasSentBoth_, true))
             return;
         header.kind = MessageKind::Fragment;
         header.number = 1;
@@ -663,6 +669,7 @@ public:
 
 private:
     std::shared_ptr<dfb::MemoryPool> pool_ = dfb::MemoryPool::create(false);
+    bool hasSentBoth_ = false;
 };
 
 } // namespace

@@ -71,8 +71,13 @@ struct FrameTerms {
         };
         compare("background", background, o.background, backgroundText);
         number("passes", &FrameTerms::passes);
-        compare("samples", samplesHash, o.samplesHash, [](const FrameTerms& t) {
-            return t.samplesHash == 0 ? "null" : "a plan of " + std::to_string(t.sampleCount) + " samples";
+        compare("samples", samplesHash, o.samplesHash, [&](const FrameTerms& t) {
+            if (t.samplesHash == 0)
+                return std::string("null");
+            std::string plan = "a plan of " + std::to_string(t.sampleCount) + " samples";
+            if (samplesHash != 0 && o.samplesHash != 0) // two plans may have equally many
+                plan += " with hash " + std::to_string(t.samplesHash);
+            return plan;
         });
         number("maxLayers", &FrameTerms::maxLayers);
         number("accumulationId", &FrameTerms::accumulationId);
