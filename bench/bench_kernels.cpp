@@ -263,11 +263,6 @@ Function blending(int count, OutputFormat format, Depths depths, From from)
     };
 }
 
-std::string nameOf(OutputFormat format)
-{
-    return format == OutputFormat::RGBA8 ? "RGBA8" : format == OutputFormat::SRGBA8 ? "SRGBA8" : "RGBA32F";
-}
-
 std::string inputsOf(int count, int side, OutputFormat format, From from)
 {
     return std::to_string(count) + " x " + std::to_string(side) + "² to " + nameOf(format) + nameOf(from);

@@ -566,11 +566,14 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     };
     const std::string wallVote =
         of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "", 1}.bytes()), ToAnother);
-    const auto frameOf = [&](Way way) {
+    const auto frameOf = [&](Way way, bool isFirst = true) {
         std::string text = inputs(way);
         if (way.has(Declared)) {
-            text = of(MessageKind::Manifest, Output().put(2).put(9u).put(std::uint16_t{0}).bytes());
-            text += of(MessageKind::ManifestAck, "") + of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}));
+            text.clear();
+            if (isFirst || way.engineCount() > 1) // what it has declared holds in the engine's next frame
+                text += of(MessageKind::Manifest, Output().put(2).put(9u).put(std::uint16_t{0}).bytes())
+                        + of(MessageKind::ManifestAck, "");
+            text += of(MessageKind::ReduceUp, reductionOf(AllDeclared, {}));
             text += of(MessageKind::Fragment, inputOf(way, 2, true));
         }
         if (!way.has(DisplayElsewhere) && !way.has(Wall)) {
@@ -583,7 +586,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     };
     const auto addFrames = [&](Way way) {
         add("frame_" + std::to_string(way.flags) + (way.rest ? "_" + std::to_string(way.rest) : ""), way,
-            frameOf(way) + frameOf(way));
+            frameOf(way) + frameOf(way, false));
         require(play(Input(all.back().second)) == 2, "both frames end well");
     };
     for (const int flags :

@@ -75,7 +75,7 @@ struct FrameTerms {
             if (t.samplesHash == 0)
                 return std::string("null");
             std::string plan = "a plan of " + std::to_string(t.sampleCount) + " samples";
-            if (samplesHash != 0 && o.samplesHash != 0) // two plans may have equally many
+            if (sampleCount == o.sampleCount) // else that tells them apart
                 plan += " with hash " + std::to_string(t.samplesHash);
             return plan;
         });
