@@ -84,7 +84,7 @@ struct PartialFrames {
             int lost = 0;
             while (dfb::intersection(box, fb.layout().region(lost)).empty())
                 ++lost;
-            constexpr int never = 20000, soon = 1000; // ms; enough for all but what is missing, on a busy machine
+            constexpr int never = 20000, soon = 2000; // ms; enough for all but what is missing, on a busy machine
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
                 params.timeoutMs = timeoutMs;
                 return dfb::renderDataParallel(fb, dfb::World(mine), scene::FlatCamera(), render, params, fails);
