@@ -6,8 +6,8 @@
 #include <future>
 #include <vector>
 
-// With all numbers of ranks at once, for a case that mostly waits; one after the other under ThreadSanitizer, with which
-// it mostly computes.
+// With all numbers of ranks at once, for a case that mostly waits; one after the other under ThreadSanitizer, with
+// which it mostly computes.
 template <class Case>
 void everywhereAtOnce()
 {
