@@ -1272,8 +1272,8 @@ void sendOwned(Fb& fb, Frame& frame)
         send(frame, *tile, index, 0, 0, 0, 0);
 }
 
-// How a partial frame of two ranks ended, and the one after it. On rank 0 a tile is given up first, then `more(frame)`
-// happens; `params(rank)` says with what it begins.
+// How a partial frame of two ranks ended, and the one after it. Rank 0 gives up a tile, then all call `more(frame, rank)`;
+// `params(rank)` says with what a rank begins.
 template <class Params, class More>
 std::vector<std::string> partialFrame(const Params& params, const More& more)
 {
@@ -1284,13 +1284,9 @@ std::vector<std::string> partialFrame(const Params& params, const More& more)
         const std::string text = outcomeOf([&] {
             auto frame = fb.begin(params(fb.rank()));
             sendOwned(fb, frame);
-            if (fb.rank() == 0) {
+            if (fb.rank() == 0)
                 frame.abort(std::make_exception_ptr(std::runtime_error("no such brick")), 0);
-                more(frame);
-            } else {
-                while (!frame.failed())
-                    std::this_thread::yield();
-            }
+            more(frame, fb.rank());
             const auto report = frame.end();
             failure = report.failure ? ", " + report.failure->describe() : "";
         });
@@ -1314,7 +1310,12 @@ TEST_CASE("What ends a partial frame is told to all ranks, also after an error t
         p.timeoutMs = 20000;
         return p;
     };
-    const auto texts = partialFrame(params, [](auto& frame) { frame.cancel(); });
+    const auto texts = partialFrame(params, [](auto& frame, int rank) {
+        if (rank == 0)
+            frame.cancel();
+        while (!frame.failed())
+            std::this_thread::yield();
+    });
     INFO(joined(texts));
     CHECK(allSame(texts));
     CHECK(has(texts[0], "no such brick"));
@@ -1330,7 +1331,7 @@ TEST_CASE("Ranks that began a partial frame differently disagree, whatever else 
         p.background[2] = static_cast<float>(rank);
         return p;
     };
-    const auto texts = partialFrame(params, [](auto&) {});
+    const auto texts = partialFrame(params, [](auto&, int) {});
     INFO(joined(texts));
     CHECK(allSame(texts));
     CHECK(has(texts[0], "FrameError: dfb: ranks disagree"));
