@@ -15,6 +15,7 @@
 #include <cstring>
 #include <functional>
 #include <future>
+#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -39,7 +40,7 @@ struct Board {
     std::mutex mutex;
     std::vector<std::function<void()>> held;
     bool released = false;
-    std::vector<dfb::TransportHandler*> handlers;
+    std::map<int, dfb::TransportHandler*> handlers; // by rank
     std::atomic<bool> timeIsUp{false};
     std::shared_ptr<dfb::MemoryPool> pool = dfb::MemoryPool::create();
 
@@ -70,7 +71,7 @@ struct Board {
     {
         timeIsUp = true;
         const std::lock_guard<std::mutex> lock(mutex);
-        for (dfb::TransportHandler* handler : handlers) {
+        for (const auto& [rank, handler] : handlers) {
             dfb::ErrorInfo info;
             info.kind = dfb::ErrorKind::Transport;
             info.message = "the test's time limit";
@@ -93,10 +94,9 @@ public:
     }
     void start(dfb::TransportHandler& handler)
     {
-        handler_ = &handler;
         {
             const std::lock_guard<std::mutex> lock(board_->mutex);
-            board_->handlers.push_back(&handler);
+            board_->handlers[inner_.rank()] = &handler;
         }
         inner_.start(handler);
     }
@@ -104,8 +104,7 @@ public:
     {
         {
             const std::lock_guard<std::mutex> lock(board_->mutex);
-            auto& all = board_->handlers;
-            all.erase(std::remove(all.begin(), all.end(), handler_), all.end());
+            board_->handlers.erase(inner_.rank());
         }
         inner_.stop(orderly);
     }
@@ -136,7 +135,6 @@ public:
 
 private:
     std::shared_ptr<Board> board_;
-    dfb::TransportHandler* handler_ = nullptr;
 };
 
 // runRanks() over a board, for at most so long. Throws std::runtime_error if anything came out of it but what `body`

@@ -327,6 +327,7 @@ public:
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         const std::int64_t number = reductionCount_++;
+        auto damage = takeDamage(); // now: when the others have this rank's part, they may go on to what comes after
         messenger_->expectMessages(true);
         try {
             try {
@@ -341,7 +342,7 @@ public:
                 error.rank = rank();
                 messenger_->giveUp(error);
             }
-            waitForResult([&] { return result->there.load(); }, number == 0);
+            waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
         } catch (...) {
             messenger_->expectMessages(false);
             throw;
@@ -374,13 +375,12 @@ public:
 
 private:
     // A message that could not be read may have been a part of this, for which others may not be here yet, or of what
-    // comes after, if they are through. The first one is what its owner's constructor does.
+    // comes after, if they are through. The first one is what its owner's constructor does. `damage`: from before.
     template <class Ready>
-    void waitForResult(const Ready& ready, bool isFirst)
+    void waitForResult(const Ready& ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
         const std::chrono::milliseconds late(messenger_->options().peerTimeoutMs);
-        auto damage = takeDamage();
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
         if (damage)
