@@ -17,6 +17,14 @@ foreach(_dfb_component IN LISTS DFB_COMPONENTS)
     DESTINATION ${_dfb_config_dir})
 endforeach()
 
+# Only by cmake --install <build> --component testing.
+target_include_directories(dfb_testing INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing>)
+install(DIRECTORY ${PROJECT_SOURCE_DIR}/tests/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}/dfb-testing
+  COMPONENT testing EXCLUDE_FROM_ALL FILES_MATCHING PATTERN "*.hpp")
+install(TARGETS dfb_testing EXPORT dfb-testing)
+install(EXPORT dfb-testing NAMESPACE dfb:: FILE dfb-testing.cmake DESTINATION ${_dfb_config_dir}
+  COMPONENT testing EXCLUDE_FROM_ALL)
+
 configure_package_config_file(${CMAKE_CURRENT_LIST_DIR}/dfbConfig.cmake.in
   ${PROJECT_BINARY_DIR}/dfbConfig.cmake INSTALL_DESTINATION ${_dfb_config_dir})
 write_basic_package_version_file(${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake

@@ -1,6 +1,8 @@
 # dfb::core        the library, on threads alone
 # dfb::mpi, dfb::tbb, dfb::snappy   core and one dependency more, which the definition DFB_HAS_... tells the headers
 # dfb::dfb         core and all of these that are switched on
+# dfb::testing     core and, with an include folder of its own, what tests are made of: an exact reference, checks of tile
+#                  operations and transports. Not part of dfb::dfb
 # dfb::strict_fp   for bitwise equal images over compilers: no contraction of a * b + c to one rounding
 
 function(_dfb_add_component name)
@@ -27,6 +29,10 @@ target_link_libraries(dfb_core INTERFACE Threads::Threads)
 _dfb_add_component(strict_fp)
 target_compile_options(dfb_strict_fp INTERFACE
   $<$<COMPILE_LANG_AND_ID:CXX,GNU,Clang,AppleClang,IntelLLVM>:-ffp-contract=off>)
+
+_dfb_add_component(testing)
+target_include_directories(dfb_testing INTERFACE $<BUILD_INTERFACE:${PROJECT_SOURCE_DIR}/tests/include>)
+target_link_libraries(dfb_testing INTERFACE dfb_core)
 
 set(DFB_COMPONENTS core)
 

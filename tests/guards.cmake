@@ -12,9 +12,10 @@ else()
 endif()
 set(_compile ${CMAKE_CXX_COMPILER} -std=c++17 -fsyntax-only ${_terse})
 set(_include ${PROJECT_SOURCE_DIR}/include)
+set(_testing_include ${PROJECT_SOURCE_DIR}/tests/include)
 
 add_test(NAME guard.layers
-  COMMAND ${CMAKE_COMMAND} -DROOT=${_include} -P ${CMAKE_CURRENT_SOURCE_DIR}/layers.cmake)
+  COMMAND ${CMAKE_COMMAND} "-DROOTS=${_include};${_testing_include}" -P ${CMAKE_CURRENT_SOURCE_DIR}/layers.cmake)
 set_tests_properties(guard.layers PROPERTIES LABELS guard)
 
 add_test(NAME guard.readme
@@ -50,6 +51,12 @@ foreach(_header IN LISTS _headers)
   string(REPLACE "/" "." _name ${_name})
   _dfb_add_header_test(${_name} ${_header})
 endforeach()
+file(GLOB_RECURSE _testing_headers CONFIGURE_DEPENDS RELATIVE ${_testing_include} ${_testing_include}/dfb/*.hpp)
+foreach(_header IN LISTS _testing_headers)
+  string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_header})
+  string(REPLACE "/" "." _name ${_name})
+  _dfb_add_header_test(${_name} ${_header} -I${_testing_include})
+endforeach()
 foreach(_component mpi tbb snappy)
   if(TARGET dfb::${_component})
     string(TOUPPER ${_component} _upper)
@@ -80,7 +87,7 @@ if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   endif()
   foreach(_program IN LISTS _programs)
     get_filename_component(_name ${_program} NAME_WE)
-    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -I${_include} -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1
+    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -I${_include} -I${_testing_include} -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1
       -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
     set_tests_properties(guard.${_name} PROPERTIES LABELS guard)
   endforeach()

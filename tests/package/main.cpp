@@ -12,6 +12,14 @@
 #error "dfb::dfb has not the components that were asked for"
 #endif
 
+#if EXPECT_TESTING
+#include <dfb/testing/reference.hpp>
+#elif defined(__has_include)
+#if __has_include(<dfb/testing/reference.hpp>)
+#error "the component 'testing' is there although nobody asked for it"
+#endif
+#endif
+
 #if WITH_FRAME
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
 
@@ -68,6 +76,10 @@ int main()
     codec = std::make_shared<dfb::SnappyCodec>();
 #endif
     bool right = frameIsRight(executor, codec);
+
+#if EXPECT_TESTING
+    right = right && dfb::testing::composite({}, {1, 0, 0, 1}).rgba[0] == 1;
+#endif
 
 #if EXPECT_MPI
     int initialized = 1;

@@ -5,17 +5,27 @@ set(_others ${DFB_COMPONENTS})
 list(REMOVE_ITEM _others core)
 
 # Emptied first: an install over an older one can leave stale files.
-add_test(NAME package.clean COMMAND ${CMAKE_COMMAND} -E rm -rf ${_stage})
+add_test(NAME package.clean COMMAND ${CMAKE_COMMAND} -E rm -rf ${_stage} ${_stage}_testing)
 set_tests_properties(package.clean PROPERTIES LABELS package FIXTURES_SETUP dfb_stage_clean)
 add_test(NAME package.install COMMAND ${CMAKE_COMMAND} --install ${PROJECT_BINARY_DIR} --prefix ${_stage})
 set_tests_properties(package.install PROPERTIES LABELS package
   FIXTURES_REQUIRED dfb_stage_clean FIXTURES_SETUP dfb_stage)
+# The component testing is installed only if it is named.
+add_test(NAME package.install_testing COMMAND ${CMAKE_COMMAND} --install ${PROJECT_BINARY_DIR} --component testing
+  --prefix ${_stage}_testing)
+add_test(NAME package.install_for_testing COMMAND ${CMAKE_COMMAND} --install ${PROJECT_BINARY_DIR}
+  --prefix ${_stage}_testing)
+set_tests_properties(package.install_testing package.install_for_testing PROPERTIES LABELS package
+  FIXTURES_REQUIRED dfb_stage_clean FIXTURES_SETUP dfb_stage_testing)
 
-# dfb_add_package_test(<name> HOW <how> [VERSION <version>] [COMPONENTS <component>...] [EXPECT <component>...]
+# dfb_add_package_test(<name> HOW <how> [STAGE <folder>] [VERSION <version>] [COMPONENTS <component>...] [EXPECT <component>...]
 #                      [WITHOUT <package>...] [OPTIONS <option>...] [FAILS <regex>])
 # WITHOUT: packages that are not found, as on a machine that does not have them.
 function(dfb_add_package_test name)
-  cmake_parse_arguments(PARSE_ARGV 1 A "" "HOW;VERSION;FAILS" "COMPONENTS;EXPECT;WITHOUT;OPTIONS")
+  cmake_parse_arguments(PARSE_ARGV 1 A "" "HOW;STAGE;VERSION;FAILS" "COMPONENTS;EXPECT;WITHOUT;OPTIONS")
+  if(NOT A_STAGE)
+    set(A_STAGE stage)
+  endif()
   list(JOIN A_COMPONENTS "," components)
   list(JOIN A_EXPECT "," expect)
   list(TRANSFORM A_WITHOUT REPLACE "(.+)" "-DCMAKE_DISABLE_FIND_PACKAGE_\\1=ON")
@@ -23,7 +33,7 @@ function(dfb_add_package_test name)
     -DCMAKE_CXX_COMPILER=${CMAKE_CXX_COMPILER} -DCMAKE_CXX_COMPILER_LAUNCHER=${CMAKE_CXX_COMPILER_LAUNCHER}
     ${A_WITHOUT} ${A_OPTIONS})
   if(A_HOW STREQUAL "find_package")
-    list(APPEND arguments -Ddfb_ROOT=${_stage})
+    list(APPEND arguments -Ddfb_ROOT=${CMAKE_CURRENT_BINARY_DIR}/${A_STAGE})
   elseif(A_HOW STREQUAL "add_subdirectory")
     list(APPEND arguments -DDFB_SOURCE=${PROJECT_SOURCE_DIR})
   else()
@@ -40,7 +50,7 @@ function(dfb_add_package_test name)
     -P ${CMAKE_CURRENT_SOURCE_DIR}/package/build_and_run.cmake)
   set_tests_properties(package.${name} PROPERTIES LABELS package TIMEOUT 180)
   if(A_HOW STREQUAL "find_package")
-    set_tests_properties(package.${name} PROPERTIES FIXTURES_REQUIRED dfb_stage)
+    set_tests_properties(package.${name} PROPERTIES FIXTURES_REQUIRED dfb_${A_STAGE})
   endif()
 endfunction()
 
@@ -70,7 +80,13 @@ foreach(_component IN LISTS _others)
     COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
 endforeach()
 
+# What tests are made of, beside what is asked for.
+dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
+  WITHOUT MPI TBB Snappy)
+
 # What can not be had is said clearly.
+dfb_add_package_test(find_package_misses_testing HOW find_package COMPONENTS testing
+  FAILS "component 'testing' is not installed")
 dfb_add_package_test(other_minor_version HOW find_package VERSION 0.0 FAILS "requested version \"0.0\"")
 dfb_add_package_test(unknown_component HOW find_package COMPONENTS cuda FAILS "component 'cuda' is not installed")
 foreach(_component IN LISTS _others)
