@@ -1,5 +1,5 @@
-// The way of finished tiles to the display rank: in batches while others still render, all at the end, or with one
-// MPI_Gatherv. Each rank renders the tiles that it owns, with renderers that cost nothing, time or only patience.
+// The way of finished tiles to the display rank: in batches while others still render, or with one MPI_Gatherv.
+// Each rank renders the tiles that it owns, with renderers that cost nothing, time or only patience.
 //   mpirun -n 2 bench_gather        or -n 4, -n 8; --quick; a list of parts such as 12 takes only those image sizes
 #include "baselines.hpp"
 
@@ -179,7 +179,7 @@ private:
 
 // ---- measuring
 
-constexpr std::array<const char*, 4> variants{"Batches", "AtEnd", "MPI_Gatherv", "MPI_Igatherv, test+nap"};
+constexpr std::array<const char*, 3> variants{"dfb", "MPI_Gatherv", "MPI_Igatherv, test+nap"};
 
 // How much of Renderer::compute() a core does when nobody disturbs it.
 double stepsPerSecond(MPI_Comm comm)
@@ -219,10 +219,8 @@ public:
         config.width = config.height = c.side;
         config.format = c.format;
         config.executor = executor;
-        FrameBuffer batches(messenger, config);
-        config.gather = dfb::GatherMode::AtEnd;
-        FrameBuffer atEnd(messenger, config);
-        GathervImage plain(batches, comm_);
+        FrameBuffer fb(messenger, config);
+        GathervImage plain(fb, comm_);
         const Renderer renderer(c.cost, 100e-6, stepsPerSecond_);
 
         Samples tails, frames, cpu;
@@ -235,11 +233,9 @@ public:
                 bench::meet(comm_);
                 const double start = bench::now(), cpuBefore = bench::processCpuSeconds();
                 if (v == 0)
-                    dfb::renderImageParallel(batches, renderer);
-                else if (v == 1)
-                    dfb::renderImageParallel(atEnd, renderer);
+                    dfb::renderImageParallel(fb, renderer);
                 else
-                    plain.render(renderer, v == 2 ? Waiting::Blocking : Waiting::Nap);
+                    plain.render(renderer, v == 1 ? Waiting::Blocking : Waiting::Nap);
                 const double end = bench::now(), cpuSpent = bench::processCpuSeconds() - cpuBefore;
                 const double first = bench::reduce(comm_, start, MPI_MIN);
                 const double cpuOfAll = bench::reduce(comm_, cpuSpent, MPI_SUM);
@@ -251,7 +247,7 @@ public:
                 cpu[v].push_back(1e3 * cpuOfAll);
             }
             if (round < 0)
-                requireSame(batches, atEnd, plain);
+                requireSame(fb, plain);
         }
         const std::string image =
             std::to_string(c.side) + "² " + (c.format == dfb::OutputFormat::RGBA8 ? "RGBA8" : "RGBA32F");
@@ -278,7 +274,7 @@ private:
     {
         std::vector<std::string> names{"image", "renderer", "rounds"};
         names.insert(names.end(), variants.begin(), variants.end());
-        names.push_back("AtEnd - Batches");
+        names.push_back("dfb - MPI_Igatherv");
         return names;
     }
 
@@ -290,21 +286,20 @@ private:
             row.push_back(bench::text(bench::figureOf(s)));
         std::vector<double> differences;
         for (std::size_t i = 0; i < samples[0].size(); ++i)
-            differences.push_back(samples[1][i] - samples[0][i]);
+            differences.push_back(samples[0][i] - samples[2][i]);
         row.push_back(bench::text(bench::figureOf(differences)));
         return row;
     }
 
-    void requireSame(const FrameBuffer& batches, const FrameBuffer& atEnd, const GathervImage& plain) const
+    void requireSame(const FrameBuffer& fb, const GathervImage& plain) const
     {
         if (rank_ != 0)
             return;
         const std::vector<std::byte>& image = plain.image();
-        for (const FrameBuffer* fb : {&batches, &atEnd})
-            if (std::memcmp(fb->image().bytes(), image.data(), image.size()) != 0) {
-                std::printf("the images differ\n");
-                MPI_Abort(comm_, 1);
-            }
+        if (std::memcmp(fb.image().bytes(), image.data(), image.size()) != 0) {
+            std::printf("the images differ\n");
+            MPI_Abort(comm_, 1);
+        }
     }
 
     MPI_Comm comm_;

@@ -18,12 +18,6 @@
 
 namespace dfb {
 
-// When finished tiles leave for the display rank.
-enum class GatherMode : std::uint8_t {
-    Batches, // as soon as enough of them are finished, while others still render
-    AtEnd    // when all tiles of a rank are finished
-};
-
 // Where a codec is used, if there is one.
 enum class CompressionMode : std::uint8_t {
     Always,
@@ -51,7 +45,6 @@ struct FrameBufferConfig {
     // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
     // left out. That changes it by no more than this times the largest colour.
     float minTransmittance = 0;
-    GatherMode gather = GatherMode::Batches;
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
     std::size_t messagePoolBytes = std::size_t{64} << 20;

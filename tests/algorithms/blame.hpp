@@ -124,7 +124,6 @@ struct BlamedConfig {
             {"depth", [](Config& c) { c.depth = false; }, "true", "false"},
             {"dither", [](Config& c) { c.dither = true; }, "false", "true"},
             {"framesInFlight", [](Config& c) { c.framesInFlight = 2; }, "1", "2"},
-            {"gather", [](Config& c) { c.gather = dfb::GatherMode::AtEnd; }, "Batches", "AtEnd"},
             {"compression", [](Config& c) { c.compression = dfb::CompressionMode::Auto; }, "Always", "Auto"},
             {"messagePoolBytes", [](Config& c) { c.messagePoolBytes = 1 << 28; }, "67108864", "268435456"},
             {"minTransmittance", [](Config& c) { c.minTransmittance = 0.5f; }, "0", "0.5"},

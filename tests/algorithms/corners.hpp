@@ -755,10 +755,8 @@ private:
                        const std::vector<corners::Loop>& loops, dfb::BlendRule rule, Result& result, Count& count)
     {
         for (const corners::Loop loop : loops) {
-            const bool isOdd = count.loops % 2 == 1;
             dfb::FrameBufferConfig config = configOf(corners::sceneFor(loop, rule, 0), count.loops % 3);
             config.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
-            config.gather = isOdd ? dfb::GatherMode::AtEnd : dfb::GatherMode::Batches;
             corners::Corner<TileOp, PixelOp, Transport> corner(messenger, config, loop, rule, result);
             count.faults += corner.run();
             ++count.loops;

@@ -70,12 +70,13 @@ struct PartialFrames {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        for (const dfb::GatherMode gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd}) {
+        for (const bool shared : {true, false}) {
+            dfb::MessengerOptions options;
+            options.sharedMemory = shared;
             const scene::Scene s = scene::makeScene(5, 3);
             auto config = configOf(s, 2);
-            config.gather = gather;
             using FrameBuffer = dfb::DistributedFrameBuffer<FailingBlend, dfb::NoPixelOp, Transport>;
-            FrameBuffer fb(communicator, config);
+            FrameBuffer fb(communicator, config, options);
             auto params = paramsOf(s);
             params.allowPartial = true;
             const auto mine = bricksOf(s, fb.rank(), fb.size());

@@ -164,7 +164,6 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     config.height = group.scene.height;
     config.format = dfb::OutputFormat::RGBA32F;
     config.depth = true;
-    config.gather = group.seed % 2 ? dfb::GatherMode::AtEnd : dfb::GatherMode::Batches;
     config.messagePoolBytes = group.seed % 3 ? std::size_t{64} << 20 : 0;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1 + static_cast<int>(group.seed % 2));
     dfb::MessengerOptions options;

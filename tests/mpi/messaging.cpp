@@ -158,13 +158,12 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
 {
     const int ranks = sizeOf(MPI_COMM_WORLD);
     for (const flood::NamedExecutor& e : executors())
-        for (const auto gather : {dfb::GatherMode::Batches, dfb::GatherMode::AtEnd})
+        for (const bool shared : {true, false})
             for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
                 auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
-                config.gather = gather;
                 dfb::MessengerOptions options;
                 options.progress = progress;
-                options.sharedMemory = gather == dfb::GatherMode::Batches;
+                options.sharedMemory = shared;
                 AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
                 const auto report = floodFrame(fb, 2, From::Loop, longMs);
                 INFO(e.name);
@@ -174,13 +173,12 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
             }
 }
 
-TEST_CASE("Gathering at the end, or all through MPI, gives the same image bit for bit", "[messaging]")
+TEST_CASE("All through MPI gives the same image bit for bit", "[messaging]")
 {
     const Scene s = sceneFor(7, 3);
     std::vector<std::uint64_t> hashes;
     for (const bool shared : {true, false}) {
         auto config = configOf(s);
-        config.gather = shared ? dfb::GatherMode::Batches : dfb::GatherMode::AtEnd;
         dfb::MessengerOptions options;
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config, options);

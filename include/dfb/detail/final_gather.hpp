@@ -34,7 +34,6 @@ struct GatherSettings {
     ChannelMask channels = 0;   // beside the colour
     std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
-    bool atEnd = false; // nothing leaves before flush()
     bool dither = false;
 };
 
@@ -94,7 +93,6 @@ public:
         tilesSent_ = 0;
         placed_.clear();
         placedPixels_ = 0;
-        held_.clear();
         tilesReceived_ = 0;
         tilesAnnounced_ = 0;
         ranksDone_ = 0;
@@ -116,7 +114,7 @@ public:
     template <class PlaceOf>
     std::optional<ImagePlaces> shareImage(const PlaceOf& placeOf)
     {
-        if (image_.empty() || settings_.atEnd)
+        if (image_.empty())
             return std::nullopt;
         gateMemory_ = pool_->acquire(std::max(sizeof(ImageGate), MemoryPool::smallestShared));
         const Planes planes = image_.planesAt(0);
@@ -146,7 +144,7 @@ public:
     template <class BlockAt>
     void useImage(const ImagePlaces& places, const BlockAt& blockAt)
     {
-        if (isDisplay_ || !enabled() || settings_.atEnd)
+        if (isDisplay_ || !enabled())
             return;
         SharedImage image;
         image.gate = reinterpret_cast<ImageGate*>(blockAt(places.gate, sizeof(ImageGate)));
@@ -308,8 +306,6 @@ public:
             std::copy(placed_.begin(), placed_.end(),
                       reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof tilesSent_));
         }
-        for (Buffer& message : held_) // nobody else touches them any more
-            send_(std::move(message));
         if (last)
             sendBatch(std::move(last));
         send_(std::move(done));
@@ -581,13 +577,6 @@ private:
         const MessageHeader m = messageHeader(MessageKind::FinishedTiles);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
-        if (settings_.atEnd) {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (!flushed_) {
-                held_.push_back(std::move(message));
-                return;
-            }
-        }
         send_(std::move(message));
     }
 
@@ -622,7 +611,6 @@ private:
     std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
     std::vector<std::shared_ptr<Batch>> spareBatches_;
     bool flushed_ = false;
-    std::vector<Buffer> held_; // does not change after flush()
     std::int64_t tilesSent_ = 0;
     SharedImage remote_;               // of the display rank, if this one sees it
     std::vector<std::int32_t> placed_; // tiles that are in it

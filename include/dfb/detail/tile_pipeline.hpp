@@ -42,8 +42,7 @@ public:
                  rank, rankCount),
           gather_(
               pool_, table_.layout(),
-              {config.format, imageChannels(config), address, config.codec, config.gather == GatherMode::AtEnd,
-               config.dither},
+              {config.format, imageChannels(config), address, config.codec, config.dither},
               rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
           coder_(config.wire, ActiveByDepth<TileOp>::value)

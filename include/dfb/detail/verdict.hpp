@@ -315,7 +315,6 @@ struct Agreement {
         s.add("wire.budget", c.wire.budget);
         s.add("wire.maxColor", c.wire.maxColor);
         s.add("minTransmittance", c.minTransmittance);
-        s.add("gather", c.gather == GatherMode::AtEnd ? "AtEnd" : "Batches");
         s.add("messagePoolBytes", c.messagePoolBytes);
         s.add("checksums", checksums);
         return {true, s.text(), rank};
