@@ -40,19 +40,19 @@ struct Options {
 
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
-    const auto messenger = bench::makeMessenger(inputs.comm, false);
+    const auto connection = bench::makeConnection(inputs.comm, false);
     using bench::addDfb, dfb::WireFormat, dfb::BasicOrderedBlend, dfb::BasicAlphaBlend;
     const auto addOrdered = [&](const std::string& wire, const bench::DfbSettings& settings) {
-        addDfb<BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, " + wire + ", tiles of 128", settings);
+        addDfb<BasicOrderedBlend<128>>(systems, connection, inputs, "in order, " + wire + ", tiles of 128", settings);
     };
-    addDfb<BasicOrderedBlend<64>>(systems, messenger, inputs, "in order, float32, tiles of 64", {});
+    addDfb<BasicOrderedBlend<64>>(systems, connection, inputs, "in order, float32, tiles of 64", {});
     addOrdered("float32", {});
     bench::DfbSettings threads;
     threads.hasThreads = true;
-    addDfb<BasicOrderedBlend<128>>(systems, bench::makeMessenger(inputs.comm, true), inputs,
+    addDfb<BasicOrderedBlend<128>>(systems, bench::makeConnection(inputs.comm, true), inputs,
                                    "in order, float32, tiles of 128, threads of its own", threads);
-    addDfb<BasicAlphaBlend<64>>(systems, messenger, inputs, "float32, tiles of 64", {});
-    addDfb<BasicAlphaBlend<128>>(systems, messenger, inputs, "float32, tiles of 128", {});
+    addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, tiles of 64", {});
+    addDfb<BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
     addOrdered("unorm16", {WireFormat::Unorm16});
     addOrdered("unorm8", {WireFormat::Unorm8});
 #if defined(DFB_HAS_SNAPPY)
@@ -103,7 +103,7 @@ public:
             else
                 sum += (has("direct") ? 20 : has("tree") ? 35 : 60) * used_ * (has("ubyte") ? 0.3 : 1) + 10 * all_;
         }
-        return sum + (hasDfb ? 24 * used_ : 0); // the messenger's, of which there is one
+        return sum + (hasDfb ? 24 * used_ : 0); // the connection's, of which there is one
     }
 
 private:

@@ -23,13 +23,13 @@ struct Options {
 
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
-    const auto messenger = bench::makeMessenger(inputs.comm, false);
+    const auto connection = bench::makeConnection(inputs.comm, false);
     using bench::addDfb, bench::DfbSettings, dfb::WireFormat;
     const auto add = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::AlphaBlend>(systems, messenger, inputs, config, settings);
+        addDfb<dfb::AlphaBlend>(systems, connection, inputs, config, settings);
     };
     const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::OrderedBlend>(systems, messenger, inputs, config, settings);
+        addDfb<dfb::OrderedBlend>(systems, connection, inputs, config, settings);
     };
     add("float32", {WireFormat::Float32, {}, 0, true});
     addOrdered("in order, float32", {WireFormat::Float32, {}, 0, true});
@@ -43,10 +43,10 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
         add(name.str(), {dfb::ErrorBudget{budget}});
     }
     add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
-    addDfb<dfb::BasicAlphaBlend<32>>(systems, messenger, inputs, "float32, tiles of 32", {});
-    addDfb<dfb::BasicAlphaBlend<128>>(systems, messenger, inputs, "float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, messenger, inputs, "in order, unorm16, tiles of 128",
+    addDfb<dfb::BasicAlphaBlend<32>>(systems, connection, inputs, "float32, tiles of 32", {});
+    addDfb<dfb::BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, float32, tiles of 128", {});
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, unorm16, tiles of 128",
                                         {WireFormat::Unorm16});
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();

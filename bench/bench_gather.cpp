@@ -18,7 +18,7 @@ namespace {
 using bench::Table;
 using bench::Waiting;
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::MpiTransport>;
-using Messenger = dfb::Messenger<dfb::MpiTransport>;
+using dfb::Connection;
 using Tile = FrameBuffer::Tile;
 
 // ---- renderers
@@ -213,13 +213,13 @@ public:
     void run(const Case& c)
     {
         // Framebuffers and memory of a case go before the next.
-        const auto messenger = std::make_shared<Messenger>(comm_);
+        const auto connection = dfb::connect<dfb::MpiTransport>(comm_);
         const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer::Config config;
         config.width = config.height = c.side;
         config.format = c.format;
         config.executor = executor;
-        FrameBuffer fb(messenger, config);
+        FrameBuffer fb(connection, config);
         GathervImage plain(fb, comm_);
         const Renderer renderer(c.cost, 100e-6, stepsPerSecond_);
 

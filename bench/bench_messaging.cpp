@@ -3,7 +3,7 @@
 //   mpirun -n 2 bench_messaging        or -n 8; --quick; a list of parts such as 14 runs only those
 #include "baselines.hpp"
 
-#include <dfb/comm/messaging.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/mpi_transport.hpp>
 
 #include <array>
@@ -19,36 +19,36 @@ using bench::Signal;
 using bench::Table;
 using bench::Waiting;
 using dfb::Buffer;
+using dfb::Connection;
 using dfb::detail::MessageHeader;
 using dfb::detail::MessageKind;
-using Messenger = dfb::Messenger<dfb::MpiTransport>;
 
 constexpr std::size_t tileBytes = 64 * 64 * 5 * sizeof(float); // colour and depth
 constexpr std::array<Waiting, 3> waitings{Waiting::Blocking, Waiting::Yield, Waiting::Nap};
 
-// A receiver that expects messages as long as it lives: what an open frame is to a messenger.
+// A receiver that expects messages as long as it lives: what an open frame is to a connection.
 class Endpoint final : private dfb::detail::MessageReceiver {
 public:
     using OnMessage = std::function<void(int source, const MessageHeader&, Buffer&&)>;
 
     // To be made, and gone, in the same order on all ranks. `onMessage` is called by the progress thread.
-    Endpoint(Messenger& messenger, OnMessage onMessage) : messenger_(messenger), onMessage_(std::move(onMessage))
+    Endpoint(Connection& connection, OnMessage onMessage) : connection_(connection), onMessage_(std::move(onMessage))
     {
-        messenger_.expectMessages(true);
-        messenger_.attach(*this, address_);
+        connection_.expectMessages(true);
+        connection_.attach(*this, address_);
     }
     Endpoint(const Endpoint&) = delete;
     Endpoint& operator=(const Endpoint&) = delete;
     ~Endpoint()
     {
-        messenger_.detach(address_);
-        messenger_.expectMessages(false);
+        connection_.detach(address_);
+        connection_.expectMessages(false);
     }
 
     // With `byteCount` bytes after the header, which nobody looks at.
     void send(int destination, std::size_t byteCount, std::int64_t number = 0)
     {
-        Buffer message = messenger_.pool()->acquire(sizeof(MessageHeader) + byteCount);
+        Buffer message = connection_.pool()->acquire(sizeof(MessageHeader) + byteCount);
         forward(destination, std::move(message), MessageKind::Fragment, number);
     }
 
@@ -59,7 +59,7 @@ public:
         header.receiver = address_;
         header.number = number;
         std::memcpy(message.data(), &header, sizeof header);
-        messenger_.send(destination, std::move(message));
+        connection_.send(destination, std::move(message));
     }
 
 private:
@@ -68,9 +68,9 @@ private:
         onMessage_(source, header, std::move(message));
     }
     void malformed(int, const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
-    void messengerFailed() override { std::abort(); }
+    void connectionFailed() override { std::abort(); }
 
-    Messenger& messenger_;
+    Connection& connection_;
     OnMessage onMessage_;
     std::uint32_t address_ = 0;
 };
@@ -115,16 +115,16 @@ std::vector<double> pingPongPlain(const Group& pair, std::size_t byteCount, int 
 }
 
 // Each message is answered where it comes in, as tasks of a frame are started there.
-std::vector<double> pingPongInReceive(const Group& pair, Messenger& messenger, std::size_t byteCount, int trips)
+std::vector<double> pingPongInReceive(const Group& pair, Connection& connection, std::size_t byteCount, int trips)
 {
     std::vector<double> samples;
     Signal done;
-    const Messenger::Hurry hurry(messenger); // as in Frame::end()
+    const Connection::Hurry hurry(connection); // as in Frame::end()
     double start = 0;
     int got = 0;
     std::optional<Endpoint> endpoint;
     bench::meet(pair.comm);
-    endpoint.emplace(messenger, [&](int source, const MessageHeader&, Buffer&& message) {
+    endpoint.emplace(connection, [&](int source, const MessageHeader&, Buffer&& message) {
         if (pair.rank == 0 && got >= warmUp)
             samples.push_back(usSince(start) / 2);
         start = bench::now();
@@ -145,13 +145,13 @@ std::vector<double> pingPongInReceive(const Group& pair, Messenger& messenger, s
 }
 
 // Each message is answered by a thread that waits for it.
-std::vector<double> pingPongInThread(const Group& pair, Messenger& messenger, std::size_t byteCount, int trips)
+std::vector<double> pingPongInThread(const Group& pair, Connection& connection, std::size_t byteCount, int trips)
 {
     std::vector<double> samples;
     Signal arrived;
-    const Messenger::Hurry hurry(messenger); // as in Frame::end()
+    const Connection::Hurry hurry(connection); // as in Frame::end()
     Buffer ball;
-    Endpoint endpoint(messenger, [&](int, const MessageHeader&, Buffer&& message) {
+    Endpoint endpoint(connection, [&](int, const MessageHeader&, Buffer&& message) {
         ball = std::move(message);
         arrived.set();
     });
@@ -224,10 +224,10 @@ std::vector<double> streamPlain(const Group& pair, const Stream& stream, Waiting
 }
 
 // Rank 1 answers every fourth part of the window.
-std::vector<double> streamMessenger(const Group& pair, Messenger& messenger, const Stream& stream)
+std::vector<double> streamConnection(const Group& pair, Connection& connection, const Stream& stream)
 {
     Signal done;
-    const Messenger::Hurry hurry(messenger); // as in Frame::end()
+    const Connection::Hurry hurry(connection); // as in Frame::end()
     int sent = 0, got = 0;
     std::optional<Endpoint> endpoint;
     const auto sendUpTo = [&](int count) {
@@ -235,7 +235,7 @@ std::vector<double> streamMessenger(const Group& pair, Messenger& messenger, con
             endpoint->send(1, stream.byteCount);
     };
     bench::meet(pair.comm);
-    endpoint.emplace(messenger, [&](int, const MessageHeader& header, Buffer&&) {
+    endpoint.emplace(connection, [&](int, const MessageHeader& header, Buffer&&) {
         if (pair.rank == 0) {
             const auto known = static_cast<int>(header.number);
             sendUpTo(known + stream.window);
@@ -264,32 +264,32 @@ std::vector<double> streamMessenger(const Group& pair, Messenger& messenger, con
 }
 
 // The layer that counts credit and has an inbox, as a frame uses it.
-class CreditEnd final : private dfb::detail::MessageHandler {
+class CreditEnd final : private dfb::detail::MailboxOwner {
 public:
-    CreditEnd(const std::shared_ptr<Messenger>& messenger, const std::shared_ptr<dfb::Executor>& executor,
+    CreditEnd(const std::shared_ptr<Connection>& connection, const std::shared_ptr<dfb::Executor>& executor,
               const Stream& stream)
-        : stream_(stream), messenger_(messenger),
-          messaging_(messenger, executor,
-                     std::max(std::size_t{64} << 20, 4 * (stream.byteCount + sizeof(MessageHeader))), *this)
+        : stream_(stream), connection_(connection),
+          mailbox_(connection, executor,
+                   std::max(std::size_t{64} << 20, 4 * (stream.byteCount + sizeof(MessageHeader))), *this)
     {
-        messenger_->expectMessages(true);
-        messaging_.start();
-        messaging_.newEpoch(1);
+        connection_->expectMessages(true);
+        mailbox_.start();
+        mailbox_.newEpoch(1);
     }
     CreditEnd(const CreditEnd&) = delete;
     CreditEnd& operator=(const CreditEnd&) = delete;
-    ~CreditEnd() { messenger_->expectMessages(false); }
+    ~CreditEnd() { connection_->expectMessages(false); }
 
     void sendAll()
     {
         for (int i = 0; i < stream_.total; ++i) {
             MessageHeader header;
-            header.receiver = messaging_.address();
+            header.receiver = mailbox_.address();
             header.number = 1;
-            Buffer message = messenger_->pool()->acquire(sizeof header + stream_.byteCount);
+            Buffer message = connection_->pool()->acquire(sizeof header + stream_.byteCount);
             std::memcpy(message.data(), &header, sizeof header);
-            messaging_.sendWithCredit(1, std::move(message));
-            messaging_.waitForRoom([] { return false; }, std::chrono::milliseconds(0));
+            mailbox_.sendWithCredit(1, std::move(message));
+            mailbox_.waitForRoom([] { return false; }, std::chrono::milliseconds(0));
         }
     }
     void wait() { done_.wait(); }
@@ -299,18 +299,18 @@ private:
     {
         switch (header.kind) {
         case MessageKind::Fragment:
-            messaging_.flow().consumed(source, message.size());
+            mailbox_.flow().consumed(source, message.size());
             if (++got_ == stream_.total) {
-                messaging_.send(source, MessageKind::TilesDone, 1);
+                mailbox_.send(source, MessageKind::TilesDone, 1);
                 done_.set();
             }
             break;
         case MessageKind::CreditRequest:
-            messaging_.flow().requested(
+            mailbox_.flow().requested(
                 source, dfb::detail::loadAs<dfb::detail::FlowControl::Request>(message.data() + sizeof header));
             break;
         case MessageKind::Credit:
-            messaging_.flow().credited(
+            mailbox_.flow().credited(
                 source, dfb::detail::loadAs<dfb::detail::FlowControl::Credit>(message.data() + sizeof header));
             break;
         default: done_.set();
@@ -319,17 +319,17 @@ private:
     void undecodable(int, const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
 
     Stream stream_;
-    std::shared_ptr<Messenger> messenger_;
+    std::shared_ptr<Connection> connection_;
     Signal done_;
     std::atomic<int> got_{0};
-    dfb::detail::Messaging<dfb::MpiTransport> messaging_; // last: its tasks use the others
+    dfb::detail::Mailbox mailbox_; // last: its tasks use the others
 };
 
-std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Messenger>& messenger,
+std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Connection>& connection,
                                  const std::shared_ptr<dfb::Executor>& executor, const Stream& stream)
 {
-    CreditEnd end(messenger, executor, stream);
-    const Messenger::Hurry hurry(*messenger); // as in Frame::end()
+    CreditEnd end(connection, executor, stream);
+    const Connection::Hurry hurry(*connection); // as in Frame::end()
     bench::meet(pair.comm);
     const double start = bench::now();
     if (pair.rank == 0)
@@ -342,7 +342,7 @@ std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Messen
 
 void latencyAndBandwidth(const Group& pair, bool quick)
 {
-    const auto messenger = std::make_shared<Messenger>(pair.comm);
+    const auto connection = dfb::connect<dfb::MpiTransport>(pair.comm);
     const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
     Table latency(
         {"payload", nameOf(waitings[0]), nameOf(waitings[1]), nameOf(waitings[2]), "dfb", "dfb, to a thread"});
@@ -359,10 +359,10 @@ void latencyAndBandwidth(const Group& pair, bool quick)
                 append(times[w], pingPongPlain(pair, byteCount, trips, waitings[w]));
                 append(speeds[w], streamPlain(pair, stream, waitings[w]));
             }
-            append(times[3], pingPongInReceive(pair, *messenger, byteCount, trips));
-            append(times[4], pingPongInThread(pair, *messenger, byteCount, trips));
-            append(speeds[3], streamMessenger(pair, *messenger, stream));
-            append(speeds[4], streamCredit(pair, messenger, executor, stream));
+            append(times[3], pingPongInReceive(pair, *connection, byteCount, trips));
+            append(times[4], pingPongInThread(pair, *connection, byteCount, trips));
+            append(speeds[3], streamConnection(pair, *connection, stream));
+            append(speeds[4], streamCredit(pair, connection, executor, stream));
         }
         std::vector<std::string> timeRow{bench::byteText(byteCount)}, speedRow = timeRow;
         for (std::size_t i = 0; i < times.size(); ++i) {
@@ -425,13 +425,13 @@ const char* nameOf(Beside beside)
 template <class Work>
 void runBeside(const Group& all, Beside beside, const Work& work)
 {
-    std::optional<Messenger> messenger;
+    std::shared_ptr<Connection> connection;
     std::optional<Endpoint> endpoint;
     std::optional<PlainWaiter> waiter;
     if (beside == Beside::Idle || beside == Beside::Open || beside == Beside::Traffic)
-        messenger.emplace(all.comm);
+        connection = dfb::connect(all.comm);
     if (beside == Beside::Open || beside == Beside::Traffic)
-        endpoint.emplace(*messenger, [](int, const MessageHeader&, Buffer&&) {});
+        endpoint.emplace(*connection, [](int, const MessageHeader&, Buffer&&) {});
     bench::meet(all.comm);
     if (beside == Beside::PlainNap || beside == Beside::PlainBlocking)
         waiter.emplace(all, beside == Beside::PlainNap ? Waiting::Nap : Waiting::Blocking);
@@ -580,14 +580,14 @@ std::vector<double> ringPlain(const Group& all, std::size_t byteCount, double se
     return ring.samples;
 }
 
-std::vector<double> ringMessenger(const Group& all, Messenger& messenger, std::size_t byteCount, double seconds)
+std::vector<double> ringConnection(const Group& all, Connection& connection, std::size_t byteCount, double seconds)
 {
     Ring ring;
     Signal done;
-    const Messenger::Hurry hurry(messenger); // as in Frame::end()
+    const Connection::Hurry hurry(connection); // as in Frame::end()
     std::optional<Endpoint> endpoint;
     bench::meet(all.comm);
-    endpoint.emplace(messenger, [&](int, const MessageHeader& header, Buffer&& message) {
+    endpoint.emplace(connection, [&](int, const MessageHeader& header, Buffer&& message) {
         bool last = header.number != 0;
         const bool arrived = all.rank == 0 && last;
         if (all.rank == 0)
@@ -680,11 +680,11 @@ std::vector<double> exchangePlain(const Group& all, std::size_t byteCount, int r
     return samples;
 }
 
-std::vector<double> exchangeMessenger(const Group& all, Messenger& messenger, std::size_t byteCount, int rounds)
+std::vector<double> exchangeConnection(const Group& all, Connection& connection, std::size_t byteCount, int rounds)
 {
     std::vector<double> samples, starts(static_cast<std::size_t>(all.size));
     Signal done;
-    const Messenger::Hurry hurry(messenger); // as in Frame::end()
+    const Connection::Hurry hurry(connection); // as in Frame::end()
     int outstanding = 0, roundsLeft = rounds;
     std::optional<Endpoint> endpoint;
     const auto beginRound = [&] {
@@ -698,7 +698,7 @@ std::vector<double> exchangeMessenger(const Group& all, Messenger& messenger, st
     };
     // Only the progress thread may be in here, so it begins the first round as well, told by a message that is no tile.
     bench::meet(all.comm);
-    endpoint.emplace(messenger, [&](int source, const MessageHeader& header, Buffer&& message) {
+    endpoint.emplace(connection, [&](int source, const MessageHeader& header, Buffer&& message) {
         if (header.kind == MessageKind::Fragment) {
             endpoint->forward(source, std::move(message), MessageKind::FinishedTiles);
             return;
@@ -713,7 +713,7 @@ std::vector<double> exchangeMessenger(const Group& all, Messenger& messenger, st
             done.set();
     });
     bench::meet(all.comm);
-    endpoint->forward(all.next(), messenger.pool()->acquire(sizeof(MessageHeader)), MessageKind::TilesDone);
+    endpoint->forward(all.next(), connection.pool()->acquire(sizeof(MessageHeader)), MessageKind::TilesDone);
     done.wait();
     bench::meet(all.comm); // the others may still need answers
     return samples;
@@ -742,7 +742,7 @@ std::vector<double> besideCompute(bool compute, const Communicate& communicate)
 
 void hops(const Group& all, bool quick)
 {
-    Messenger messenger(all.comm);
+    const auto connection = dfb::connect(all.comm);
     const double seconds = quick ? 0.3 : 1.5;
     Table table({"pattern", "payload", nameOf(waitings[0]), nameOf(waitings[1]), nameOf(waitings[2]), "dfb"});
     enum class Pattern { Ring, RingBesideCompute, Exchange };
@@ -757,10 +757,11 @@ void hops(const Group& all, bool quick)
                     append(samples[v],
                            bench::collect(all.comm, besideCompute(pattern == Pattern::RingBesideCompute, [&] {
                                               if (pattern == Pattern::Exchange)
-                                                  return plain ? exchangePlain(all, byteCount, rounds, waitings[v])
-                                                               : exchangeMessenger(all, messenger, byteCount, rounds);
+                                                  return plain
+                                                             ? exchangePlain(all, byteCount, rounds, waitings[v])
+                                                             : exchangeConnection(all, *connection, byteCount, rounds);
                                               return plain ? ringPlain(all, byteCount, seconds, waitings[v])
-                                                           : ringMessenger(all, messenger, byteCount, seconds);
+                                                           : ringConnection(all, *connection, byteCount, seconds);
                                           })));
                 }
             std::vector<std::string> row{pattern == Pattern::Ring       ? "ring"

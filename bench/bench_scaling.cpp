@@ -279,13 +279,13 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         const auto rank = static_cast<std::size_t>(communicator.rank());
         const bench::PartialImage& image = images[rank];
-        const auto messenger = std::make_shared<dfb::Messenger<bench::CountedTransport>>(
-            bench::CountedTransport::Communicator{communicator, counters});
+        const auto connection =
+            dfb::connect<bench::CountedTransport>(bench::CountedTransport::Communicator{communicator, counters});
         dfb::FrameBufferConfig config;
         config.width = width;
         config.height = height;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        FrameBuffer fb(messenger, config);
+        FrameBuffer fb(connection, config);
         dfb::World world;
         const auto& v = image.viewport;
         world.add({static_cast<std::uint32_t>(rank),
@@ -312,7 +312,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
             }
             Counted& counted = (frame == 0 ? result.first : result.last)[rank];
             counted = Counted::of(counters->sent[rank], counters->received[rank]);
-            counted.poolBytes = static_cast<std::int64_t>(messenger->pool()->peakBytes());
+            counted.poolBytes = static_cast<std::int64_t>(connection->pool()->peakBytes());
         }
         counters->meet();
     });

@@ -136,15 +136,15 @@ class MarchedBricks {
 
 public:
     // Collective. The communicator remains the caller's; `config` has size and executor, and what else dfb should do.
-    // `hasThreads`: see makeMessenger().
+    // `hasThreads`: see makeConnection().
     MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount, bool hasThreads = true)
-        : comm_(comm), messenger_(makeMessenger(comm, hasThreads)), config_(std::move(config)), width_(config_.width),
+        : comm_(comm), connection_(makeConnection(comm, hasThreads)), config_(std::move(config)), width_(config_.width),
           height_(config_.height), rank_(rankIn(comm)), grid_(sizeOf(comm)), marcher_(boxOf(rank_)),
           world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
           image_(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f)
     {
         config_.format = dfb::OutputFormat::RGBA32F;
-        ordered_ = std::make_unique<Ordered>(messenger_, config_);
+        ordered_ = std::make_unique<Ordered>(connection_, config_);
         shared_ = std::make_unique<dfb::SharedWorld>(*ordered_, world_);
         for (const dfb::PerspectiveCamera& camera : orbitOf(viewCount, grid_.size(), 1.9f)) {
             MarchedView view{camera, {}};
@@ -181,7 +181,7 @@ public:
     // dfb as in the paper: what comes is sorted. Collective.
     MarchedSystem sorted(const std::string& name)
     {
-        const auto fb = std::make_shared<dfb::DistributedFrameBuffer<dfb::AlphaBlend>>(messenger_, config_);
+        const auto fb = std::make_shared<dfb::DistributedFrameBuffer<dfb::AlphaBlend>>(connection_, config_);
         const auto report = std::make_shared<dfb::FrameReport>();
         return {name,
                 [this, fb, report](const MarchedView& view) {
@@ -263,7 +263,7 @@ private:
     }
 
     MPI_Comm comm_;
-    std::shared_ptr<Messenger> messenger_;
+    std::shared_ptr<Connection> connection_;
     dfb::FrameBufferConfig config_;
     int width_, height_, rank_;
     BrickGrid grid_;

@@ -26,9 +26,9 @@ class PaperStage {
 public:
     // The communicator remains the caller's; `config` has all but the format.
     PaperStage(MPI_Comm comm, PaperScene scene, dfb::FrameBufferConfig config, int views)
-        : scene_(std::move(scene)), messenger_(std::make_shared<dfb::Messenger<dfb::MpiTransport>>(comm)),
-          config_(std::move(config)), cameras_(orbitOf(views, unit, 1.5f)), width_(config_.width),
-          height_(config_.height), grid_(sizeOf(comm)), ranks_(sizeOf(comm))
+        : scene_(std::move(scene)), connection_(dfb::connect<dfb::MpiTransport>(comm)), config_(std::move(config)),
+          cameras_(orbitOf(views, unit, 1.5f)), width_(config_.width), height_(config_.height), grid_(sizeOf(comm)),
+          ranks_(sizeOf(comm))
     {
         MPI_Comm_rank(comm, &rank_);
     }
@@ -149,7 +149,7 @@ private:
     {
         dfb::FrameBufferConfig config = config_;
         config.format = format;
-        const auto fb = std::make_shared<FrameBuffer>(messenger_, config);
+        const auto fb = std::make_shared<FrameBuffer>(connection_, config);
         const auto report = std::make_shared<dfb::FrameReport>();
         PaperWay way;
         way.system = system;
@@ -173,7 +173,7 @@ private:
     }
 
     PaperScene scene_;
-    std::shared_ptr<dfb::Messenger<dfb::MpiTransport>> messenger_;
+    std::shared_ptr<dfb::Connection> connection_;
     dfb::FrameBufferConfig config_;
     std::vector<dfb::PerspectiveCamera> cameras_;
     int width_, height_, rank_ = 0;

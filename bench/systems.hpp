@@ -28,7 +28,7 @@
 
 namespace bench {
 
-using Messenger = dfb::Messenger<dfb::MpiTransport>;
+using dfb::Connection;
 
 // Of all ranks, of what this one has. Collective.
 inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialImage& image)
@@ -126,23 +126,23 @@ struct DfbSettings {
 };
 
 // Without `hasThreads` what each rank does is done by one thread, as with the other systems.
-inline std::shared_ptr<Messenger> makeMessenger(MPI_Comm comm, bool hasThreads)
+inline std::shared_ptr<Connection> makeConnection(MPI_Comm comm, bool hasThreads)
 {
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.progress = hasThreads ? dfb::Progress::Thread : dfb::Progress::Caller;
-    return std::make_shared<Messenger>(comm, options);
+    return dfb::connect<dfb::MpiTransport>(comm, options);
 }
 
 // `inputs` must outlive the systems, here and below.
 template <class TileOp>
-void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& messenger, const Inputs& inputs,
+void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& connection, const Inputs& inputs,
             const std::string& config, const DfbSettings& settings)
 {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
     struct Renderer {
-        Renderer(const std::shared_ptr<Messenger>& sharedMessenger, const dfb::FrameBufferConfig& c,
+        Renderer(const std::shared_ptr<Connection>& sharedConnection, const dfb::FrameBufferConfig& c,
                  const PartialImage& image)
-            : fb(sharedMessenger, c), world(worldOf(image, fb.rank())), shared(fb, world)
+            : fb(sharedConnection, c), world(worldOf(image, fb.rank())), shared(fb, world)
         {
         }
         FrameBuffer fb;
@@ -165,14 +165,14 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Messenger>& mess
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
-        s.start = [c, messenger, toBytes, hasThreads = settings.hasThreads, from = &inputs.image,
+        s.start = [c, connection, toBytes, hasThreads = settings.hasThreads, from = &inputs.image,
                    order = inputs.order] {
             dfb::FrameBufferConfig ownConfig = c;
             if (hasThreads)
                 ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
             else
                 ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
-            const auto r = std::make_shared<Renderer>(messenger, ownConfig, *from);
+            const auto r = std::make_shared<Renderer>(connection, ownConfig, *from);
             Compositor compositor;
             compositor.frame = [r, from, order] {
                 const auto renderBrick = dfb::inPlace([from](const dfb::Brick&, auto& view) {

@@ -4,16 +4,16 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp fwd.hpp comm/compression_gains.hpp detail/fifo.hpp detail/hidden_tiles.hpp detail/quiescence.hpp detail/small_bytes.hpp testing/reference.hpp)
-set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp processors.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp comm/progress.hpp
+set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp processors.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp
             double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
 set(level_2 levels.hpp detail/background_pixels.hpp wire_codes.hpp detail/image_gate.hpp comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
             comm/transport.hpp exec.hpp detail/blend_kernels.hpp detail/sort_kernels.hpp)
-set(level_3 wire_format.hpp tbb_executor.hpp comm/flow_control.hpp comm/reduction.hpp comm/inproc_transport.hpp comm/messenger.hpp comm/mpi_transport.hpp
+set(level_3 wire_format.hpp tbb_executor.hpp comm/flow_control.hpp comm/reduction.hpp comm/inproc_transport.hpp comm/link.hpp comm/mpi_transport.hpp
             detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
-set(level_4 comm/messaging.hpp comm/mpi_session.hpp testing/fault_transport.hpp
+set(level_4 comm/progress.hpp comm/mpi_session.hpp testing/fault_transport.hpp
             testing/transport_conformance.hpp image.hpp render/world.hpp)
-set(level_5 dither.hpp tile.hpp render/footprint.hpp)
-set(level_6 compositing.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
+set(level_5 comm/connection.hpp dither.hpp tile.hpp render/footprint.hpp)
+set(level_6 comm/mailbox.hpp compositing.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 fragment_compositor.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
 set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
             detail/tile_table.hpp detail/frame_terms.hpp)

@@ -180,7 +180,7 @@ dfb::FrameBufferConfig smallConfig()
 void renderAll(MPI_Comm communicator, dfb::Progress progress)
 {
     const std::string name = progress == dfb::Progress::Thread ? "with a thread" : "without a thread";
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.progress = progress;
     {
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>> fb(communicator, smallConfig(), options);

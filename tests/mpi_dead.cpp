@@ -124,7 +124,7 @@ void runRank(const Run& run, int& argc, char**& argv)
     const bool isVictim = mpi.rank() == run.victim;
     std::atomic<bool> handlerCalled{false};
     std::string text, lateText;
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.peerTimeoutMs = timeoutMs;
     if (run.reaction == "handler")
         options.onPeerLost = [&](const dfb::ErrorInfo& error) {
@@ -135,7 +135,7 @@ void runRank(const Run& run, int& argc, char**& argv)
     int lost = -1;
     double toldMs = 0;
     {
-        auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(mpi.communicator(), options);
+        auto connection = dfb::connect<dfb::MpiTransport>(mpi.communicator(), options);
         try {
             const auto make = [&] {
                 dfb::FrameBufferConfig config{256, 256};
@@ -143,7 +143,7 @@ void runRank(const Run& run, int& argc, char**& argv)
                     config.width = config.height = 2048;
                     config.messagePoolBytes = 0; // as small as can be: who sends waits for who takes
                 }
-                return std::make_unique<FrameBuffer>(messenger, config);
+                return std::make_unique<FrameBuffer>(connection, config);
             };
             std::unique_ptr<FrameBuffer> fb;
             if (run.where == "constructor") {

@@ -151,7 +151,7 @@ int main(int argc, char** argv)
         if (everywhere || mpi.rank() == last)
             failing = call;
         const std::string text = transportErrorOf(what, [&] {
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.sharedMemory = shared;
             FrameBuffer fb(mpi.communicator(), config, options);
         });

@@ -21,7 +21,6 @@
 
 namespace {
 
-using Messenger = dfb::Messenger<dfb::MpiTransport>;
 using Single = dfb::BasicImageParallel<16>;
 using FrameBuffer = dfb::DistributedFrameBuffer<Single>;
 
@@ -54,9 +53,9 @@ dfb::FrameBufferConfig smallConfig()
 std::string transportErrorOf(dfb::Progress progress)
 {
     try {
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.progress = progress;
-        Messenger messenger(MPI_COMM_WORLD, options);
+        dfb::connect(MPI_COMM_WORLD, options);
     } catch (const dfb::TransportError& e) {
         return e.what();
     } catch (const std::exception& e) {
@@ -112,18 +111,18 @@ struct Flat {
     }
 };
 
-// A wall, and beside its framebuffer another on the same messenger, with bricks that all ranks have.
+// A wall, and beside its framebuffer another on the same connection, with bricks that all ranks have.
 void wallAndSharedWorld()
 {
-    const auto messenger = std::make_shared<Messenger>(MPI_COMM_WORLD);
-    const int last = messenger->size() - 1;
+    const auto connection = dfb::connect<dfb::MpiTransport>(MPI_COMM_WORLD);
+    const int last = connection->size() - 1;
     const dfb::WallLayout layout{2, 1, 40, 30, 0, 0, {last, 0}};
-    dfb::DisplayWall<> wall(messenger, layout, dfb::OutputFormat::RGBA8);
-    dfb::DistributedFrameBuffer<Single, dfb::ToWall<>> fb(messenger, wall.frameBufferConfig(), {&wall});
+    dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8);
+    dfb::DistributedFrameBuffer<Single, dfb::ToWall> fb(connection, wall.frameBufferConfig(), {&wall});
     dfb::FrameBufferConfig config;
     config.width = 64;
     config.height = 32;
-    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> bricks(messenger, config);
+    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> bricks(connection, config);
     const dfb::World both({{3, {{0, 0, 0}, {32, 32, 1}}}, {9, {{32, 0, 0}, {64, 32, 1}}}});
     const dfb::SharedWorld world(bricks, both);
     dfb::RoundRobinBricks inTurn;
@@ -131,7 +130,7 @@ void wallAndSharedWorld()
         const dfb::FrameReport report = renderTiles(fb, frame);
         wall.finish(report.frame);
         for (int d = 0; d < 2; ++d)
-            if (layout.ranks[static_cast<std::size_t>(d)] == messenger->rank())
+            if (layout.ranks[static_cast<std::size_t>(d)] == connection->rank())
                 checkImage(wall.image(d), fb.layout(), frame, "display " + std::to_string(d), 40 * d);
 
         dfb::renderMixedParallel(bricks, world, Flat(), inTurn, [&](const dfb::Brick& brick, auto& tile) {

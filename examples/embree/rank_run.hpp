@@ -40,6 +40,7 @@ using AdaptiveSingle = dfb::Progressive<dfb::BasicImageParallel<16, tileChannels
 
 using VerifiedBlend = dfb::testing::Verified<Blend>;
 using VerifiedSingle = dfb::testing::Verified<Single>;
+using ToneMapToWall = dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall>;
 
 template <class TileOp>
 inline constexpr bool is_single_v =
@@ -92,9 +93,9 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     return config;
 }
 
-inline dfb::MessengerOptions messengerOptionsOf(const Options& o)
+inline dfb::ConnectionOptions connectionOptionsOf(const Options& o)
 {
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.sharedMemory = o.sharedMemory;
     options.peerTimeoutMs = 1000 * o.peerTimeout;
     return options;
@@ -158,34 +159,32 @@ template <class TileOp, class PixelOp, class Transport>
 class RankRun {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
     using Reduce = typename FrameBuffer::Reduce;
-    using Wall = dfb::DisplayWall<Transport>;
-    using ToWall = dfb::ToWall<Transport>;
-    using ToneMapToWall = dfb::PixelOpChain<dfb::ToneMap, ToWall>;
-    static constexpr bool hasWall = std::is_same_v<PixelOp, ToWall> || std::is_same_v<PixelOp, ToneMapToWall>;
+    static constexpr bool hasWall = std::is_same_v<PixelOp, dfb::ToWall> || std::is_same_v<PixelOp, ToneMapToWall>;
 
 public:
     RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
-        : o_(o), messenger_(std::make_shared<dfb::Messenger<Transport>>(communicator, messengerOptionsOf(o))),
-          threads_(threads > 0 ? threads : messenger_->threadShare())
+        : o_(o), connection_(dfb::connect<Transport>(communicator, connectionOptionsOf(o))),
+          threads_(threads > 0 ? threads : connection_->threadShare())
     {
         dfb::FrameBufferConfig config = configOf(o, threads_);
         PixelOp pixelOp{};
         if constexpr (hasWall) {
             // Of what a wall shows no rank has the whole.
             const auto format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F : dfb::OutputFormat::SRGBA8;
-            wall_ = std::make_unique<Wall>(messenger_, wallOf(o, messenger_->size()), format, config.executor);
-            if constexpr (std::is_same_v<PixelOp, ToWall>)
+            wall_ = std::make_unique<dfb::DisplayWall>(connection_, wallOf(o, connection_->size()), format,
+                                                       config.executor);
+            if constexpr (std::is_same_v<PixelOp, dfb::ToWall>)
                 pixelOp.wall = wall_.get();
             else
                 pixelOp.second.wall = wall_.get();
             config.format = dfb::OutputFormat::None;
         }
         try {
-            fb_ = std::make_unique<FrameBuffer>(messenger_, config, pixelOp);
+            fb_ = std::make_unique<FrameBuffer>(connection_, config, pixelOp);
         } catch (const dfb::InvalidArgument&) {
-            // All ranks throw it. A messenger that ends while an exception passes tells the others that it has failed.
+            // All ranks throw it. A connection that ends while an exception passes tells the others that it has failed.
             wall_.reset();
-            messenger_.reset();
+            connection_.reset();
             throw;
         }
     }
@@ -619,9 +618,9 @@ private:
 
     PhaseClock clock_;
     Options o_;
-    std::shared_ptr<dfb::Messenger<Transport>> messenger_;
+    std::shared_ptr<dfb::Connection> connection_;
     int threads_;
-    std::unique_ptr<Wall> wall_; // outlives the framebuffer that sends to it
+    std::unique_ptr<dfb::DisplayWall> wall_; // outlives the framebuffer that sends to it
     std::unique_ptr<FrameBuffer> fb_;
     std::unique_ptr<RankScene> scene_;
     RenderSettings settings_;
@@ -646,8 +645,6 @@ int runWith(const typename Transport::Communicator& communicator, const Options&
     const auto run = [&](auto tileOp, auto pixelOp) {
         return RankRun<decltype(tileOp), decltype(pixelOp), Transport>(communicator, o, threads).run();
     };
-    using ToWall = dfb::ToWall<Transport>;
-    using ToneMapToWall = dfb::PixelOpChain<dfb::ToneMap, ToWall>;
     if (o.deep > 0 || o.interleave > 1)
         return run(dfb::DeepBlend(), dfb::NoPixelOp());
     if (o.verify)
@@ -662,7 +659,7 @@ int runWith(const typename Transport::Communicator& communicator, const Options&
     if (o.wallColumns > 0 && o.exposure > 0)
         return isImage ? run(Single(), ToneMapToWall()) : run(Blend(), ToneMapToWall());
     if (o.wallColumns > 0)
-        return isImage ? run(Single(), ToWall()) : run(Blend(), ToWall());
+        return isImage ? run(Single(), dfb::ToWall()) : run(Blend(), dfb::ToWall());
     if (o.exposure > 0)
         return isImage ? run(Single(), dfb::ToneMap()) : run(Blend(), dfb::ToneMap());
     return isImage ? run(Single(), dfb::NoPixelOp()) : run(Blend(), dfb::NoPixelOp());

@@ -2,7 +2,7 @@
 // paper). The framebuffer's own image format is None: no rank gets the pixels of another's displays.
 #pragma once
 
-#include <dfb/comm/messaging.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/detail/verdict.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/fwd.hpp>
@@ -48,66 +48,63 @@ struct WallLayout {
     }
 };
 
-template <class Transport>
 class DisplayWall;
 
 // The pixel operation that sends tiles to a wall. Works after every tile operation, and as the last of a PixelOpChain.
-template <class Transport = MpiTransport>
 struct ToWall {
-    DisplayWall<Transport>* wall = nullptr; // outlives the framebuffer
+    DisplayWall* wall = nullptr; // outlives the framebuffer
 
-    void process(PixelTile& tile) const { wall->put(tile); }
+    void process(PixelTile& tile) const;
 };
 
-// One object per rank, over the messenger that the framebuffer uses as well:
+// One object per rank, over the connection that the framebuffer uses as well:
 //
-//   auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(communicator);
-//   dfb::DisplayWall<> wall(messenger, layout, dfb::OutputFormat::SRGBA8);
-//   dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::ToWall<>> fb(messenger, wall.frameBufferConfig(), {&wall});
+//   auto connection = dfb::connect<dfb::MpiTransport>(communicator);
+//   dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::SRGBA8);
+//   dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::ToWall> fb(connection, wall.frameBufferConfig(), {&wall});
 //   const auto report = dfb::renderDataParallel(fb, ...);
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
 // Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them
 // at most `poolBytes` each.
-template <class Transport = MpiTransport>
-class DisplayWall final : private detail::MessageHandler {
+class DisplayWall final : private detail::MailboxOwner {
 public:
-    // Collective, in the same order as the framebuffers of the messenger. `format`: of the displays' images. Throws
+    // Collective, in the same order as the framebuffers of the connection. `format`: of the displays' images. Throws
     // InvalidArgument on all ranks if the layout is none, is not the same on all, or some rank has no memory for it.
-    DisplayWall(std::shared_ptr<Messenger<Transport>> messenger, const WallLayout& layout, OutputFormat format,
+    DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20)
-        : layout_(layout), format_(format), pool_(messenger->pool())
+        : layout_(layout), format_(format), pool_(connection->pool())
     {
         if (!executor)
-            executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
+            executor = std::make_shared<ThreadExecutor>(connection->threadShare());
         const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
-        detail::MessageHandler& self = *this;
-        messaging_ = std::make_unique<detail::Messaging<Transport>>(std::move(messenger), std::move(executor),
-                                                                    std::max(poolBytes, 4 * largest), self);
-        messaging_->start();
-        detail::Agreement mine{true, describe(), messaging_->rank()};
+        detail::MailboxOwner& self = *this;
+        mailbox_ = std::make_unique<detail::Mailbox>(std::move(connection), std::move(executor),
+                                                     std::max(poolBytes, 4 * largest), self);
+        mailbox_->start();
+        detail::Agreement mine{true, describe(), mailbox_->rank()};
         if (const std::string wrong = whatIsWrong(); !wrong.empty())
-            mine = {false, wrong, messaging_->rank()};
+            mine = {false, wrong, mailbox_->rank()};
         else
             try {
                 takeMemory();
             } catch (const std::exception& e) { // the others must not wait for this rank
-                mine = {false, e.what(), messaging_->rank()};
+                mine = {false, e.what(), mailbox_->rank()};
             }
-        const auto all = detail::agree(*messaging_, mine);
+        const auto all = detail::agree(*mailbox_, mine);
         if (!all.fine) {
-            messaging_->stop();
-            messaging_.reset();
+            mailbox_->stop();
+            mailbox_.reset();
             all.refuse();
         }
-        messaging_->messenger().setAlike();
+        mailbox_->connection().setAlike();
     }
 
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
     // Collective. After the framebuffers whose pixel operation sends here.
-    ~DisplayWall() { messaging_->stop(); }
+    ~DisplayWall() { mailbox_->stop(); }
 
     const WallLayout& layout() const noexcept { return layout_; }
 
@@ -129,8 +126,8 @@ public:
     // allReduce() does. Throws TransportError.
     void finish(std::int64_t frame, int timeoutMs = 0)
     {
-        messaging_->requireProgress();
-        messaging_->messenger().expectMessages(true);
+        mailbox_->requireProgress();
+        mailbox_->connection().expectMessages(true);
         bool complete = true;
         std::string missing;
         try {
@@ -138,23 +135,23 @@ public:
             if (timeoutMs > 0)
                 deadline = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs);
             tellSent(frame);
-            messaging_->wait([&] { return isOver(frame) || hasError(); }, deadline);
+            mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
             missing = whatIsMissing(frame);
             complete = missing.empty();
         } catch (...) {
-            messaging_->messenger().expectMessages(false);
+            mailbox_->connection().expectMessages(false);
             throw;
         }
-        detail::Agreement mine{complete, complete ? "" : missing, messaging_->rank()};
-        const auto all = detail::Agreement::from(messaging_->reduce(mine.bytes(), detail::Agreement::combine));
-        messaging_->messenger().expectMessages(false);
+        detail::Agreement mine{complete, complete ? "" : missing, mailbox_->rank()};
+        const auto all = detail::Agreement::from(mailbox_->reduce(mine.bytes(), detail::Agreement::combine));
+        mailbox_->connection().expectMessages(false);
         const std::lock_guard<std::mutex> lock(mutex_);
         if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
             for (auto& [display, picture] : *done->second)
                 std::swap(shown_.at(display), picture.image);
         if (all.fine)
             shownFrame_ = frame;
-        messaging_->reductions().forget(SentPixels, frame);
+        mailbox_->reductions().forget(SentPixels, frame);
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
         sent_.erase(sent_.begin(), sent_.upper_bound(frame));
         allSent_.erase(allSent_.begin(), allSent_.upper_bound(frame));
@@ -199,7 +196,7 @@ public:
                 continue;
             detail::MessageHeader header;
             header.kind = detail::MessageKind::FinishedTiles;
-            header.receiver = messaging_->address();
+            header.receiver = mailbox_->address();
             header.number = tile.frame;
             const PartHeader where{
                 d, {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0, part.y1 - display.y0}};
@@ -213,7 +210,7 @@ public:
                                           + static_cast<std::size_t>(part.x0 - tile.region.x0);
                 convertPixels(tile.color + 4 * first, part.width(), format_, out);
             }
-            messaging_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
+            mailbox_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
             countSent(tile.frame, d, static_cast<std::int64_t>(part.width()) * part.height());
         }
     }
@@ -236,7 +233,7 @@ private:
     // At the end of what a display misses.
     static constexpr std::string_view unsent = " that no rank has sent";
 
-    enum Scope : std::uint32_t { SentPixels = detail::Messaging<Transport>::ownScope + 1 }; // of reductions
+    enum Scope : std::uint32_t { SentPixels = detail::Mailbox::ownScope + 1 }; // of reductions
 
     struct Picture {
         Image image;
@@ -258,7 +255,7 @@ private:
         for (const int rank : layout_.ranks)
             ranks += (ranks.empty() ? "" : ", ") + text(rank);
         settings.add("the list of its displays' ranks", '{' + ranks + '}');
-        settings.add("checksums", messaging_->messenger().options().checksums);
+        settings.add("checksums", mailbox_->connection().options().checksums);
         return settings.text();
     }
 
@@ -274,9 +271,9 @@ private:
             return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
                    + std::to_string(layout_.ranks.size()) + " ranks";
         for (const int rank : layout_.ranks)
-            if (rank < 0 || rank >= messaging_->size())
+            if (rank < 0 || rank >= mailbox_->size())
                 return "a display of the wall is driven by rank " + std::to_string(rank) + " of "
-                       + std::to_string(messaging_->size());
+                       + std::to_string(mailbox_->size());
         return "";
     }
 
@@ -286,7 +283,7 @@ private:
     {
         std::vector<Image> images;
         for (int d = 0; d < layout_.displayCount(); ++d)
-            if (layout_.ranks[static_cast<std::size_t>(d)] == messaging_->rank()) {
+            if (layout_.ranks[static_cast<std::size_t>(d)] == mailbox_->rank()) {
                 shown_.emplace(d, Image());
                 for (int i = 0; i < 2; ++i)
                     images.emplace_back(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0);
@@ -296,20 +293,20 @@ private:
     void incoming(int source, const detail::MessageHeader& header, Buffer&& message) override
     {
         const std::size_t byteCount = message.size();
-        if (source != messaging_->rank() && messaging_->needsCredit(header.kind))
-            messaging_->flow().consumed(source, byteCount);
+        if (source != mailbox_->rank() && mailbox_->needsCredit(header.kind))
+            mailbox_->flow().consumed(source, byteCount);
         try {
             switch (header.kind) {
             case detail::MessageKind::CreditRequest:
-                messaging_->flow().requested(source, bodyAs<detail::FlowControl::Request>(message));
+                mailbox_->flow().requested(source, bodyAs<detail::FlowControl::Request>(message));
                 break;
             case detail::MessageKind::Credit:
-                messaging_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
+                mailbox_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
                 break;
             case detail::MessageKind::FinishedTiles: store(header.number, message); break;
             case detail::MessageKind::ReduceUp:
             case detail::MessageKind::ReduceDown:
-                if (messaging_->keyOf(header, message).scope == SentPixels) {
+                if (mailbox_->keyOf(header, message).scope == SentPixels) {
                     receiveSent(source, header, message);
                     break;
                 }
@@ -322,18 +319,18 @@ private:
             if (header.kind == detail::MessageKind::FinishedTiles)
                 refuse(source, e.info(), header.number);
             else // it may have been one that finish() waits for
-                messaging_->giveUp(source, e.info());
+                mailbox_->giveUp(source, e.info());
         } catch (const std::bad_alloc& e) { // for more frames than one
             ErrorInfo info;
             info.kind = ErrorKind::Transport;
             info.message = e.what();
-            messaging_->giveUp(source, info);
+            mailbox_->giveUp(source, info);
         }
     }
 
     void undecodable(int source, const ErrorInfo& error) override
     {
-        messaging_->keepDamage(source, error); // it may have been a part of what finish() waits for
+        mailbox_->keepDamage(source, error); // it may have been a part of what finish() waits for
         refuse(source, error, 0);
     }
 
@@ -346,7 +343,7 @@ private:
             errorFrame_ = std::max({errorFrame_, newest_, coming_.empty() ? 0 : coming_.rbegin()->first,
                                     frame <= lastPossible() ? frame : 0});
         }
-        messaging_->notify();
+        mailbox_->notify();
     }
 
     template <class Body>
@@ -395,7 +392,7 @@ private:
             complete = picture.pixelsLeft == 0;
         }
         if (complete)
-            messaging_->notify();
+            mailbox_->notify();
     }
 
     // Takes note that these pixels have come, and must not come again; under mutex_.
@@ -461,7 +458,7 @@ private:
         }
         mine.resize(static_cast<std::size_t>(layout_.displayCount()));
         const auto* first = reinterpret_cast<const std::byte*>(mine.data());
-        messaging_->reductions().enter(
+        mailbox_->reductions().enter(
             {SentPixels, frame}, Sums(first, first + mine.size() * sizeof mine[0]),
             [](const Sums& a, const Sums& b) { // equally long: receiveSent()
                 detail::ByteReader x(a), y(b);
@@ -479,7 +476,7 @@ private:
                     sent.resize(static_cast<std::size_t>(layout_.displayCount()));
                     std::copy(all.begin(), all.end(), reinterpret_cast<std::byte*>(sent.data()));
                 }
-                messaging_->notify();
+                mailbox_->notify();
             });
     }
 
@@ -490,10 +487,10 @@ private:
             if (header.number > lastPossible())
                 detail::failMalformed("word of a frame that no rank can have begun", lastPossible(), header.number);
         }
-        if (messaging_->bytesOf(message).size()
+        if (mailbox_->bytesOf(message).size()
             != static_cast<std::size_t>(layout_.displayCount()) * sizeof(std::int64_t))
             detail::failMalformed("word of what was sent to other displays than there are");
-        messaging_->receiveReduction(source, header, message);
+        mailbox_->receiveReduction(source, header, message);
     }
 
     // Under mutex_: what has not come to a display of this rank, and whether nothing more will.
@@ -530,7 +527,7 @@ private:
             const std::int64_t left = pixelsLeft(frame, display);
             if (left > 0)
                 text += (text.empty() ? "display " : ", display ") + std::to_string(display) + " of rank "
-                        + std::to_string(messaging_->rank()) + " misses " + std::to_string(left) + " pixels"
+                        + std::to_string(mailbox_->rank()) + " misses " + std::to_string(left) + " pixels"
                         + std::string(hasAllSent(frame, display) ? unsent : "");
         }
         return text;
@@ -550,9 +547,11 @@ private:
     std::string error_;           // under mutex_
     std::int64_t errorFrame_ = 0; // the last that error_ may be about; under mutex_
 
-    std::unique_ptr<detail::Messaging<Transport>> messaging_; // last: its tasks use the others
+    std::unique_ptr<detail::Mailbox> mailbox_; // last: its tasks use the others
 };
 
-static_assert(is_pixel_op_v<ToWall<InprocTransport>>);
+inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
+
+static_assert(is_pixel_op_v<ToWall>);
 
 } // namespace dfb

@@ -27,7 +27,7 @@ class DistributedFrameBuffer {
     static_assert(detail::checkPixelOp<PixelOp>());
     static_assert(detail::checkTransport<Transport>());
 
-    using Engine = detail::FrameEngine<TileOp, PixelOp, Transport>;
+    using Engine = detail::FrameEngine<TileOp, PixelOp>;
 
 public:
     using Config = FrameBufferConfig;
@@ -187,30 +187,30 @@ public:
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
-        : DistributedFrameBuffer(communicator, std::move(config), MessengerOptions(), std::move(pixelOp))
+        : DistributedFrameBuffer(communicator, std::move(config), ConnectionOptions(), std::move(pixelOp))
     {
     }
 
-    // The same with a messenger made with these options, for this framebuffer alone.
-    DistributedFrameBuffer(const Communicator& communicator, Config config, MessengerOptions options,
+    // The same with a connection made with these options, for this framebuffer alone.
+    DistributedFrameBuffer(const Communicator& communicator, Config config, ConnectionOptions options,
                            PixelOp pixelOp = {})
-        : DistributedFrameBuffer(std::make_shared<Messenger<Transport>>(communicator, std::move(options)),
-                                 std::move(config), std::move(pixelOp))
+        : DistributedFrameBuffer(connect<Transport>(communicator, std::move(options)), std::move(config),
+                                 std::move(pixelOp))
     {
     }
 
-    // The same over a messenger that several framebuffers share; they are made in the same order on all ranks.
-    DistributedFrameBuffer(std::shared_ptr<Messenger<Transport>> messenger, Config config, PixelOp pixelOp = {})
+    // The same over a connection that several framebuffers share; they are made in the same order on all ranks.
+    DistributedFrameBuffer(std::shared_ptr<Connection> connection, Config config, PixelOp pixelOp = {})
     {
         if (!config.executor)
-            config.executor = std::make_shared<ThreadExecutor>(messenger->threadShare());
+            config.executor = std::make_shared<ThreadExecutor>(connection->threadShare());
         try {
             for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
-                engines_.push_back(std::make_unique<Engine>(messenger, config, pixelOp, slot));
+                engines_.push_back(std::make_unique<Engine>(connection, config, pixelOp, slot));
         } catch (const InvalidArgument&) {
-            // All ranks throw it: the messenger's end is in order, so it must not come while an exception passes.
+            // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
             engines_.clear();
-            messenger.reset();
+            connection.reset();
             throw;
         }
         lastEnded_ = engines_.front().get();

@@ -123,7 +123,7 @@ private:
 class ThreadExecutor final : public Executor {
 public:
     // `threadCount` workers; 0: one for each processor that the calling thread may run on. Where several ranks share
-    // them, that is too many: see Messenger::threadShare().
+    // them, that is too many: see Connection::threadShare().
     explicit ThreadExecutor(int threadCount = 0)
     {
         if (threadCount <= 0)

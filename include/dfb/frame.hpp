@@ -26,8 +26,9 @@ enum class CompressionMode : std::uint8_t {
          // messages become smaller by it, as each rank finds out by itself
 };
 
-// What a framebuffer is made with; how its messages travel is said by the MessengerOptions. Everything but the executor
-// and quietMs must be the same on all ranks, as must the types of its operations, which is checked when it is made.
+// What a framebuffer is made with; how its messages travel is said by the ConnectionOptions. Everything but the
+// executor and quietMs must be the same on all ranks, as must the types of its operations, which is checked when it is
+// made.
 struct FrameBufferConfig {
     int width = 0, height = 0;                 // pixels, 1 to 65536
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
@@ -48,8 +49,8 @@ struct FrameBufferConfig {
     // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
     // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
     std::size_t messagePoolBytes = std::size_t{64} << 20;
-    // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see Messenger::threadShare().
-    // A CallerExecutor makes no threads.
+    // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see
+    // Connection::threadShare(). A CallerExecutor makes no threads.
     std::shared_ptr<Executor> executor{};
     // So long a rank waits in end() until it looks whether anything is still under way on any rank; then it does so
     // more and more seldom. A frame that nothing can complete any more is found by that: see ErrorKind::MissingInput. 1

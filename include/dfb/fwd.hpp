@@ -8,9 +8,7 @@ class MpiTransport;    // comm/mpi_transport.hpp
 class InprocTransport; // comm/inproc_transport.hpp
 class Executor;        // exec.hpp
 class Image;           // image.hpp
-
-template <class Transport>
-class Messenger; // comm/messenger.hpp
+class Connection;      // comm/connection.hpp
 
 template <class TileOp, class PixelOp = NoPixelOp, class Transport = MpiTransport>
 class DistributedFrameBuffer; // distributed_framebuffer.hpp

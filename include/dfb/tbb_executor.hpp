@@ -17,7 +17,7 @@ namespace dfb {
 class TbbExecutor final : public Executor {
 public:
     // 0: one for each processor that oneTBB finds for this process. Where several ranks share them, that is too many:
-    // see Messenger::threadShare().
+    // see Connection::threadShare().
     explicit TbbExecutor(int threadCount = 0) : arena_(threadCount > 0 ? threadCount : tbb::task_arena::automatic, 1)
     {
         arena_.initialize();

@@ -169,30 +169,30 @@ struct BlamedConfig {
         }
         for (const int odd : oddRanks(size)) {
             const auto makeWall = [&](bool checksums, int bezel, int displays) {
-                dfb::MessengerOptions options;
+                dfb::ConnectionOptions options;
                 options.checksums = checksums;
                 dfb::WallLayout layout;
                 layout.columns = displays;
                 layout.displayWidth = layout.displayHeight = 8;
                 layout.bezelX = bezel;
                 layout.ranks = {0, 1};
-                const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator, options);
+                const auto connection = dfb::connect<Transport>(communicator, options);
                 return scene::outcomeOf([&] {
-                    dfb::DisplayWall<Transport> wall(messenger, layout, dfb::OutputFormat::RGBA8,
-                                                     std::make_shared<dfb::ThreadExecutor>(1));
+                    dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8,
+                                          std::make_shared<dfb::ThreadExecutor>(1));
                 });
             };
-            // The exception takes the messenger along.
+            // The exception takes the connection along.
             const auto makeWide = [&](int width) {
                 return scene::outcomeOf([&] {
-                    const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+                    const auto connection = dfb::connect<Transport>(communicator);
                     Config config = configOf(s);
                     config.width = width;
-                    BlameFrameBuffer<Transport> fb(messenger, config);
+                    BlameFrameBuffer<Transport> fb(connection, config);
                 });
             };
             const std::string sums = scene::outcomeOf([&] {
-                dfb::MessengerOptions options;
+                dfb::ConnectionOptions options;
                 options.checksums = rank == odd;
                 BlameFrameBuffer<Transport> fb(communicator, configOf(s), options);
             });

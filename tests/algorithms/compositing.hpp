@@ -266,7 +266,7 @@ struct BlackInFront {
     }
 
     template <class TileOp, class Transport, class RenderBrick>
-    static void frame(const std::shared_ptr<dfb::Messenger<Transport>>& messenger, dfb::WireFormat format,
+    static void frame(const std::shared_ptr<dfb::Connection>& connection, dfb::WireFormat format,
                       const RenderBrick& renderBrick, Result& result)
     {
         scene::Scene s;
@@ -276,7 +276,7 @@ struct BlackInFront {
         auto config = configOf(s, 1);
         config.wire = format;
         config.aux = dfb::imageAuxChannels;
-        dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(messenger, config);
+        dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(connection, config);
         dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(), renderBrick,
                                 paramsOf(s));
         if (!fb.isDisplayRank())
@@ -290,7 +290,7 @@ struct BlackInFront {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto connection = dfb::connect<Transport>(communicator);
         const auto render = [](const dfb::Brick& b, auto& tile) {
             tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
                 const Pixel p = pixelOf(b.id, x, y);
@@ -315,9 +315,9 @@ struct BlackInFront {
         });
         for (const auto format :
              {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
-            frame<Op>(messenger, format, render, result);
-            frame<Op>(messenger, format, find, result);
-            frame<dfb::Progressive<Op>>(messenger, format, render, result);
+            frame<Op, Transport>(connection, format, render, result);
+            frame<Op, Transport>(connection, format, find, result);
+            frame<dfb::Progressive<Op>, Transport>(connection, format, render, result);
         }
         return result;
     }

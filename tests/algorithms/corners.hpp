@@ -243,9 +243,9 @@ class Corner {
     using Tile = typename FrameBuffer::Tile;
 
 public:
-    Corner(const std::shared_ptr<dfb::Messenger<Transport>>& messenger, const dfb::FrameBufferConfig& config, Loop loop,
+    Corner(const std::shared_ptr<dfb::Connection>& connection, const dfb::FrameBufferConfig& config, Loop loop,
            dfb::BlendRule rule, Result& result)
-        : fb_(messenger, config), loop_(loop), result_(result), good_(sceneFor(loop, rule, 11)),
+        : fb_(connection, config), loop_(loop), result_(result), good_(sceneFor(loop, rule, 11)),
           other_(sceneFor(loop, rule, 12)), mine_(bricksOf(good_, fb_.rank(), fb_.size())), world_(fb_, copiesOf(mine_))
     {
     }
@@ -726,18 +726,18 @@ struct Corners {
         using Deep = Trapped<dfb::BasicDeepBlend<32>>;
         using dfb::BlendRule;
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
-        Count count{messenger->size()};
-        faults<Blend, dfb::NoPixelOp, Transport>(messenger, {Loop::Data, Loop::ByHand, Loop::Mixed},
+        const auto connection = dfb::connect<Transport>(communicator);
+        Count count{connection->size()};
+        faults<Blend, dfb::NoPixelOp, Transport>(connection, {Loop::Data, Loop::ByHand, Loop::Mixed},
                                                  BlendRule::SortByDepth, result, count);
-        faults<Ordered, dfb::NoPixelOp, Transport>(messenger, {Loop::Ordered}, BlendRule::InOrder, result, count);
-        faults<Depth, TrappedPixels<true>, Transport>(messenger, {Loop::Data, Loop::ByHand}, BlendRule::Nearest, result,
-                                                      count);
-        faults<Whole, TrappedPixels<false>, Transport>(messenger,
+        faults<Ordered, dfb::NoPixelOp, Transport>(connection, {Loop::Ordered}, BlendRule::InOrder, result, count);
+        faults<Depth, TrappedPixels<true>, Transport>(connection, {Loop::Data, Loop::ByHand}, BlendRule::Nearest,
+                                                      result, count);
+        faults<Whole, TrappedPixels<false>, Transport>(connection,
                                                        {Loop::ImageOwned, Loop::ImageRoundRobin, Loop::ImageDynamic},
                                                        BlendRule::SortByDepth, result, count);
-        faults<Accumulated, dfb::NoPixelOp, Transport>(messenger, {Loop::Data}, BlendRule::SortByDepth, result, count);
-        faults<Deep, TrappedPixels<false>, Transport>(messenger, {Loop::Deep}, BlendRule::SortByDepth, result, count);
+        faults<Accumulated, dfb::NoPixelOp, Transport>(connection, {Loop::Data}, BlendRule::SortByDepth, result, count);
+        faults<Deep, TrappedPixels<false>, Transport>(connection, {Loop::Deep}, BlendRule::SortByDepth, result, count);
         static const std::map<int, int> expected{{1, 501}, {2, 1046}, {3, 1489}, {4, 1757}, {7, 670}};
         const auto found = expected.find(count.ranks);
         result.expect(found != expected.end() && found->second == count.faults,
@@ -751,13 +751,13 @@ private:
     };
 
     template <class TileOp, class PixelOp, class Transport>
-    static void faults(const std::shared_ptr<dfb::Messenger<Transport>>& messenger,
-                       const std::vector<corners::Loop>& loops, dfb::BlendRule rule, Result& result, Count& count)
+    static void faults(const std::shared_ptr<dfb::Connection>& connection, const std::vector<corners::Loop>& loops,
+                       dfb::BlendRule rule, Result& result, Count& count)
     {
         for (const corners::Loop loop : loops) {
             dfb::FrameBufferConfig config = configOf(corners::sceneFor(loop, rule, 0), count.loops % 3);
             config.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
-            corners::Corner<TileOp, PixelOp, Transport> corner(messenger, config, loop, rule, result);
+            corners::Corner<TileOp, PixelOp, Transport> corner(connection, config, loop, rule, result);
             count.faults += corner.run();
             ++count.loops;
         }

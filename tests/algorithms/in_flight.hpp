@@ -91,17 +91,17 @@ struct LoopsInFlight {
     }
 };
 
-// Two framebuffers of other sizes and operations, over one messenger.
+// Two framebuffers of other sizes and operations, over one connection.
 struct TwoFrameBuffers {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto connection = dfb::connect<Transport>(communicator);
         const scene::Scene a = scene::makeScene(5, 3), b = scene::makeScene(1, 4, 128, 33);
-        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> blend(messenger,
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> blend(connection,
                                                                                                configOf(a, 1));
-        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(messenger,
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(connection,
                                                                                                    configOf(b, 1));
         for (int round = 0; round < 3; ++round) {
             auto frame = blend.begin(paramsOf(a));

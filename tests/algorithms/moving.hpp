@@ -227,12 +227,12 @@ struct ChangingDeclarations {
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicDeepBlend<16>, dfb::NoPixelOp, Transport>;
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto connection = dfb::connect<Transport>(communicator);
         const std::vector<Step> all = steps();
         auto config = configOf(sceneOf(all[0]));
         std::deque<FrameBuffer> kept; // one of each loop
         for (int loop = 0; loop < Loops; ++loop)
-            kept.emplace_back(messenger, config);
+            kept.emplace_back(connection, config);
         std::vector<std::uint64_t> hashes;
         for (std::size_t i = 0; i < all.size(); ++i) {
             const Step& step = all[i];
@@ -240,7 +240,7 @@ struct ChangingDeclarations {
             std::optional<FrameBuffer> fresh;
             scene::Picture expected;
             if (step.fails == Fails::Never) {
-                fresh.emplace(messenger, config);
+                fresh.emplace(connection, config);
                 const dfb::FrameReport report = start(*fresh, Data, step, number).end();
                 expected = scene::Picture(fresh->image(), report);
                 if (fresh->isDisplayRank())
@@ -267,7 +267,7 @@ struct ChangingDeclarations {
         }
         // The same with two frames open at a time.
         config.framesInFlight = 2;
-        FrameBuffer fb(messenger, config);
+        FrameBuffer fb(connection, config);
         std::deque<typename FrameBuffer::Frame> open;
         std::size_t ended = 0;
         const auto endFirst = [&] {

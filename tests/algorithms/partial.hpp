@@ -71,7 +71,7 @@ struct PartialFrames {
     {
         Result result;
         for (const bool shared : {true, false}) {
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.sharedMemory = shared;
             const scene::Scene s = scene::makeScene(5, 3);
             auto config = configOf(s, 2);

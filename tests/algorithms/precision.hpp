@@ -30,13 +30,13 @@ struct Precision {
     {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto connection = dfb::connect<Transport>(communicator);
         const auto frame = [&](const dfb::WirePrecision& wire, float minTransmittance, int maxLayers,
                                bool inRange) -> std::pair<std::vector<float>, dfb::FrameReport> {
             auto config = configOf(s, 1);
             config.wire = wire;
             config.minTransmittance = minTransmittance;
-            dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(messenger, config);
+            dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(connection, config);
             auto params = paramsOf(s);
             params.maxLayers = maxLayers;
             const auto report = dfb::renderDataParallel(
@@ -108,7 +108,7 @@ struct OtherChannels {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
         const std::array<float, 3> normal{0.6f, 0.0f, -0.8f};
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
+        const auto connection = dfb::connect<Transport>(communicator);
         std::vector<float> depth, position;
         std::vector<std::uint32_t> ids;
         for (const auto format :
@@ -116,7 +116,7 @@ struct OtherChannels {
             auto config = configOf(s, 1);
             config.wire = format;
             config.aux = dfb::imageAuxChannels;
-            dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(messenger, config);
+            dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(connection, config);
             dfb::renderDataParallel(
                 fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
                 [&](const dfb::Brick& b, auto& tile) {
@@ -169,8 +169,8 @@ struct NoPrecision {
     {
         Result result;
         const auto [rank, size] = [&] {
-            const dfb::Messenger<Transport> messenger(communicator);
-            return std::make_pair(messenger.rank(), messenger.size());
+            const auto connection = dfb::connect<Transport>(communicator);
+            return std::make_pair(connection->rank(), connection->size());
         }();
         const scene::Scene s = scene::makeScene(2, 1);
         const float nan = std::numeric_limits<float>::quiet_NaN();

@@ -24,9 +24,9 @@ inline dfb::FrameBufferConfig quickConfig(const scene::Scene& s, int threads = 1
 }
 
 // With no threads the ranks' own ones move messages, too.
-inline dfb::MessengerOptions optionsOf(int threads)
+inline dfb::ConnectionOptions optionsOf(int threads)
 {
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.progress = threads > 0 ? dfb::Progress::Thread : dfb::Progress::Caller;
     return options;
 }
@@ -179,8 +179,8 @@ struct QuietOthers {
             config.framesInFlight = 1;
         }
         {
-            const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
-            FrameBuffer a(messenger, config), b(messenger, config);
+            const auto connection = dfb::connect<Transport>(communicator);
+            FrameBuffer a(connection, config), b(connection, config);
             auto inA = a.begin(paramsOf(s));
             auto inB = b.begin(paramsOf(s));
             sendAll(a, inA, s, false);
@@ -212,15 +212,14 @@ struct QuietWall {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
-        const dfb::WallLayout layout{2, 1, 40, 48, 0, 0, {0, messenger->size() - 1}};
+        const auto connection = dfb::connect<Transport>(communicator);
+        const dfb::WallLayout layout{2, 1, 40, 48, 0, 0, {0, connection->size() - 1}};
         const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
-        dfb::DisplayWall<Transport> wall(messenger, layout, dfb::OutputFormat::RGBA8, executor);
+        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8, executor);
         auto config = wall.frameBufferConfig();
         config.executor = executor;
         config.quietMs = 5;
-        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall<Transport>, Transport> fb(messenger, config,
-                                                                                                    {&wall});
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall, Transport> fb(connection, config, {&wall});
         const auto frame = [&](int tiles, bool allowPartial) {
             dfb::FrameParams params;
             params.allowPartial = allowPartial;

@@ -15,16 +15,16 @@ using FrameBufferOf = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
 
 struct Wall {
     template <class TileOp, class Transport, class Render>
-    static void check(const std::shared_ptr<dfb::Messenger<Transport>>& messenger, const dfb::WallLayout& layout,
+    static void check(const std::shared_ptr<dfb::Connection>& connection, const dfb::WallLayout& layout,
                       dfb::OutputFormat format, Result& result, const std::string& name, const Render& render)
     {
         auto executor = std::make_shared<dfb::ThreadExecutor>(2);
-        dfb::DisplayWall<Transport> wall(messenger, layout, format, executor);
+        dfb::DisplayWall wall(connection, layout, format, executor);
         dfb::FrameBufferConfig config = wall.frameBufferConfig();
         config.executor = executor;
-        FrameBufferOf<TileOp, dfb::ToWall<Transport>, Transport> toWall(messenger, config, {&wall});
+        FrameBufferOf<TileOp, dfb::ToWall, Transport> toWall(connection, config, {&wall});
         config.format = format;
-        FrameBufferOf<TileOp, dfb::NoPixelOp, Transport> single(messenger, config);
+        FrameBufferOf<TileOp, dfb::NoPixelOp, Transport> single(connection, config);
         result.expect(wall.imageFrame() == -1, name + ": a frame before the first");
         for (int d = 0; d < layout.displayCount(); ++d)
             if (layout.ranks[static_cast<std::size_t>(d)] == single.rank())
@@ -70,8 +70,8 @@ struct Wall {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
-        const int size = messenger->size();
+        const auto connection = dfb::connect<Transport>(communicator);
+        const int size = connection->size();
         const auto dealt = [size](dfb::WallLayout layout, int first) {
             for (int d = 0; d < layout.displayCount(); ++d)
                 layout.ranks.push_back((d + first) % size);
@@ -96,16 +96,16 @@ struct Wall {
                 fb, dfb::WorkDistribution::RoundRobin, [&](auto& tile) { renderBrick(s, s.bricks[0], tile); },
                 paramsOfFrame(frame));
         };
-        check<dfb::BasicAlphaBlend<16>, Transport>(messenger, dealt({2, 2, 40, 30, 0, 0, {}}, 0),
+        check<dfb::BasicAlphaBlend<16>, Transport>(connection, dealt({2, 2, 40, 30, 0, 0, {}}, 0),
                                                    dfb::OutputFormat::RGBA32F, result, "2x2", data);
-        check<dfb::BasicImageParallel<32>, Transport>(messenger, dealt({3, 1, 25, 41, 7, 0, {}}, 1),
+        check<dfb::BasicImageParallel<32>, Transport>(connection, dealt({3, 1, 25, 41, 7, 0, {}}, 1),
                                                       dfb::OutputFormat::SRGBA8, result, "3x1 with bezels", image);
-        check<dfb::BasicAlphaBlend<16>, Transport>(messenger, dealt({1, 5, 61, 9, 0, 40, {}}, 2),
+        check<dfb::BasicAlphaBlend<16>, Transport>(connection, dealt({1, 5, 61, 9, 0, 40, {}}, 2),
                                                    dfb::OutputFormat::RGBA8, result, "1x5 with wide bezels", data);
         dfb::WallLayout wrong = dealt({2, 2, 8, 8, 0, 0, {}}, 0);
         wrong.ranks[3] = size;
         const std::string outcome =
-            scene::outcomeOf([&] { dfb::DisplayWall<Transport>(messenger, wrong, dfb::OutputFormat::RGBA8); });
+            scene::outcomeOf([&] { dfb::DisplayWall(connection, wrong, dfb::OutputFormat::RGBA8); });
         result.expect(scene::has(outcome, "is driven by rank"), outcome);
         return result;
     }
@@ -117,15 +117,15 @@ struct WallProgressive {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        const auto messenger = std::make_shared<dfb::Messenger<Transport>>(communicator);
-        dfb::WallLayout layout{2, 1, 40, 50, 3, 0, {0, messenger->size() - 1}};
+        const auto connection = dfb::connect<Transport>(communicator);
+        dfb::WallLayout layout{2, 1, 40, 50, 3, 0, {0, connection->size() - 1}};
         auto executor = std::make_shared<dfb::ThreadExecutor>(1);
-        dfb::DisplayWall<Transport> wall(messenger, layout, dfb::OutputFormat::RGBA32F, executor);
+        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA32F, executor);
         auto config = wall.frameBufferConfig();
         config.executor = executor;
         using Op = dfb::Progressive<dfb::BasicImageParallel<16>>;
-        FrameBufferOf<Op, dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall<Transport>>, Transport> fb(
-            messenger, config, {dfb::ToneMap{}, dfb::ToWall<Transport>{&wall}});
+        FrameBufferOf<Op, dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall>, Transport> fb(
+            connection, config, {dfb::ToneMap{}, dfb::ToWall{&wall}});
         dfb::AdaptiveSampler sampler(fb.layout(), {0.05, 2, 16, 4});
         const auto render = [&](bool fails) {
             // Noise on the left, where it takes many samples, none on the right.

@@ -5,8 +5,8 @@
 // An input: a byte that picks which, then its bytes.
 #include "fuzz.hpp"
 
+#include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
-#include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/detail/job_share.hpp>
 #include <dfb/detail/manifest.hpp>

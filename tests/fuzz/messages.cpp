@@ -325,7 +325,7 @@ private:
     {
         auto config = configFor(way_);
         config.executor = peer_->tasks;
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.progress = dfb::Progress::Caller;
         options.sharedMemory = false;
         options.checksums = way_.has(Checksums);
@@ -335,20 +335,20 @@ private:
         const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
             peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
         };
-        messenger_ = std::make_shared<dfb::Messenger<PlayedTransport>>(peer_, options);
+        connection_ = dfb::connect<PlayedTransport>(peer_, options);
         if (way_.has(NoConfiguration))
             sendAll(*peer_, in_, way_, 0);
         PixelOp pixelOp;
         if constexpr (!std::is_same_v<PixelOp, dfb::NoPixelOp>) {
             if (!way_.has(NoConfiguration))
                 agree(0, d::Agreement{true, wallText(options.checksums), 1});
-            wall_.emplace(messenger_, wallLayout(), dfb::OutputFormat::RGBA8, peer_->tasks);
+            wall_.emplace(connection_, wallLayout(), dfb::OutputFormat::RGBA8, peer_->tasks);
             pixelOp.wall = &*wall_;
         }
         if (!way_.has(NoConfiguration))
             for (std::size_t i = 0; i < way_.engineCount(); ++i)
                 agree(way_.addressOf(static_cast<std::int64_t>(i) + 1), agreement);
-        fb_.emplace(messenger_, config, pixelOp);
+        fb_.emplace(connection_, config, pixelOp);
         if (way_.has(Gathers)) {
             sendAll(*peer_, in_, way_, 1);
             const auto all = fb_->allGather(std::vector<std::byte>(3));
@@ -429,8 +429,8 @@ private:
     fuzz::Input& in_;
     int fine_ = 0;
     std::shared_ptr<Peer> peer_;
-    std::shared_ptr<dfb::Messenger<PlayedTransport>> messenger_;
-    std::optional<dfb::DisplayWall<PlayedTransport>> wall_;
+    std::shared_ptr<dfb::Connection> connection_;
+    std::optional<dfb::DisplayWall> wall_;
     std::optional<FrameBuffer> fb_;
     std::unique_ptr<typename FrameBuffer::Tile> tile_ = std::make_unique<typename FrameBuffer::Tile>();
 };
@@ -439,7 +439,7 @@ template <class TileOp>
 int play(Way way, fuzz::Input& in)
 {
     if (way.has(Wall))
-        return Player<TileOp, dfb::ToWall<PlayedTransport>>(way, in).play();
+        return Player<TileOp, dfb::ToWall>(way, in).play();
     return Player<TileOp, dfb::NoPixelOp>(way, in).play();
 }
 

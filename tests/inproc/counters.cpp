@@ -372,12 +372,12 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
         for (auto& count : *tiles)
             count = 0;
     dfb::runRanks(rankCount, [&](dfb::InprocCommunicator communicator) {
-        const auto messenger = std::make_shared<dfb::Messenger<dfb::InprocTransport>>(communicator);
-        fill(*messenger->pool());
+        const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
+        fill(*connection->pool());
         dfb::FrameBufferConfig config;
         config.width = config.height = side;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        Fb fb(messenger, config);
+        Fb fb(connection, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         const auto depth = static_cast<float>(fb.rank());
         const auto worldOf = [&](std::uint32_t id) { return dfb::World({{id, {{0, 0, depth}, {1, 1, depth + 1}}}}); };
@@ -583,9 +583,8 @@ TEST_CASE("What is too large for memory is named with its bytes and its rank, on
         layout.columns = 2;
         layout.displayWidth = layout.displayHeight = 32000;
         layout.ranks = {1, 1};
-        const auto messenger = std::make_shared<dfb::Messenger<dfb::InprocTransport>>(communicator);
-        const dfb::DisplayWall<dfb::InprocTransport> made(messenger, layout, OutputFormat::RGBA8,
-                                                          std::make_shared<dfb::ThreadExecutor>(1));
+        const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
+        const dfb::DisplayWall made(connection, layout, OutputFormat::RGBA8, std::make_shared<dfb::ThreadExecutor>(1));
     });
     CHECK(wall[0] == wall[1]);
     CHECK(wall[0]

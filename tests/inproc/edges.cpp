@@ -164,21 +164,21 @@ TEST_CASE("A float image of 2.25 GiB travels to the display rank", "[edges][.str
     CHECK(wrong == "");
 }
 
-TEST_CASE("Framebuffers on one messenger are made and gone in any order", "[edges]")
+TEST_CASE("Framebuffers on one connection are made and gone in any order", "[edges]")
 {
     const scene::Scene s = scene::makeScene(5, 3);
     std::size_t wrong = 0; // written by the display rank
     int images = 0;
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
         using Fb = FrameBuffer<dfb::BasicAlphaBlend<16>>;
-        const auto messenger = std::make_shared<dfb::Messenger<Inproc>>(communicator);
+        const auto connection = dfb::connect<Inproc>(communicator);
         std::vector<std::unique_ptr<Fb>> alive(4);
         for (std::uint64_t step = 0; step < 40; ++step) { // the same on all ranks
             auto& one = alive[scene::mix(step) % alive.size()];
             if (one && scene::mix(step + 99) % 2)
                 one.reset();
             else if (!one)
-                one = std::make_unique<Fb>(messenger, configOf(s));
+                one = std::make_unique<Fb>(connection, configOf(s));
             if (!one)
                 continue;
             const auto report = scene::renderLoop(*one, s, scene::Loop::Declared);

@@ -1214,8 +1214,8 @@ TEST_CASE("A rank that leaves by an exception outside frames: the others get a T
                     if (rank != culprit) {
                         const std::string& text = texts[static_cast<std::size_t>(rank)];
                         CHECK(has(text, "TransportError: dfb: transport failure: rank " + std::to_string(culprit)));
-                        // From runRanks(), or from the messenger that the exception passes on its way there.
-                        CHECK((has(text, "out of disk") || has(text, "an exception has ended its messenger")));
+                        // From runRanks(), or from the connection that the exception passes on its way there.
+                        CHECK((has(text, "out of disk") || has(text, "an exception has ended its connection")));
                     }
             }
 }
@@ -1272,8 +1272,8 @@ void sendOwned(Fb& fb, Frame& frame)
         send(frame, *tile, index, 0, 0, 0, 0);
 }
 
-// How a partial frame of two ranks ended, and the one after it. Rank 0 gives up a tile, then all call `more(frame, rank)`;
-// `params(rank)` says with what a rank begins.
+// How a partial frame of two ranks ended, and the one after it. Rank 0 gives up a tile, then all call `more(frame,
+// rank)`; `params(rank)` says with what a rank begins.
 template <class Params, class More>
 std::vector<std::string> partialFrame(const Params& params, const More& more)
 {

@@ -166,7 +166,7 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     config.depth = true;
     config.messagePoolBytes = group.seed % 3 ? std::size_t{64} << 20 : 0;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1 + static_cast<int>(group.seed % 2));
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.checksums = true;
     std::vector<FaultEnding> endings;
     std::unique_ptr<FrameBuffer> made;

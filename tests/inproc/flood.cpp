@@ -442,7 +442,7 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
                         auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
                         if (toOne)
                             config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                        dfb::MessengerOptions options;
+                        dfb::ConnectionOptions options;
                         options.progress = dfb::Progress::Caller;
                         AddingFrameBuffer fb(communicator, config, options);
                         const auto r = floodFrame(fb, 3, from);
@@ -490,10 +490,10 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
             config.executor = std::make_shared<dfb::ThreadExecutor>(1);
             config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             config.messagePoolBytes = std::size_t{1} << 30; // not what limits it here
-            const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
-            if (messenger->rank() == 0)
-                ownersPool = messenger->pool();
-            Fb fb(messenger, config);
+            const auto connection = dfb::connect<BoardTransport>(communicator);
+            if (connection->rank() == 0)
+                ownersPool = connection->pool();
+            Fb fb(connection, config);
             std::vector<typename Fb::Frame> open;
             const auto tile = std::make_unique<Fb::Tile>();
             const auto send = [&](auto& frame, int index, int generation, int children) {

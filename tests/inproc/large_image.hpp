@@ -23,7 +23,7 @@ std::string largeImage(const typename Transport::Communicator& communicator, boo
     config.format = dfb::OutputFormat::RGBA32F;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
     config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks > 1 ? 1 : 0; };
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.sharedMemory = sharedMemory;
     dfb::DistributedFrameBuffer<dfb::BasicImageParallel<256>, dfb::NoPixelOp, Transport> fb(communicator, config,
                                                                                             options);

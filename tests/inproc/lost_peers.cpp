@@ -84,9 +84,9 @@ dfb::FrameBufferConfig smallConfig()
     return config;
 }
 
-dfb::MessengerOptions timedOptions(int peerTimeoutMs = timeoutMs)
+dfb::ConnectionOptions timedOptions(int peerTimeoutMs = timeoutMs)
 {
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.peerTimeoutMs = peerTimeoutMs;
     return options;
 }
@@ -115,11 +115,10 @@ bool isSign(const MessageHeader& header)
     return header.kind == MessageKind::AreYouThere || header.kind == MessageKind::Present;
 }
 
-// `wait(messenger, fb)` is the call that the others are in when `victim` answers no more. `withFrameBuffer`: the
-// victim is held when that has been made and a first frame ended, else as soon as there is a messenger.
-std::vector<Told>
-lose(int ranks, int victim, bool withFrameBuffer,
-     const std::function<void(std::shared_ptr<dfb::Messenger<HeldTransport>>, std::unique_ptr<FrameBuffer>&)>& wait)
+// `wait(connection, fb)` is the call that the others are in when `victim` answers no more. `withFrameBuffer`: the
+// victim is held when that has been made and a first frame ended, else as soon as there is a connection.
+std::vector<Told> lose(int ranks, int victim, bool withFrameBuffer,
+                       const std::function<void(std::shared_ptr<dfb::Connection>, std::unique_ptr<FrameBuffer>&)>& wait)
 {
     const auto holds = std::make_shared<Holds>(ranks);
     std::vector<Told> told(static_cast<std::size_t>(ranks));
@@ -129,11 +128,11 @@ lose(int ranks, int victim, bool withFrameBuffer,
         std::make_shared<Board>(), ranks,
         [&](const BoardTransport::Communicator& communicator) {
             const int rank = communicator.inner.rank();
-            auto messenger = std::make_shared<dfb::Messenger<HeldTransport>>(
-                HeldTransport::Communicator{communicator, holds}, timedOptions());
+            auto connection =
+                dfb::connect<HeldTransport>(HeldTransport::Communicator{communicator, holds}, timedOptions());
             std::unique_ptr<FrameBuffer> fb;
             if (withFrameBuffer) {
-                fb = std::make_unique<FrameBuffer>(messenger, smallConfig());
+                fb = std::make_unique<FrameBuffer>(connection, smallConfig());
                 emptyFrame(*fb);
             } else {
                 std::this_thread::sleep_for(milliseconds(100)); // until all have heard that the others answer
@@ -152,7 +151,7 @@ lose(int ranks, int victim, bool withFrameBuffer,
                     std::this_thread::sleep_for(milliseconds(1));
             }
             try {
-                wait(messenger, fb);
+                wait(connection, fb);
             } catch (const dfb::TransportError& e) {
                 mine.error = e.info();
             }
@@ -160,7 +159,7 @@ lose(int ranks, int victim, bool withFrameBuffer,
             mine.ms = std::chrono::duration<double, std::milli>(now - Clock::time_point(Clock::duration(heldAt.load())))
                           .count();
             fb.reset();
-            messenger.reset();
+            connection.reset();
             mine.endMs = std::chrono::duration<double, std::milli>(Clock::now() - now).count();
             ++over;
         },
@@ -190,18 +189,18 @@ void checkTold(const std::vector<Told>& told, int victim)
 
 TEST_CASE("A rank that stops answering is named by all others, in whatever call they wait", "[lost_peers]")
 {
-    using Messenger = dfb::Messenger<HeldTransport>;
-    const auto constructor = [](const std::shared_ptr<Messenger>& messenger, std::unique_ptr<FrameBuffer>& fb) {
-        fb = std::make_unique<FrameBuffer>(messenger, smallConfig());
+    using dfb::Connection;
+    const auto constructor = [](const std::shared_ptr<Connection>& connection, std::unique_ptr<FrameBuffer>& fb) {
+        fb = std::make_unique<FrameBuffer>(connection, smallConfig());
     };
-    const auto frame = [](const std::shared_ptr<Messenger>&, std::unique_ptr<FrameBuffer>& fb) { emptyFrame(*fb); };
-    const auto reduction = [](const std::shared_ptr<Messenger>&, std::unique_ptr<FrameBuffer>& fb) {
+    const auto frame = [](const std::shared_ptr<Connection>&, std::unique_ptr<FrameBuffer>& fb) { emptyFrame(*fb); };
+    const auto reduction = [](const std::shared_ptr<Connection>&, std::unique_ptr<FrameBuffer>& fb) {
         fb->allReduce({1}, FrameBuffer::Reduce::Sum);
     };
     struct Case {
         int ranks, victim;
         bool withFrameBuffer;
-        std::function<void(std::shared_ptr<Messenger>, std::unique_ptr<FrameBuffer>&)> wait;
+        std::function<void(std::shared_ptr<Connection>, std::unique_ptr<FrameBuffer>&)> wait;
     };
     std::vector<Case> cases;
     for (const int ranks : {2, 5})
@@ -221,14 +220,13 @@ TEST_CASE("A rank that stops answering is named by all others, in whatever call 
 TEST_CASE("A frame that is open while rendering fails when a rank is lost, and says so before end()", "[lost_peers]")
 {
     std::atomic<int> failed{0};
-    const auto told =
-        lose(3, 2, true, [&](const std::shared_ptr<dfb::Messenger<HeldTransport>>&, std::unique_ptr<FrameBuffer>& fb) {
-            auto frame = begin(*fb);
-            for (const auto start = Clock::now(); !frame.failed() && Clock::now() - start < std::chrono::seconds(10);)
-                std::this_thread::sleep_for(milliseconds(1));
-            failed += frame.failed();
-            frame.end();
-        });
+    const auto told = lose(3, 2, true, [&](const std::shared_ptr<dfb::Connection>&, std::unique_ptr<FrameBuffer>& fb) {
+        auto frame = begin(*fb);
+        for (const auto start = Clock::now(); !frame.failed() && Clock::now() - start < std::chrono::seconds(10);)
+            std::this_thread::sleep_for(milliseconds(1));
+        failed += frame.failed();
+        frame.end();
+    });
     checkTold(told, 2);
     CHECK(failed >= 2); // the lost one may not even begin it
 }

@@ -1,4 +1,4 @@
-// Several framebuffers on one messenger, messages that come twice or damaged, gathering, and progress by the caller:
+// Several framebuffers on one connection, messages that come twice or damaged, gathering, and progress by the caller:
 // what the messaging layer promises to frames. Ranks are threads; every test has a time limit.
 #include "board.hpp"
 #include "catch.hpp"
@@ -61,7 +61,7 @@ Scene sceneFor(Loop loop, std::uint64_t seed = 1)
 
 } // namespace
 
-// ---- several objects on one messenger, several messengers
+// ---- several objects on one connection, several connections
 
 namespace {
 
@@ -122,17 +122,15 @@ bool interleaved(A& a, B& b, const Scene& sa, const Scene& sb, bool endFirst, bo
     return right;
 }
 
-using SharedMessenger = dfb::Messenger<BoardTransport>;
-
 } // namespace
 
-TEST_CASE("Frames of two framebuffers on one messenger, open at the same time; one that fails", "[messaging]")
+TEST_CASE("Frames of two framebuffers on one connection, open at the same time; one that fails", "[messaging]")
 {
     const Scene sa = sceneFor(Loop::Declared, 3);
     Scene sb = scene::makeScene(1, 4, 70, 90);
     sb.bricks[0].bounds = {{0, 0, 0}, {70, 90, 1}};
     for (const int ranks : {1, 2, 5})
-        for (const bool shared : {true, false}) // else a messenger each, on one communicator
+        for (const bool shared : {true, false}) // else a connection each, on one communicator
             for (const bool shuffle : {false, true}) {
                 INFO(ranks << " ranks" << (shared ? ", shared" : "") << (shuffle ? ", shuffled" : ""));
                 std::vector<std::string> texts(static_cast<std::size_t>(ranks));
@@ -140,15 +138,15 @@ TEST_CASE("Frames of two framebuffers on one messenger, open at the same time; o
                     std::make_shared<Board>(), ranks,
                     [&](const BoardTransport::Communicator& communicator) {
                         const int rank = communicator.inner.rank();
-                        const auto messenger = shared ? std::make_shared<SharedMessenger>(communicator)
-                                                      : std::shared_ptr<SharedMessenger>();
+                        const auto connection =
+                            shared ? dfb::connect<BoardTransport>(communicator) : std::shared_ptr<dfb::Connection>();
                         std::unique_ptr<FrameBuffer<Blend>> a;
                         std::unique_ptr<FrameBuffer<dfb::BasicImageParallel<32>>> b;
                         auto configB = configOf(sb);
                         configB.displayRank = ranks - 1;
                         if (shared) {
-                            a = std::make_unique<FrameBuffer<Blend>>(messenger, configOf(sa));
-                            b = std::make_unique<FrameBuffer<dfb::BasicImageParallel<32>>>(messenger, configB);
+                            a = std::make_unique<FrameBuffer<Blend>>(connection, configOf(sa));
+                            b = std::make_unique<FrameBuffer<dfb::BasicImageParallel<32>>>(connection, configB);
                         } else {
                             a = std::make_unique<FrameBuffer<Blend>>(communicator, configOf(sa));
                             b = std::make_unique<FrameBuffer<dfb::BasicImageParallel<32>>>(communicator, configB);
@@ -189,14 +187,14 @@ TEST_CASE("A framebuffer made later on one rank gets what came for it before", "
         };
         std::vector<std::size_t> wrong;
         runOn(board, 4, [&](const BoardTransport::Communicator& communicator) {
-            const auto messenger = std::make_shared<SharedMessenger>(communicator);
-            FrameBuffer<Blend> first(messenger, configOf(s));
+            const auto connection = dfb::connect<BoardTransport>(communicator);
+            FrameBuffer<Blend> first(connection, configOf(s));
             if (first.rank() == late) {
                 std::unique_lock<std::mutex> lock(mutex);
                 early = changed.wait_for(lock, std::chrono::seconds(20), [&] { return came == expected; });
                 waiting = false;
             }
-            FrameBuffer<Blend> second(messenger, configOf(s));
+            FrameBuffer<Blend> second(connection, configOf(s));
             for (auto* fb : {&second, &first}) {
                 const auto report = scene::renderLoop(*fb, s, Loop::Declared);
                 if (fb->isDisplayRank())
@@ -214,13 +212,13 @@ TEST_CASE("One framebuffer goes while the other has a frame open; another is mad
     const Scene s = sceneFor(Loop::Listing3, 6);
     std::size_t wrong = 1;
     runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
-        const auto messenger = std::make_shared<SharedMessenger>(communicator);
-        FrameBuffer<Blend> a(messenger, configOf(s));
-        auto b = std::make_unique<FrameBuffer<Single>>(messenger, configOf(s));
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        FrameBuffer<Blend> a(connection, configOf(s));
+        auto b = std::make_unique<FrameBuffer<Single>>(connection, configOf(s));
         for (int i = 0; i < 3; ++i) {
             auto frame = a.begin(scene::paramsOf(s));
             b.reset();
-            b = std::make_unique<FrameBuffer<Single>>(messenger, configOf(s));
+            b = std::make_unique<FrameBuffer<Single>>(connection, configOf(s));
             const auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
             for (int index : a.ownedTiles()) {
                 frame.start(*tile, index);
@@ -378,7 +376,7 @@ TEST_CASE("With checksums the image is the same", "[messaging]")
             }
         };
         runOn(board, 3, [&](const auto& communicator) {
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.checksums = true;
             if (scene::isDataParallel(loop)) {
                 FrameBuffer<Blend> fb(communicator, configOf(s), options);
@@ -425,7 +423,7 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
     };
     Scene s = sceneFor(Loop::Declared);
     runOn(board, 2, [&](const auto& communicator) {
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.checksums = true;
         options.peerTimeoutMs = peerTimeoutMs;
         FrameBuffer<Blend> fb(communicator, configOf(s), options);
@@ -545,7 +543,7 @@ TEST_CASE("With frames in flight a damaged message costs frames, not the framebu
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
         config.framesInFlight = 2; // the second has never begun one when the first fails
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.checksums = true;
         FrameBuffer<Blend> fb(communicator, config, options);
         const auto rank = static_cast<std::size_t>(fb.rank());
@@ -586,7 +584,7 @@ TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
         config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.checksums = true;
         options.peerTimeoutMs = 300;
         FrameBuffer<Blend> fb(communicator, config, options);
@@ -782,7 +780,7 @@ TEST_CASE("Ranks that disagree about checksums learn which rank has them, and no
                 runOn(
                     std::make_shared<Board>(), ranks,
                     [&](const BoardTransport::Communicator& communicator) {
-                        dfb::MessengerOptions options;
+                        dfb::ConnectionOptions options;
                         options.checksums = (communicator.inner.rank() == odd) == uses;
                         texts[static_cast<std::size_t>(communicator.inner.rank())] = outcomeOf(
                             [&] { FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options); });
@@ -914,7 +912,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
             [&](const BoardTransport::Communicator& communicator) {
                 auto config = configOf(s);
                 config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                dfb::MessengerOptions options;
+                dfb::ConnectionOptions options;
                 options.progress = dfb::Progress::Caller;
                 FrameBuffer<Counter> fb(communicator, config, options);
                 {

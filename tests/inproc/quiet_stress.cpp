@@ -71,7 +71,7 @@ Outcome frames(std::uint64_t seed, int ranks, int threads, int inFlight, int cou
         auto config = configOf(s, threads);
         config.quietMs = 1;
         config.framesInFlight = inFlight;
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.progress = threads > 0 ? dfb::Progress::Thread : dfb::Progress::Caller;
         FrameBuffer fb({inner, faults}, config, options);
         std::mt19937_64 same(seed), own(seed * 31 + static_cast<std::uint64_t>(fb.rank()));

@@ -685,14 +685,14 @@ TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()",
         CHECK((has(text, "timed out") || (has(text, "TransportError") && !has(text, "time limit"))));
 }
 
-TEST_CASE("Time-outs in frames of one framebuffer leave the other on the same messenger alone", "[timeouts]")
+TEST_CASE("Time-outs in frames of one framebuffer leave the other on the same connection alone", "[timeouts]")
 {
     const Scene s = scene::makeScene(5, 4);
     std::vector<std::string> texts(3);
     std::size_t wrong = 2;
     runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
-        const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
-        FrameBuffer a(messenger, configOf(s)), b(messenger, configOf(s));
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        FrameBuffer a(connection, configOf(s)), b(connection, configOf(s));
         {
             auto frameB = b.begin(scene::paramsOf(s));
             {
@@ -722,7 +722,7 @@ TEST_CASE("Progress by the caller: an absent rank that does not poll is a Transp
     runOn(
         std::make_shared<Board>(), 2,
         [&](const auto& communicator) {
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.progress = dfb::Progress::Caller;
             FrameBuffer fb(communicator, smallConfig(), options);
             auto frame = fb.begin(timed(true));

@@ -23,14 +23,13 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
     };
     const dfb::WallLayout layout{2, 2, 64, 64, 0, 0, {0, 1, 2, 3}};
     board::runOn(watched, 4, [&](const board::BoardTransport::Communicator& communicator) {
-        auto messenger = std::make_shared<dfb::Messenger<board::BoardTransport>>(communicator);
+        auto connection = dfb::connect<board::BoardTransport>(communicator);
         auto executor = std::make_shared<dfb::ThreadExecutor>(1);
-        dfb::DisplayWall<board::BoardTransport> wall(messenger, layout, dfb::OutputFormat::RGBA8, executor);
+        dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8, executor);
         auto config = wall.frameBufferConfig();
         config.executor = executor;
-        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall<board::BoardTransport>,
-                                    board::BoardTransport>
-            fb(messenger, config, {&wall});
+        dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall, board::BoardTransport> fb(
+            connection, config, {&wall});
         const auto report = dfb::renderImageParallel(fb, [](auto& tile) {
             const float rgba[4] = {0.5f, 0, 0, 1};
             tile.fill(rgba);

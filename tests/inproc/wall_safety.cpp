@@ -24,7 +24,7 @@ using dfb::detail::MessageKind;
 using scene::has;
 using scene::outcomeOf;
 
-using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall<BoardTransport>, BoardTransport>;
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall, BoardTransport>;
 using What = Board::What;
 constexpr std::size_t body = sizeof(MessageHeader), region = body + 4; // of a part of a display
 constexpr std::uint32_t wallAddress = 0;                               // it is made first
@@ -64,16 +64,16 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
     board::runOn(
         watched, 2,
         [&](const BoardTransport::Communicator& communicator) {
-            const auto messenger = std::make_shared<dfb::Messenger<BoardTransport>>(communicator);
+            const auto connection = dfb::connect<BoardTransport>(communicator);
             dfb::WallLayout layout;
             layout.columns = 2;
             layout.displayWidth = 72, layout.displayHeight = 64;
             layout.ranks = {0, 1};
             const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
-            dfb::DisplayWall<BoardTransport> wall(messenger, layout, dfb::OutputFormat::RGBA32F, executor);
+            dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA32F, executor);
             auto config = wall.frameBufferConfig();
             config.executor = executor;
-            FrameBuffer fb(messenger, config, {&wall});
+            FrameBuffer fb(connection, config, {&wall});
             const auto rank = static_cast<std::size_t>(fb.rank());
             armed = true; // rank 1 has sent what the constructors send to the wall
             const auto frame = [&](float shade) {

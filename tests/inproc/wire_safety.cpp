@@ -262,7 +262,7 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
     }
 }
 
-TEST_CASE("A vote or a verdict that is none ends the messenger, as there is no other", "[wire_safety]")
+TEST_CASE("A vote or a verdict that is none ends the connection, as there is no other", "[wire_safety]")
 {
     struct Lie {
         const char* name;

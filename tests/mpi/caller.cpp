@@ -50,7 +50,7 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
     config.messagePoolBytes = std::size_t{1} << 30;
     const int owner = last > 1 ? 1 : 0;
     config.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.progress = dfb::Progress::Caller;
     options.sharedMemory = false;
     Fb fb(MPI_COMM_WORLD, config, options);

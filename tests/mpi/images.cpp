@@ -24,7 +24,7 @@ using Single = dfb::BasicImageParallel<16>;
 // On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
 template <class TileOp, class Transport, class Communicator>
 Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
-                  int deal = 0, const dfb::MessengerOptions& options = {}, int frames = 2)
+                  int deal = 0, const dfb::ConnectionOptions& options = {}, int frames = 2)
 {
     dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(communicator, config, options);
     Picture result;
@@ -36,7 +36,7 @@ Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, c
 }
 
 Picture overMpi(MPI_Comm communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config, int deal = 0,
-                const dfb::MessengerOptions& options = {})
+                const dfb::ConnectionOptions& options = {})
 {
     return scene::isDataParallel(loop)
                ? pictureOn<Blend, dfb::MpiTransport>(communicator, s, loop, config, deal, options)
@@ -95,7 +95,7 @@ TEST_CASE("The image does not depend on configuration", "[images]")
     const Scene s = sceneFor(Loop::Declared, 5);
     const std::uint64_t expected = inProcess(1, s, Loop::Declared, configOf(s, 2)).hash();
     const auto check = [&](const char* what, const std::function<void(dfb::FrameBufferConfig&)>& change, int deal = 0,
-                           const dfb::MessengerOptions& options = {}) {
+                           const dfb::ConnectionOptions& options = {}) {
         auto config = configOf(s, 2);
         change(config);
         const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config, deal, options);
@@ -108,7 +108,7 @@ TEST_CASE("The image does not depend on configuration", "[images]")
         "all bricks on the last rank", [](auto&) {}, -1);
     check("another display rank", [&](auto& c) { c.displayRank = size - 1; });
     check("linear owners", [](auto& c) { c.ownerMap = dfb::linearOwner; });
-    dfb::MessengerOptions byCaller;
+    dfb::ConnectionOptions byCaller;
     byCaller.progress = dfb::Progress::Caller;
     check(
         "progress by the caller", [](auto&) {}, 0, byCaller);

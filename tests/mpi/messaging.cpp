@@ -128,7 +128,7 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
     for (const flood::NamedExecutor& e : executors())
         for (const From from : {From::Loop, From::Thread}) {
             auto config = floodConfig(256, e.make());
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.sharedMemory = from == From::Loop;
             config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
             config.displayRank = ranks - 1;
@@ -161,7 +161,7 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
         for (const bool shared : {true, false})
             for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
                 auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
-                dfb::MessengerOptions options;
+                dfb::ConnectionOptions options;
                 options.progress = progress;
                 options.sharedMemory = shared;
                 AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
@@ -179,7 +179,7 @@ TEST_CASE("All through MPI gives the same image bit for bit", "[messaging]")
     std::vector<std::uint64_t> hashes;
     for (const bool shared : {true, false}) {
         auto config = configOf(s);
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config, options);
         for (int i = 0; i < 2; ++i) {
@@ -190,13 +190,13 @@ TEST_CASE("All through MPI gives the same image bit for bit", "[messaging]")
     CHECK(std::count(hashes.begin(), hashes.end(), hashes.front()) == 4);
 }
 
-TEST_CASE("Two framebuffers on one messenger, and one with its own, with frames open at once", "[messaging]")
+TEST_CASE("Two framebuffers on one connection, and one with its own, with frames open at once", "[messaging]")
 {
     const Scene s = sceneFor(6, 4), t = sceneFor(5, 5);
-    const auto messenger = std::make_shared<dfb::Messenger<dfb::MpiTransport>>(MPI_COMM_WORLD);
+    const auto connection = dfb::connect<dfb::MpiTransport>(MPI_COMM_WORLD);
     using Fb = dfb::DistributedFrameBuffer<Blend>;
-    auto a = std::make_unique<Fb>(messenger, configOf(s));
-    auto b = std::make_unique<dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<32>>>(messenger, configOf(t));
+    auto a = std::make_unique<Fb>(connection, configOf(s));
+    auto b = std::make_unique<dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<32>>>(connection, configOf(t));
     auto c = std::make_unique<Fb>(MPI_COMM_WORLD, configOf(s));
     for (int i = 0; i < 3; ++i) {
         auto frame = a->begin(scene::paramsOf(s));
@@ -263,7 +263,7 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
                         std::byte{64};
                 return TamperingTransport::What::Pass;
             };
-            dfb::MessengerOptions options;
+            dfb::ConnectionOptions options;
             options.checksums = true;
             TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, damage}, configOf(s), options);
             CHECK(goodFrame(fb, nothing));
@@ -399,7 +399,7 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
 {
     const Scene s = sceneFor(6, 10);
     auto config = configOf(s);
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.progress = dfb::Progress::Caller;
     const int size = sizeOf(MPI_COMM_WORLD), rank = rankIn(MPI_COMM_WORLD);
     config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };

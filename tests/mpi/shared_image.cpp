@@ -75,7 +75,7 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
     for (const bool shared : {true, false}) {
         auto config = scene::configOf(s);
         config.displayRank = sizeOf(MPI_COMM_WORLD) - 1;
-        dfb::MessengerOptions options;
+        dfb::ConnectionOptions options;
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config, options);
         dfb::FrameReport report;

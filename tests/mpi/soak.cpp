@@ -94,7 +94,7 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
                                                 5 + static_cast<int>(h >> 16 & 63));
     auto config = configOf(first, 1 + static_cast<int>(h >> 24 & 1));
     config.displayRank = static_cast<int>(h >> 32 & 255) % sizeOf(communicator);
-    dfb::MessengerOptions options;
+    dfb::ConnectionOptions options;
     options.sharedMemory = (h >> 41) % 4 != 0;
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config, options);
     std::string wrong;

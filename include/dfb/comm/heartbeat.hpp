@@ -1,5 +1,5 @@
 // Heartbeat: which ranks this one listens for, when to ask them for a sign of life, and which of them is lost. It only
-// says so: the messenger sends and receives.
+// says so: the connection sends and receives.
 //
 // Needed as MPI tells nobody that a rank has ended or hangs: a receive from it just never completes.
 #pragma once

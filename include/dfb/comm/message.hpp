@@ -27,7 +27,7 @@ enum class MessageKind : std::uint8_t {
     JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
     Jobs,          // a range of them
     ImagePlace,    // where in shared memory the image of the display rank lies
-    Failure,       // the sender's messenger can not go on, nor can anybody who waits for it
+    Failure,       // the sender's connection can not go on, nor can anybody who waits for it
     AreYouThere,   // to be answered at once with the next
     Present,       // the sender is there, and answers whenever it is asked
     Hidden         // from which generation on inputs of a tile can not be seen
@@ -42,7 +42,7 @@ struct MessageHeader {
     MessageKind kind = MessageKind::Fragment;
     std::uint32_t receiver = 0; // address of the receiving object
     std::int64_t number = 0;    // of the frame; of the reduction
-    std::uint32_t sequence = 0; // running, per sender and destination; set by the messenger, as is the next
+    std::uint32_t sequence = 0; // running, per sender and destination; set by the connection, as is the next
     std::uint32_t checksum = 0; // CRC-32C of the message with 0 in this place; 0: there is none
 };
 static_assert(sizeof(MessageHeader) == 24 && std::is_trivially_copyable_v<MessageHeader>);

@@ -1,9 +1,9 @@
-// ProgressThread: calls poll() of a transport so that messages move while the renderer works. It polls for a
+// ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a
 // few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
 // In between it calls who wants to look at the clock.
 #pragma once
 
-#include <dfb/version.hpp>
+#include <dfb/comm/link.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -20,15 +20,14 @@
 
 namespace dfb {
 
-template <class Transport>
 class ProgressThread {
 public:
     using Clock = std::chrono::steady_clock;
 
-    // Does not start yet. `transport` must live until stop(). `between` is called by the thread when there has been a
+    // Does not start yet. `link` must live until stop(). `between` is called by the thread when there has been a
     // poll since the last time; with nothing to do it sleeps for `longestNap` at most.
-    ProgressThread(Transport& transport, Clock::duration longestNap, std::function<void(Clock::time_point now)> between)
-        : transport_(transport), longestNap_(longestNap), between_(std::move(between))
+    ProgressThread(Link& link, Clock::duration longestNap, std::function<void(Clock::time_point now)> between)
+        : link_(link), longestNap_(longestNap), between_(std::move(between))
     {
     }
     ProgressThread(const ProgressThread&) = delete;
@@ -44,7 +43,7 @@ public:
     void stop()
     {
         stop_ = true;
-        transport_.interrupt();
+        link_.interrupt();
         if (thread_.joinable())
             thread_.join();
     }
@@ -57,7 +56,7 @@ public:
         const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
         if (!lock.owns_lock())
             return false;
-        const bool moved = transport_.poll();
+        const bool moved = link_.poll();
         ++polls_;
         return moved;
     }
@@ -67,7 +66,7 @@ public:
     {
         expecting_ = expect;
         if (expect)
-            transport_.interrupt();
+            link_.interrupt();
     }
     bool expectsMessages() const noexcept { return expecting_; }
 
@@ -75,7 +74,7 @@ public:
     void hurry(bool more)
     {
         if (more && waiting_++ == 0)
-            transport_.interrupt();
+            link_.interrupt();
         if (!more)
             --waiting_;
     }
@@ -94,7 +93,7 @@ private:
         // What the network library has taken may need it for a moment more.
         if (!expecting_ && quiet && idle > std::chrono::milliseconds(10))
             return longestNap_;
-        if (transport_.wakesOnArrival())
+        if (link_.wakesOnArrival())
             return between(waiting_ > 0 ? 50 : 200, 2000);
         return waiting_ > 0 ? between(50, 200) : between(1000, 2000);
     }
@@ -120,11 +119,11 @@ private:
             const Clock::duration idle = now - last;
             if (idle < pollTime)
                 continue;
-            transport_.nap(napAfter(idle, transport_.quiet()));
+            link_.nap(napAfter(idle, link_.quiet()));
         }
     }
 
-    Transport& transport_;
+    Link& link_;
     const Clock::duration longestNap_;
     const std::function<void(Clock::time_point)> between_;
     std::mutex pollMutex_;

@@ -4,7 +4,7 @@
 
 #include <dfb/comm/compression_gains.hpp>
 #include <dfb/comm/compression_trial.hpp>
-#include <dfb/comm/messaging.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/detail/frame_figures.hpp>
 #include <dfb/detail/frame_gate.hpp>
 #include <dfb/detail/hidden_tiles.hpp>
@@ -33,8 +33,8 @@
 namespace dfb::detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
-template <class TileOp, class PixelOp, class Transport>
-class FrameEngine final : private MessageHandler {
+template <class TileOp, class PixelOp>
+class FrameEngine final : private MailboxOwner {
 public:
     using Pipeline = TilePipeline<TileOp, PixelOp>;
     using Tile = typename Pipeline::Tile;
@@ -44,17 +44,15 @@ public:
     using Bytes = ReductionTable::Bytes;
 
     // `slot`: which of config.framesInFlight engines this is.
-    FrameEngine(std::shared_ptr<Messenger<Transport>> messenger, FrameBufferConfig config, PixelOp pixelOp,
-                int slot = 0)
-        : pool_(messenger->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
+    FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, PixelOp pixelOp, int slot = 0)
+        : pool_(connection->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
         config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
-        MessageHandler& self = *this;
-        messaging_ = std::make_unique<Messaging<Transport>>(std::move(messenger), config_.executor,
-                                                            config_.messagePoolBytes, self);
-        outcome_ = std::make_unique<FrameOutcome<Transport>>(*messaging_, gate_, FrameVerdict);
+        MailboxOwner& self = *this;
+        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messagePoolBytes, self);
+        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, gate_, FrameVerdict);
         gains_.emplace(config_.codec ? size() : 0);
-        messaging_->start();
+        mailbox_->start();
         Agreement mine;
         try {
             if (config_.displayRank < 0 || config_.displayRank >= size())
@@ -66,47 +64,48 @@ public:
             if (config_.aux & ~(TileOp::channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
-            if (const int ms = messaging_->messenger().options().peerTimeoutMs; ms != 0 && ms < 100)
+            if (const int ms = mailbox_->connection().options().peerTimeoutMs; ms != 0 && ms < 100)
                 throw InvalidArgument("a time-out for peers of " + std::to_string(ms) + " ms: 0, or 100 and more");
             if (config_.quietMs < 1)
                 throw InvalidArgument("quietMs is " + std::to_string(config_.quietMs) + ": it must be 1 or more");
             checkWire();
             pipeline_ =
-                std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), messaging_->address(),
+                std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), mailbox_->address(),
                                            [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of<TileOp, PixelOp>(config_, messaging_->messenger().options().checksums, rank(),
+            mine = Agreement::of<TileOp, PixelOp>(config_, mailbox_->connection().options().checksums, rank(),
                                                   Tile::size, Pipeline::travelling(config_), layout().tileCount(),
                                                   [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message, rank()};
         } catch (const OutOfMemory& e) {
             const bool several = config_.framesInFlight > 1;
-            mine = {false, e.what()
-                               + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
-                                                + " frames in flight"
-                                          : ""),
+            mine = {false,
+                    e.what()
+                        + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
+                                         + " frames in flight"
+                                   : ""),
                     rank()};
         } catch (const std::exception& e) {
             // No memory, or out of the owner map: the others must not wait for this rank.
             mine = {false, e.what(), rank()};
         }
-        const auto all = agree(*messaging_, mine);
+        const auto all = agree(*mailbox_, mine);
         if (!all.fine) {
-            messaging_->stop(); // what has come already is for this object, as long as it is whole
+            mailbox_->stop(); // what has come already is for this object, as long as it is whole
             outcome_.reset();
-            messaging_.reset(); // before the exception passes: all ranks throw it, so this end is in order
+            mailbox_.reset(); // before the exception passes: all ranks throw it, so this end is in order
             all.refuse();
         }
-        messaging_->messenger().setAlike();
+        mailbox_->connection().setAlike();
         tellImagePlace();
     }
 
     FrameEngine(const FrameEngine&) = delete;
     FrameEngine& operator=(const FrameEngine&) = delete;
-    ~FrameEngine() { messaging_->stop(); }
+    ~FrameEngine() { mailbox_->stop(); }
 
-    int rank() const noexcept { return messaging_->rank(); }
-    int size() const noexcept { return messaging_->size(); }
+    int rank() const noexcept { return mailbox_->rank(); }
+    int size() const noexcept { return mailbox_->size(); }
     const FrameBufferConfig& config() const noexcept { return config_; }
     const TileLayout& layout() const noexcept { return pipeline_->table().layout(); }
     int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
@@ -128,8 +127,8 @@ public:
         checkSamples(params);
         if (params.timeoutMs < 0)
             throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
-        messaging_->requireProgress();
-        messaging_->messenger().throwIfFailed();
+        mailbox_->requireProgress();
+        mailbox_->connection().throwIfFailed();
         params_ = params;
         terms_ = FrameTerms::of(params, rank());
         manifests_.newFrame(!lastFailed_); // if it did, some owners may have what was declared in it, and others not
@@ -156,8 +155,8 @@ public:
         quiescence_.newFrame(std::chrono::milliseconds(config_.quietMs));
         ownTilesDone_ = endCalled_ = false;
         inputsSent_ = 0;
-        bytesBefore_ = messaging_->bytesSent();
-        messagesBefore_ = messaging_->messagesSent();
+        bytesBefore_ = mailbox_->bytesSent();
+        messagesBefore_ = mailbox_->messagesSent();
         renderNs_ = 0;
         figures_.newFrame();
         tilesLeft_ = countUnknown;
@@ -172,8 +171,8 @@ public:
         tilesLeft_ += static_cast<std::int64_t>(kept.size());
         lastPoll_ = beginTime_ = Clock::now();
         frameOpen_ = true;
-        messaging_->newEpoch(info.frame);
-        messaging_->messenger().expectMessages(true);
+        mailbox_->newEpoch(info.frame);
+        mailbox_->connection().expectMessages(true);
         auto& early = gate_.open();
         if (userError)
             failWhole(userError); // comes out of end(), on all ranks; nothing is made with half of the frame's data
@@ -211,7 +210,7 @@ public:
             gains_->add(owner, rawFragmentBytes(message), message.size());
         ++inputsSent_;
         if (owner != rank()) {
-            messaging_->sendWithCredit(owner, std::move(message));
+            mailbox_->sendWithCredit(owner, std::move(message));
             waitForRoom();
         } else if (gate_.enter(tile.frame)) {
             arrive(std::move(message), -1);
@@ -251,7 +250,7 @@ public:
             std::optional<Clock::time_point> deadline;
             if (params_.timeoutMs > 0)
                 deadline = Clock::now() + std::chrono::milliseconds(params_.timeoutMs);
-            if (!messaging_->wait([this] { return jobs_.ready() || outcome_->failed(); }, deadline)) {
+            if (!mailbox_->wait([this] { return jobs_.ready() || outcome_->failed(); }, deadline)) {
                 ErrorInfo info;
                 info.kind = ErrorKind::TimedOut;
                 info.from = jobServer();
@@ -267,11 +266,11 @@ public:
     void waitForRoom()
     {
         const std::chrono::milliseconds limit(params_.timeoutMs);
-        if (messaging_->waitForRoom([this] { return outcome_->failed(); }, limit))
+        if (mailbox_->waitForRoom([this] { return outcome_->failed(); }, limit))
             return;
         ErrorInfo info;
         info.kind = ErrorKind::TimedOut;
-        info.message = "no room for more tiles: " + messaging_->flow().notTaken();
+        info.message = "no room for more tiles: " + mailbox_->flow().notTaken();
         failWith(std::make_exception_ptr(Error(std::move(info))));
     }
 
@@ -290,7 +289,7 @@ public:
         const bool isWaiting = manifests_.declare(
             inputs, rank(), [this](int tile) { return tileOwner(tile); },
             [this](int owner, const Bytes& manifest) {
-                messaging_->send(owner, MessageKind::Manifest, gate_.frame(), manifest);
+                mailbox_->send(owner, MessageKind::Manifest, gate_.frame(), manifest);
             });
         if (!isWaiting)
             enterAllDeclared();
@@ -307,8 +306,8 @@ public:
 
     bool poll()
     {
-        bool did = messaging_->messenger().poll();
-        Executor& executor = messaging_->executor();
+        bool did = mailbox_->connection().poll();
+        Executor& executor = mailbox_->executor();
         while (!executor.hasWorkers() && executor.help())
             did = true;
         return did;
@@ -317,7 +316,7 @@ public:
     // Where nobody else does, for a renderer that does not call poll(). What takes no time gets on quicker without.
     void pollNowAndThen()
     {
-        if (!messaging_->messenger().needsCaller() && messaging_->executor().hasWorkers())
+        if (!mailbox_->connection().needsCaller() && mailbox_->executor().hasWorkers())
             return;
         const auto now = Clock::now();
         if (now - lastPoll_.load() < std::chrono::milliseconds(1))
@@ -326,7 +325,7 @@ public:
         poll();
     }
 
-    void requireProgress() const { messaging_->requireProgress(); }
+    void requireProgress() const { mailbox_->requireProgress(); }
 
     FrameReport end()
     {
@@ -360,8 +359,8 @@ public:
         report.tilesTotal = layout().tileCount();
         report.wireColor = pipeline_->wireColor();
         report.compressed = compressed;
-        report.threads = messaging_->executor().concurrency();
-        report.progress = messaging_->messenger().needsCaller() ? Progress::Caller : Progress::Thread;
+        report.threads = mailbox_->executor().concurrency();
+        report.progress = mailbox_->connection().needsCaller() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         return report;
     }
@@ -393,7 +392,7 @@ public:
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
     {
-        return messaging_->allReduce(values, operation);
+        return mailbox_->allReduce(values, operation);
     }
 
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
@@ -403,7 +402,7 @@ public:
         out.put(static_cast<std::uint64_t>(own.size()));
         Bytes mine = out.bytes();
         mine.append(own.data(), own.data() + own.size());
-        const Bytes all = messaging_->reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
+        const Bytes all = mailbox_->reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
             Bytes both = a;
             both.append(b.begin(), b.end());
             return both;
@@ -424,11 +423,7 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
-    enum Scope : std::uint32_t {
-        AllDeclared = Messaging<Transport>::ownScope + 1,
-        FrameVerdict,
-        Quiet = Messaging<Transport>::quietScope
-    };
+    enum Scope : std::uint32_t { AllDeclared = Mailbox::ownScope + 1, FrameVerdict, Quiet = Mailbox::quietScope };
 
     // Added to the number of tiles to wait for as long as it is not known: finishing one is then never the last.
     static constexpr std::int64_t countUnknown = std::int64_t{1} << 40;
@@ -447,7 +442,7 @@ private:
         if (other == rank() || !compresses())
             return nullptr;
         const bool isLeftOut = config_.compression == CompressionMode::Auto
-                               && (messaging_->messenger().isSeenBy(other) || !gains_->isWorthwhile(other));
+                               && (mailbox_->connection().isSeenBy(other) || !gains_->isWorthwhile(other));
         return isLeftOut ? nullptr : config_.codec.get();
     }
 
@@ -456,16 +451,16 @@ private:
     void incoming(int source, const MessageHeader& header, Buffer&& message) override
     {
         const std::size_t byteCount = message.size();
-        const bool hasCredit = source != rank() && messaging_->needsCredit(header.kind);
+        const bool hasCredit = source != rank() && mailbox_->needsCredit(header.kind);
         switch (gate_.enter(source, header, message)) {
         case FrameGate::Entry::Kept: return;
         case FrameGate::Entry::Late:
             if (hasCredit)
-                messaging_->flow().discarded(byteCount);
+                mailbox_->flow().discarded(byteCount);
             return;
         case FrameGate::Entry::Absurd: {
             if (hasCredit)
-                messaging_->flow().discarded(byteCount);
+                mailbox_->flow().discarded(byteCount);
             ErrorInfo info;
             info.kind = ErrorKind::MalformedMessage;
             info.expected = gate_.next();
@@ -477,8 +472,8 @@ private:
         case FrameGate::Entry::Inside: break;
         }
         if (hasCredit)
-            messaging_->flow().consumed(source, byteCount);
-        messaging_->countTaken(source, header, message);
+            mailbox_->flow().consumed(source, byteCount);
+        mailbox_->countTaken(source, header, message);
         guarded([&] { handle(source, header, std::move(message)); }, {}, source);
         gate_.leave();
     }
@@ -501,17 +496,17 @@ private:
     void sendBody(int to, MessageKind kind, const Body& body)
     {
         const auto* first = reinterpret_cast<const std::byte*>(&body);
-        messaging_->send(to, kind, gate_.frame(), Bytes(first, first + sizeof body));
+        mailbox_->send(to, kind, gate_.frame(), Bytes(first, first + sizeof body));
     }
 
     void sendToDisplay(Buffer&& message)
     {
-        if (messaging_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
+        if (mailbox_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
             if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
                 gains_->add(config_.displayRank, raw, message.size());
-            messaging_->sendWithCredit(config_.displayRank, std::move(message));
+            mailbox_->sendWithCredit(config_.displayRank, std::move(message));
         } else
-            messaging_->send(config_.displayRank, std::move(message));
+            mailbox_->send(config_.displayRank, std::move(message));
     }
 
     // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
@@ -520,27 +515,27 @@ private:
     {
         if (rank() != config_.displayRank)
             return;
-        Messenger<Transport>& messenger = messaging_->messenger();
+        Connection& connection = mailbox_->connection();
         std::vector<int> seers;
         for (int other = 0; other < size(); ++other)
-            if (messenger.isSeenBy(other))
+            if (connection.isSeenBy(other))
                 seers.push_back(other);
         if (seers.empty())
             return;
         const auto places =
-            pipeline_->gather().shareImage([&](const std::byte* block) { return messenger.placeOf(block); });
+            pipeline_->gather().shareImage([&](const std::byte* block) { return connection.placeOf(block); });
         if (!places)
             return;
         const auto* first = reinterpret_cast<const std::byte*>(&*places);
         for (const int other : seers)
-            messaging_->send(other, MessageKind::ImagePlace, gate_.next(), Bytes(first, first + sizeof *places));
+            mailbox_->send(other, MessageKind::ImagePlace, gate_.next(), Bytes(first, first + sizeof *places));
     }
 
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
     // next one can not do without it.
     void undecodable(int source, const ErrorInfo& error) override
     {
-        messaging_->keepDamage(source, error); // first: begin() opens the gate and then looks
+        mailbox_->keepDamage(source, error); // first: begin() opens the gate and then looks
         if (!gate_.enterAny())
             return;
         failForDamage();
@@ -549,9 +544,9 @@ private:
 
     void failForDamage()
     {
-        const auto damage = messaging_->takeDamage();
+        const auto damage = mailbox_->takeDamage();
         if (damage && !failWith(std::make_exception_ptr(Error(damage->second)), messageFrom(damage->first)))
-            messaging_->keepDamage(damage->first, damage->second);
+            mailbox_->keepDamage(damage->first, damage->second);
     }
 
     static ErrorInfo messageFrom(int source)
@@ -572,11 +567,11 @@ private:
             return;
         }
         if (kind == MessageKind::CreditRequest) {
-            messaging_->flow().requested(source, bodyAs<FlowControl::Request>(message));
+            mailbox_->flow().requested(source, bodyAs<FlowControl::Request>(message));
             return;
         }
         if (kind == MessageKind::Credit) {
-            messaging_->flow().credited(source, bodyAs<FlowControl::Credit>(message));
+            mailbox_->flow().credited(source, bodyAs<FlowControl::Credit>(message));
             return;
         }
         if (kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown) {
@@ -587,7 +582,7 @@ private:
             if (source != config_.displayRank)
                 failMalformed("a rank that displays nothing has an image", config_.displayRank, source);
             pipeline_->gather().useImage(bodyAs<ImagePlaces>(message), [&](std::int32_t place, std::size_t byteCount) {
-                return messaging_->messenger().blockAt(source, place, byteCount);
+                return mailbox_->connection().blockAt(source, place, byteCount);
             });
             return;
         }
@@ -605,7 +600,7 @@ private:
             manifests_.receive(
                 source, ByteReader(message.data() + sizeof(MessageHeader), message.size() - sizeof(MessageHeader)),
                 [this](int tile) { return pipeline_->table().isMine(tile); });
-            messaging_->send(source, MessageKind::ManifestAck, gate_.frame());
+            mailbox_->send(source, MessageKind::ManifestAck, gate_.frame());
             break;
         case MessageKind::ManifestAck:
             if (manifests_.acknowledged(source))
@@ -629,7 +624,7 @@ private:
             if (source != jobServer())
                 failMalformed("jobs from a rank that hands out none", jobServer(), source);
             jobs_.receive(bodyAs<JobRange>(message));
-            messaging_->notify();
+            mailbox_->notify();
             break;
         case MessageKind::FinishedTiles:
             pipeline_->gather().receiveTiles(source, std::move(message));
@@ -661,30 +656,30 @@ private:
     // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
-        const std::uint32_t scope = messaging_->keyOf(header, message).scope;
+        const std::uint32_t scope = mailbox_->keyOf(header, message).scope;
         const bool isUp = header.kind == MessageKind::ReduceUp;
         bool differs = false;
         try {
             if (scope == FrameVerdict) {
-                const Verdict verdict = Verdict::from(messaging_->bytesOf(message));
+                const Verdict verdict = Verdict::from(mailbox_->bytesOf(message));
                 if (!verdict.fits(layout().tileCount()))
                     failMalformed("a verdict on tiles that there are not", layout().tileCount() - 1);
                 differs = isUp && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
-                if (!messaging_->bytesOf(message).empty())
+                if (!mailbox_->bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
                 differs = isUp && !params_.declared;
             } else if (scope == Quiet) {
-                differs = !Round::from(messaging_->bytesOf(message)).terms.difference(terms_).empty();
+                differs = !Round::from(mailbox_->bytesOf(message)).terms.difference(terms_).empty();
             } else {
                 failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
             }
             if (differs)
                 failWith(std::make_exception_ptr(Error(Verdict::disagreement())));
-            messaging_->receiveReduction(source, header, message);
+            mailbox_->receiveReduction(source, header, message);
         } catch (const Error& e) {
             // Without this message there would never be a result.
-            messaging_->giveUp(source, e.info());
+            mailbox_->giveUp(source, e.info());
         }
     }
 
@@ -709,7 +704,7 @@ private:
     void submitFinish(int tile)
     {
         gate_.enterAgain(); // we are inside
-        messaging_->submitWork(tile);
+        mailbox_->submitWork(tile);
     }
 
     // A tile that is complete.
@@ -739,7 +734,7 @@ private:
 
     void enterAllDeclared()
     {
-        messaging_->reductions().enter(
+        mailbox_->reductions().enter(
             {AllDeclared, gate_.frame()}, {}, [](const Bytes& a, const Bytes&) { return a; },
             [this, frame = gate_.frame()](const Bytes&) {
                 if (!gate_.enter(frame))
@@ -829,7 +824,7 @@ private:
     // The frame has failed: what has not left matters no more, unless what is finished is wanted.
     void dropRest()
     {
-        messaging_->flow().drop([this](const Buffer& message) {
+        mailbox_->flow().drop([this](const Buffer& message) {
             return params_.allowPartial && isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
         });
         if (params_.allowPartial && !ownTilesDone_)
@@ -878,7 +873,7 @@ private:
             info->kind = kind;
             info->rank = rank();
             info->frame = gate_.frame();
-            if (const std::string lost = messaging_->messenger().lost(); kind == ErrorKind::TimedOut && !lost.empty())
+            if (const std::string lost = mailbox_->connection().lost(); kind == ErrorKind::TimedOut && !lost.empty())
                 info->message += (info->message.empty() ? "" : "; ") + lost;
         }
         return info;
@@ -887,7 +882,7 @@ private:
     // Says whose part of a reduction this rank waits for, and in `from`, if there is only one that it can be.
     void addWaitedFor(ErrorInfo& info, const char* what, const ReductionKey& key)
     {
-        const auto missing = messaging_->reductions().missing(key);
+        const auto missing = mailbox_->reductions().missing(key);
         std::string text;
         for (const auto& part : missing) {
             text += (text.empty() ? std::string(what) + " rank " : ", rank ") + std::to_string(part.rank);
@@ -918,11 +913,11 @@ private:
             [this] { return mayVote(); },
             [this] {
                 Verdict v;
-                const std::int64_t repeated = messaging_->messenger().duplicates();
+                const std::int64_t repeated = mailbox_->connection().duplicates();
                 v.terms = terms_;
                 const auto reports = pipeline_->reports();
-                v.sums = {messaging_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
-                          messaging_->messagesSent() - messagesBefore_,
+                v.sums = {mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
+                          mailbox_->messagesSent() - messagesBefore_,
                           ownTilesDone_ ? pipeline_->table().touchedCount() : 0,
                           pipeline_->nonFinitePixels(),
                           gate_.takeLateCount(),
@@ -939,7 +934,7 @@ private:
                     v.incomplete = pipeline_->table().unfinished(params_.declared);
                 repeatedBefore_ = repeated;
                 v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
-                            static_cast<std::int64_t>(messaging_->flow().peakInboxBytes()),
+                            static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes()),
                             std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
                 return v;
             });
@@ -949,8 +944,8 @@ private:
     // polls no more takes nothing, and its sender would wait in end() for it to go.
     bool mayVote() const
     {
-        Messenger<Transport>& messenger = messaging_->messenger();
-        return !messenger.needsCaller() || (messaging_->flow().allSent() && messenger.quiet());
+        Connection& connection = mailbox_->connection();
+        return !connection.needsCaller() || (mailbox_->flow().allSent() && connection.quiet());
     }
 
     void polled() override
@@ -1026,10 +1021,10 @@ private:
         } catch (const TransportError&) {
             transportError = std::current_exception();
         }
-        gate_.close([this] { return messaging_->executor().help(); });
-        messaging_->reductions().forget(AllDeclared, gate_.frame());
-        messaging_->reductions().forget(Quiet, gate_.frame());
-        messaging_->messenger().expectMessages(false);
+        gate_.close([this] { return mailbox_->executor().help(); });
+        mailbox_->reductions().forget(AllDeclared, gate_.frame());
+        mailbox_->reductions().forget(Quiet, gate_.frame());
+        mailbox_->connection().expectMessages(false);
         frameOpen_ = false;
         lastFailed_ = transportError || verdict.error;
         pipeline_->gather().closeImage();
@@ -1061,7 +1056,7 @@ private:
     // the verdict, is it waited for no longer than for a rank of which nothing is heard.
     Verdict waitWithoutLimit()
     {
-        const auto limit = std::chrono::milliseconds(messaging_->messenger().options().peerTimeoutMs);
+        const auto limit = std::chrono::milliseconds(mailbox_->connection().options().peerTimeoutMs);
         const auto step = limit.count() > 0 ? std::min(limit, untilAsked) : untilAsked;
         std::optional<Clock::time_point> deadline;
         for (;;) {
@@ -1125,30 +1120,30 @@ private:
     void look()
     {
         tryVote();
-        const auto counts = messaging_->countsAtRest();
+        const auto counts = mailbox_->countsAtRest();
         if (!counts || !quiescence_.mayEnter())
             return;
         const auto isWaiting = [this] { return !isDone() && !outcome_->failed(); };
         const Round mine{terms_, {*counts, isWaiting() ? 1u : 0u}};
         quiescence_.enter();
-        messaging_->reductions().enter({Quiet, gate_.frame()}, mine.bytes(), Round::combine,
-                                       [this, isWaiting](const Bytes& all) {
-                                           if (!quiescence_.endRound(Round::from(all).report) || !isWaiting())
-                                               return;
-                                           if (const auto what = missing(ErrorKind::MissingInput))
-                                               failWith(std::make_exception_ptr(Error(*what)));
-                                       });
+        mailbox_->reductions().enter({Quiet, gate_.frame()}, mine.bytes(), Round::combine,
+                                     [this, isWaiting](const Bytes& all) {
+                                         if (!quiescence_.endRound(Round::from(all).report) || !isWaiting())
+                                             return;
+                                         if (const auto what = missing(ErrorKind::MissingInput))
+                                             failWith(std::make_exception_ptr(Error(*what)));
+                                     });
     }
 
     // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
     void waitForFinishedTiles()
     {
-        const auto areThere = [this] { return pipeline_->gather().complete() && messaging_->flow().allSent(); };
+        const auto areThere = [this] { return pipeline_->gather().complete() && mailbox_->flow().allSent(); };
         if (params_.timeoutMs == 0) // but what could not be read does not come again
-            messaging_->wait([&] { return areThere() || outcome_->isDamaged(); });
-        messaging_->wait(areThere,
-                         Clock::now()
-                             + (params_.timeoutMs > 0 ? std::chrono::milliseconds(params_.timeoutMs) : untilAsked));
+            mailbox_->wait([&] { return areThere() || outcome_->isDamaged(); });
+        mailbox_->wait(areThere,
+                       Clock::now()
+                           + (params_.timeoutMs > 0 ? std::chrono::milliseconds(params_.timeoutMs) : untilAsked));
     }
 
     [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
@@ -1159,9 +1154,9 @@ private:
         info.frame = gate_.frame();
         info.message = "no verdict after " + std::to_string(after.count()) + " ms";
         addWaitedFor(info, "no verdict from", outcome_->key());
-        if (const std::string lost = messaging_->messenger().lost(); !lost.empty())
+        if (const std::string lost = mailbox_->connection().lost(); !lost.empty())
             info.message += "; " + lost;
-        messaging_->messenger().giveUp(info);
+        mailbox_->connection().giveUp(info);
         throw TransportError(std::move(info));
     }
 
@@ -1178,7 +1173,7 @@ private:
 
     // The frame.
     FrameGate gate_;
-    std::unique_ptr<FrameOutcome<Transport>> outcome_;
+    std::unique_ptr<FrameOutcome> outcome_;
     FrameParams params_;
     FrameTerms terms_; // of params_
     std::uint64_t lastAccumulationId_ = 0;
@@ -1195,7 +1190,7 @@ private:
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 
-    std::unique_ptr<Messaging<Transport>> messaging_; // last: its tasks use the others
+    std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others
 };
 
 } // namespace dfb::detail

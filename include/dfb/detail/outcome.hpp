@@ -2,7 +2,7 @@
 // reduction in which all ranks learn the same verdict.
 #pragma once
 
-#include <dfb/comm/messaging.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/detail/frame_gate.hpp>
 #include <dfb/detail/verdict.hpp>
 
@@ -17,11 +17,10 @@
 
 namespace dfb::detail {
 
-template <class Transport>
 class FrameOutcome {
 public:
-    FrameOutcome(Messaging<Transport>& messaging, const FrameGate& gate, std::uint32_t scope)
-        : messaging_(messaging), gate_(gate), scope_(scope)
+    FrameOutcome(Mailbox& mailbox, const FrameGate& gate, std::uint32_t scope)
+        : mailbox_(mailbox), gate_(gate), scope_(scope)
     {
     }
 
@@ -34,7 +33,7 @@ public:
     }
 
     // The frame has failed on some rank, or the transport has. From any thread, as the rest.
-    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || messaging_.failed(); }
+    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || mailbox_.failed(); }
 
     // A message was damaged, here or where the frame failed first: it may be one that the verdict needs.
     bool isDamaged() const noexcept { return damaged_; }
@@ -44,7 +43,7 @@ public:
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);
-        info.rank = messaging_.rank();
+        info.rank = mailbox_.rank();
         info.frame = gate_.frame();
         bool first = false, late = false;
         damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
@@ -59,9 +58,9 @@ public:
         if (first) {
             ByteWriter body;
             put(body, info);
-            for (int other = 0; other < messaging_.size(); ++other)
-                if (other != messaging_.rank())
-                    messaging_.send(other, MessageKind::Abort, gate_.frame(), body.bytes());
+            for (int other = 0; other < mailbox_.size(); ++other)
+                if (other != mailbox_.rank())
+                    mailbox_.send(other, MessageKind::Abort, gate_.frame(), body.bytes());
         }
         return !late;
     }
@@ -71,7 +70,7 @@ public:
     bool note(const std::exception_ptr& reason, const ErrorInfo& where)
     {
         ErrorInfo info = errorInfoOf(reason, where);
-        info.rank = messaging_.rank();
+        info.rank = mailbox_.rank();
         info.frame = gate_.frame();
         const std::lock_guard<std::mutex> lock(mutex_);
         if (!error_)
@@ -107,31 +106,30 @@ public:
         Verdict mine;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (voted_ || messaging_.failed() || !(failed_ || done()) || !may())
+            if (voted_ || mailbox_.failed() || !(failed_ || done()) || !may())
                 return;
             voted_ = true;
             mine = figures();
             mine.error = error_;
         }
-        messaging_.reductions().enter(key(), mine.bytes(), Verdict::combine,
-                                      [this](const ReductionTable::Bytes& result) {
-                                          verdict_ = Verdict::from(result);
-                                          hasVerdict_ = true;
-                                          messaging_.notify();
-                                      });
+        mailbox_.reductions().enter(key(), mine.bytes(), Verdict::combine, [this](const ReductionTable::Bytes& result) {
+            verdict_ = Verdict::from(result);
+            hasVerdict_ = true;
+            mailbox_.notify();
+        });
     }
 
     // Waits for the verdict of all ranks: null if it has not come before `deadline`. Throws TransportError.
     const Verdict* wait(std::optional<std::chrono::steady_clock::time_point> deadline = std::nullopt)
     {
-        return messaging_.wait([this] { return hasVerdict_.load(); }, deadline) ? &*verdict_ : nullptr;
+        return mailbox_.wait([this] { return hasVerdict_.load(); }, deadline) ? &*verdict_ : nullptr;
     }
 
     // Of the reduction in which the verdict comes.
     ReductionKey key() const { return {scope_, gate_.frame()}; }
 
 private:
-    Messaging<Transport>& messaging_;
+    Mailbox& mailbox_;
     const FrameGate& gate_;
     std::uint32_t scope_;
     std::atomic<bool> failed_{false}, damaged_{false}, hasVerdict_{false};

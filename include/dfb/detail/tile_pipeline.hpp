@@ -41,8 +41,7 @@ public:
           table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
                  rank, rankCount),
           gather_(
-              pool_, table_.layout(),
-              {config.format, imageChannels(config), address, config.codec, config.dither},
+              pool_, table_.layout(), {config.format, imageChannels(config), address, config.codec, config.dither},
               rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
           coder_(config.wire, ActiveByDepth<TileOp>::value)

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/detail/frame_terms.hpp>
 #include <dfb/frame.hpp>
 
@@ -284,7 +285,7 @@ struct Agreement {
         std::string text_;
     };
 
-    // `checksums`: see MessengerOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
+    // `checksums`: see ConnectionOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
     // `ownerOf(tile)`: the owner map's answers.
     template <class TileOp, class PixelOp, class OwnerOf>
     static Agreement of(const FrameBufferConfig& c, bool checksums, int rank, int tileSize, ChannelMask sent,
@@ -427,14 +428,13 @@ private:
 };
 
 // Collective. What all ranks were made with, or what is wrong. Then no rank returns before all know it: the first that
-// throws it may take the messenger along, and who has not heard of the reason by then would get another error.
-template <class Messaging>
-Agreement agree(Messaging& messaging, const Agreement& mine)
+// throws it may take the connection along, and who has not heard of the reason by then would get another error.
+inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
 {
-    const auto all = Agreement::from(messaging.reduce(mine.bytes(), Agreement::combine));
+    const auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
     if (!all.fine) {
         try {
-            messaging.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
+            mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
         } catch (const TransportError&) {
             // So one has gone, which it does when all know.
         }

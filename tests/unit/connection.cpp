@@ -1,7 +1,7 @@
-// SequenceWindow and Messenger over a transport that the test plays: numbers, checksums, addresses, failure.
+// SequenceWindow and Connection over a transport that the test plays: numbers, checksums, addresses, failure.
 #include "catch.hpp"
 
-#include <dfb/comm/messenger.hpp>
+#include <dfb/comm/connection.hpp>
 
 #include <algorithm>
 #include <cstdint>
@@ -61,7 +61,7 @@ public:
 private:
     std::shared_ptr<Wire> wire_;
 };
-using Messenger = dfb::Messenger<PlayedTransport>;
+using dfb::connect;
 
 struct Receiver : dfb::detail::MessageReceiver {
     struct Got {
@@ -84,7 +84,7 @@ struct Receiver : dfb::detail::MessageReceiver {
         CHECK(error.kind == dfb::ErrorKind::MalformedMessage);
         malformedFrom.push_back(source);
     }
-    void messengerFailed() override { ++failures; }
+    void connectionFailed() override { ++failures; }
 };
 
 std::shared_ptr<Wire> wireOf(int rank, int size)
@@ -121,7 +121,7 @@ void carry(Wire& from, Wire& to)
 
 } // namespace
 
-TEST_CASE("Each number is new once, in whatever order", "[messenger]")
+TEST_CASE("Each number is new once, in whatever order", "[connection]")
 {
     std::vector<std::uint32_t> order{0, 1, 2, 3, 4, 5, 6};
     do {
@@ -140,7 +140,7 @@ TEST_CASE("Each number is new once, in whatever order", "[messenger]")
     } while (std::next_permutation(order.begin(), order.end()));
 }
 
-TEST_CASE("Numbers that come in any order, twice or never", "[messenger]")
+TEST_CASE("Numbers that come in any order, twice or never", "[connection]")
 {
     for (std::uint64_t seed = 0; seed < 50; ++seed) {
         std::mt19937_64 random(seed);
@@ -168,7 +168,7 @@ TEST_CASE("Numbers that come in any order, twice or never", "[messenger]")
     }
 }
 
-TEST_CASE("A number far from the others is refused and changes nothing", "[messenger]")
+TEST_CASE("A number far from the others is refused and changes nothing", "[connection]")
 {
     SequenceWindow window;
     CHECK(window.arrive(0) == Result::New);
@@ -189,17 +189,18 @@ TEST_CASE("A number far from the others is refused and changes nothing", "[messe
     CHECK(window.missing() == 1u << 20);
 }
 
-TEST_CASE("Numbers run per destination, from 0, from any thread; checksums are there if they are wanted", "[messenger]")
+TEST_CASE("Numbers run per destination, from 0, from any thread; checksums are there if they are wanted",
+          "[connection]")
 {
     for (const bool checksums : {false, true}) {
         const auto wire = wireOf(1, 3);
         {
-            Messenger messenger(wire, {dfb::Progress::Thread, checksums});
+            const auto connection = connect<PlayedTransport>(wire, {dfb::Progress::Thread, checksums});
             std::vector<std::thread> threads;
             for (int t = 0; t < 4; ++t)
                 threads.emplace_back([&, t] {
                     for (int i = 0; i < 100; ++i)
-                        messenger.send(2 * (i % 2), messageOf(*messenger.pool(), 0, t));
+                        connection->send(2 * (i % 2), messageOf(*connection->pool(), 0, t));
                 });
             for (std::thread& t : threads)
                 t.join();
@@ -217,82 +218,83 @@ TEST_CASE("Numbers run per destination, from 0, from any thread; checksums are t
     }
 }
 
-TEST_CASE("Messages that come twice are dropped and counted, whatever they are for", "[messenger]")
+TEST_CASE("Messages that come twice are dropped and counted, whatever they are for", "[connection]")
 {
     const auto a = wireOf(0, 2), b = wireOf(1, 2);
-    Messenger sender(a), messenger(b);
+    const auto sender = connect<PlayedTransport>(a), connection = connect<PlayedTransport>(b);
     Receiver receiver;
     std::uint32_t address = 9;
-    messenger.attach(receiver, address);
+    connection->attach(receiver, address);
     REQUIRE(address == 0);
     for (int i = 0; i < 10; ++i)
-        sender.send(1, messageOf(*sender.pool(), 0, i));
+        sender->send(1, messageOf(*sender->pool(), 0, i));
     for (auto& [destination, message] : a->sent)
-        b->handler->receive(0, copyOf(*sender.pool(), message));
+        b->handler->receive(0, copyOf(*sender->pool(), message));
     CHECK(receiver.got.size() == 10);
-    CHECK(messenger.duplicates() == 0);
+    CHECK(connection->duplicates() == 0);
     for (auto& [destination, message] : a->sent)
-        b->handler->receive(0, copyOf(*sender.pool(), message));
+        b->handler->receive(0, copyOf(*sender->pool(), message));
     CHECK(receiver.got.size() == 10);
-    CHECK(messenger.duplicates() == 10);
+    CHECK(connection->duplicates() == 10);
     // The same numbers of another rank are no duplicates.
-    b->handler->receive(3, copyOf(*sender.pool(), a->sent[0].second));
+    b->handler->receive(3, copyOf(*sender->pool(), a->sent[0].second));
     CHECK(receiver.got.size() == 11);
-    CHECK(messenger.duplicates() == 10);
+    CHECK(connection->duplicates() == 10);
     CHECK(receiver.malformedFrom.empty());
 }
 
 TEST_CASE("Messages for an object that is not there yet wait for it; for one that is gone they are dropped",
-          "[messenger]")
+          "[connection]")
 {
     const auto a = wireOf(0, 2), b = wireOf(1, 2);
-    Messenger sender(a), messenger(b);
+    const auto sender = connect<PlayedTransport>(a), connection = connect<PlayedTransport>(b);
     for (std::uint32_t to : {1u, 0u, 1u, 2u})
-        sender.send(1, messageOf(*sender.pool(), to, to, "early"));
+        sender->send(1, messageOf(*sender->pool(), to, to, "early"));
     carry(*a, *b);
     Receiver first, second, third;
     std::uint32_t one = 9, two = 9, three = 9;
-    messenger.attach(first, one);
+    connection->attach(first, one);
     CHECK(one == 0);
     CHECK(first.got.size() == 1);
-    messenger.attach(second, two);
+    connection->attach(second, two);
     CHECK(two == 1);
     CHECK(second.got.size() == 2);
     CHECK((!second.got.empty() && second.got[0].text == "early" && second.got[0].number == 1));
-    messenger.detach(one);
-    sender.send(1, messageOf(*sender.pool(), 0, 7));
-    sender.send(1, messageOf(*sender.pool(), 1, 7));
+    connection->detach(one);
+    sender->send(1, messageOf(*sender->pool(), 0, 7));
+    sender->send(1, messageOf(*sender->pool(), 1, 7));
     carry(*a, *b);
     CHECK(first.got.size() == 1);
     CHECK(second.got.size() == 3);
-    messenger.attach(third, three); // addresses are not used again
+    connection->attach(third, three); // addresses are not used again
     CHECK(three == 2);
     CHECK(third.got.size() == 1);
-    messenger.detach(two);
-    messenger.detach(three);
+    connection->detach(two);
+    connection->detach(three);
 }
 
-TEST_CASE("With checksums, no single bit, no byte and no length can be changed unnoticed", "[messenger]")
+TEST_CASE("With checksums, no single bit, no byte and no length can be changed unnoticed", "[connection]")
 {
     const auto a = wireOf(0, 2), b = wireOf(1, 2);
-    Messenger sender(a, {dfb::Progress::Thread, true}), messenger(b, {dfb::Progress::Thread, true});
+    const auto sender = connect<PlayedTransport>(a, {dfb::Progress::Thread, true}),
+               connection = connect<PlayedTransport>(b, {dfb::Progress::Thread, true});
     Receiver first, second;
     std::uint32_t address = 0;
-    messenger.attach(first, address);
-    messenger.attach(second, address);
-    sender.send(1, messageOf(*sender.pool(), 1, 5, "Sorting is for mail, not for pixels."));
+    connection->attach(first, address);
+    connection->attach(second, address);
+    sender->send(1, messageOf(*sender->pool(), 1, 5, "Sorting is for mail, not for pixels."));
     const Buffer good = std::move(a->sent[0].second);
     const auto deliver = [&](Buffer&& message) { b->handler->receive(0, std::move(message)); };
     std::size_t tries = 0;
     for (std::size_t i = 0; i < good.size(); ++i)
         for (int bit = 0; bit < 9; ++bit) { // the 9th: all of the byte
-            Buffer bad = copyOf(*sender.pool(), good);
+            Buffer bad = copyOf(*sender->pool(), good);
             bad.data()[i] ^= static_cast<std::byte>(bit < 8 ? 1 << bit : 0xff);
             deliver(std::move(bad));
             ++tries;
         }
     for (std::size_t length = 0; length < good.size(); ++length) {
-        Buffer bad = copyOf(*sender.pool(), good);
+        Buffer bad = copyOf(*sender->pool(), good);
         bad.shrink(length);
         deliver(std::move(bad));
         ++tries;
@@ -302,100 +304,102 @@ TEST_CASE("With checksums, no single bit, no byte and no length can be changed u
     // It may have been for either.
     CHECK(first.malformedFrom.size() == tries);
     CHECK(second.malformedFrom == std::vector<int>(tries, 0));
-    CHECK(messenger.duplicates() == 0);
+    CHECK(connection->duplicates() == 0);
     // And what was refused does not count as having come.
-    deliver(copyOf(*sender.pool(), good));
+    deliver(copyOf(*sender->pool(), good));
     CHECK(second.got.size() == 1);
-    CHECK(messenger.lost().empty());
-    messenger.detach(0);
-    messenger.detach(1);
+    CHECK(connection->lost().empty());
+    connection->detach(0);
+    connection->detach(1);
 }
 
-TEST_CASE("Where checksums are wanted an input without one is refused", "[messenger]")
+TEST_CASE("Where checksums are wanted an input without one is refused", "[connection]")
 {
     const auto a = wireOf(0, 2), b = wireOf(1, 2);
-    Messenger sender(a), messenger(b, {dfb::Progress::Thread, true});
+    const auto sender = connect<PlayedTransport>(a),
+               connection = connect<PlayedTransport>(b, {dfb::Progress::Thread, true});
     Receiver receiver;
     std::uint32_t address = 0;
-    messenger.attach(receiver, address);
-    sender.send(1, messageOf(*sender.pool(), 0, 5));
+    connection->attach(receiver, address);
+    sender->send(1, messageOf(*sender->pool(), 0, 5));
     carry(*a, *b);
     CHECK(receiver.got.empty());
     CHECK(receiver.malformedFrom.size() == 1);
-    messenger.detach(address);
+    connection->detach(address);
 }
 
-TEST_CASE("By which messages ranks find out that only one of them uses checksums", "[messenger]")
+TEST_CASE("By which messages ranks find out that only one of them uses checksums", "[connection]")
 {
     using Kind = dfb::detail::MessageKind;
     for (const bool uses : {false, true})
         for (const bool isAlike : {false, true})
             for (const Kind kind : {Kind::ReduceUp, Kind::ReduceDown, Kind::Fragment, Kind::Manifest, Kind::Abort}) {
                 const auto a = wireOf(0, 2), b = wireOf(1, 2);
-                Messenger sender(a, {dfb::Progress::Thread, !uses}), messenger(b, {dfb::Progress::Thread, uses});
+                const auto sender = connect<PlayedTransport>(a, {dfb::Progress::Thread, !uses}),
+                           connection = connect<PlayedTransport>(b, {dfb::Progress::Thread, uses});
                 if (isAlike)
-                    messenger.setAlike();
+                    connection->setAlike();
                 Receiver receiver;
                 std::uint32_t address = 0;
-                messenger.attach(receiver, address);
-                dfb::Buffer message = messageOf(*sender.pool(), 0, 5);
+                connection->attach(receiver, address);
+                dfb::Buffer message = messageOf(*sender->pool(), 0, 5);
                 auto header = headerOf(message);
                 header.kind = kind;
                 std::memcpy(message.data(), &header, sizeof header);
-                sender.send(1, std::move(message));
+                sender->send(1, std::move(message));
                 carry(*a, *b);
                 INFO((uses ? "the receiver" : "the sender") << " uses checksums, kind " << static_cast<int>(kind));
                 const bool isTaken = !isAlike && (kind == Kind::ReduceUp || kind == Kind::ReduceDown);
                 CHECK(receiver.got.size() == (isTaken ? 1u : 0u));
                 CHECK(receiver.malformedFrom.size() == (isTaken ? 0u : 1u));
-                messenger.detach(address);
+                connection->detach(address);
             }
 }
 
-TEST_CASE("What is lost is said in words, by rank", "[messenger]")
+TEST_CASE("What is lost is said in words, by rank", "[connection]")
 {
     const auto a = wireOf(0, 4), b = wireOf(1, 4);
-    Messenger sender(a), messenger(b);
+    const auto sender = connect<PlayedTransport>(a), connection = connect<PlayedTransport>(b);
     Receiver receiver;
     std::uint32_t address = 0;
-    messenger.attach(receiver, address);
+    connection->attach(receiver, address);
     for (int i = 0; i < 6; ++i)
-        sender.send(1, messageOf(*sender.pool(), 0, i));
+        sender->send(1, messageOf(*sender->pool(), 0, i));
     for (const std::size_t i : {5u, 1u, 2u})
-        b->handler->receive(3, copyOf(*sender.pool(), a->sent[i].second));
-    b->handler->receive(2, copyOf(*sender.pool(), a->sent[1].second));
-    b->handler->receive(0, copyOf(*sender.pool(), a->sent[0].second));
-    CHECK(messenger.lost() == "messages on the way or lost: 1 from rank 2, 3 from rank 3");
-    messenger.detach(address);
+        b->handler->receive(3, copyOf(*sender->pool(), a->sent[i].second));
+    b->handler->receive(2, copyOf(*sender->pool(), a->sent[1].second));
+    b->handler->receive(0, copyOf(*sender->pool(), a->sent[0].second));
+    CHECK(connection->lost() == "messages on the way or lost: 1 from rank 2, 3 from rank 3");
+    connection->detach(address);
 }
 
-TEST_CASE("Who gives up says so to all others, once, and they can not go on either", "[messenger]")
+TEST_CASE("Who gives up says so to all others, once, and they can not go on either", "[connection]")
 {
     const auto a = wireOf(0, 3), b = wireOf(1, 3);
     {
-        Messenger quitter(a), other(b);
+        const auto quitter = connect<PlayedTransport>(a), other = connect<PlayedTransport>(b);
         Receiver ofQuitter, ofOther;
         std::uint32_t address = 0;
-        quitter.attach(ofQuitter, address);
-        other.attach(ofOther, address);
-        CHECK_FALSE(other.failed());
-        CHECK_NOTHROW(other.throwIfFailed());
+        quitter->attach(ofQuitter, address);
+        other->attach(ofOther, address);
+        CHECK_FALSE(other->failed());
+        CHECK_NOTHROW(other->throwIfFailed());
         dfb::ErrorInfo info;
         info.kind = dfb::ErrorKind::Transport;
         info.rank = 0;
         info.message = "the moon is full";
-        quitter.giveUp(info);
-        quitter.giveUp(info);
+        quitter->giveUp(info);
+        quitter->giveUp(info);
         CHECK(a->sent.size() == 2);
-        CHECK(quitter.failed());
+        CHECK(quitter->failed());
         CHECK(ofQuitter.failures == 1);
         carry(*a, *b);
-        CHECK(other.failed());
+        CHECK(other->failed());
         CHECK(ofOther.failures == 1);
         CHECK(ofOther.got.empty());
         std::string text;
         try {
-            other.throwIfFailed();
+            other->throwIfFailed();
         } catch (const dfb::TransportError& e) {
             text = e.what();
         }
@@ -403,8 +407,8 @@ TEST_CASE("Who gives up says so to all others, once, and they can not go on eith
         CHECK(text.find("rank 0") != std::string::npos);
         CHECK(text.find("the moon is full") != std::string::npos);
         CHECK(b->sent.empty()); // who is told does not tell
-        quitter.detach(address);
-        other.detach(address);
+        quitter->detach(address);
+        other->detach(address);
     }
     CHECK(a->stops == std::vector<bool>{false}); // waits for nobody
     CHECK(b->stops == std::vector<bool>{false});

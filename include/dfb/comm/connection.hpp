@@ -1,13 +1,14 @@
-// Messenger: a communicator's messages for any number of framebuffers: which object a message is for, that it
+// Connection: a communicator's messages for any number of framebuffers: which object a message is for, that it
 // comes once and whole, and progress of the transport (section 3.2 of the paper).
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/checksum.hpp>
 #include <dfb/comm/heartbeat.hpp>
+#include <dfb/comm/link.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
-#include <dfb/comm/transport.hpp>
+#include <dfb/fwd.hpp>
 #include <dfb/processors.hpp>
 
 #include <algorithm>
@@ -30,11 +31,11 @@
 
 namespace dfb {
 
-// How messages travel: for all framebuffers and walls of a messenger. Only `checksums` must be the same on all ranks.
-struct MessengerOptions {
+// How messages travel: for all framebuffers and walls of a connection. Only `checksums` must be the same on all ranks.
+struct ConnectionOptions {
     Progress progress = Progress::Auto;
-    // A CRC-32C in each message: whoever does not trust the network pays for it. The first object that is made on it says
-    // if it is not the same on all ranks.
+    // A CRC-32C in each message: whoever does not trust the network pays for it. The first object that is made on it
+    // says if it is not the same on all ranks.
     bool checksums = false;
     bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
     // On ranks with a progress thread: while messages are expected, in a frame or a call that waits for all ranks, a
@@ -57,7 +58,7 @@ class MessageReceiver {
 public:
     virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
     virtual void malformed(int source, const ErrorInfo& error) = 0; // may have been for this one
-    virtual void messengerFailed() = 0;
+    virtual void connectionFailed() = 0;
 
 protected:
     ~MessageReceiver() = default;
@@ -104,17 +105,13 @@ private:
 // A framebuffer makes one of its own unless it is given one; framebuffers that share it share its progress thread and
 // its buffers. They must be made in the same order on all ranks, and gone before it. All members may be called from
 // any thread unless they say otherwise.
-template <class Transport>
-class Messenger final : private TransportHandler {
-    static_assert(detail::checkTransport<Transport>());
-
+class Connection final : private TransportHandler {
 public:
-    // Collective, like the destructor. Throws TransportError.
-    explicit Messenger(const typename Transport::Communicator& communicator, MessengerOptions options = {})
-        : options_(resolved(std::move(options), communicator)), pool_(MemoryPool::create(options_.sharedMemory)),
-          transport_(communicator, pool_, options_.progress)
+    // See connect(). `pool`: the one that the link has.
+    Connection(ConnectionOptions options, std::shared_ptr<MemoryPool> pool, std::unique_ptr<Link> link)
+        : options_(std::move(options)), pool_(std::move(pool)), link_(std::move(link))
     {
-        transport_.start(*this);
+        link_->start(*this);
         if (!hasOwnThread())
             return;
         try {
@@ -129,33 +126,30 @@ public:
     }
 
     // While an exception passes it waits for nobody, as the other ranks may not be on their way here, and tells them.
-    ~Messenger()
+    ~Connection()
     {
         if (std::uncaught_exceptions() > exceptions_)
-            leave("an exception has ended its messenger");
+            leave("an exception has ended its connection");
         end();
     }
 
-    int rank() const noexcept { return transport_.rank(); }
-    int size() const noexcept { return transport_.size(); }
+    int rank() const noexcept { return rank_; }
+    int size() const noexcept { return size_; }
     // What it was made with, but for Progress::Auto, in place of which is what it has become.
-    const MessengerOptions& options() const noexcept { return options_; }
+    const ConnectionOptions& options() const noexcept { return options_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
     // How many threads this rank should render and composite with: the processors that the calling thread may run on,
-    // divided by the ranks that may run there, too, those of this messenger on this node; at least 1. What a
+    // divided by the ranks that may run there, too, those of this connection on this node; at least 1. What a
     // framebuffer has that is given no executor.
     int threadShare() const noexcept
     {
-        int ranks = 1;
-        if constexpr (detail::KnowsSharing<Transport>::value)
-            ranks = transport_.sharingRanks();
-        return dfb::threadShare(Processors::ofThisThread().count(), ranks);
+        return dfb::threadShare(Processors::ofThisThread().count(), link_->sharingRanks());
     }
 
     // Moves messages; true if any moved. With a progress thread there is no need to call it, and on a thread that may
     // not be in MPI it does nothing. Never blocks.
-    bool poll() { return !progress_.running() && transport_.mayPoll() && progress_.tryPoll(); }
+    bool poll() { return !progress_.running() && link_->mayPoll() && progress_.tryPoll(); }
 
     // ---- for the objects that it serves
 
@@ -196,31 +190,16 @@ public:
             header.checksum = checksumOf(message);
             std::memcpy(message.data(), &header, sizeof header);
         }
-        transport_.send(destination, std::move(message));
+        link_->send(destination, std::move(message));
     }
 
     // Whether another rank sees memory of this one; where a block of pool() lies there, -1: nowhere; and what lies in
     // such a place of another rank, null: this one does not see it.
-    bool isSeenBy(int other) const
-    {
-        if constexpr (detail::SharesMemory<Transport>::value)
-            return other != rank() && transport_.lendsTo(other);
-        else
-            return false;
-    }
-    std::int32_t placeOf(const std::byte* block) const
-    {
-        if constexpr (detail::SharesMemory<Transport>::value)
-            return transport_.placeOf(block);
-        else
-            return -1;
-    }
+    bool isSeenBy(int other) const { return other != rank() && link_->lendsTo(other); }
+    std::int32_t placeOf(const std::byte* block) const { return link_->placeOf(block); }
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const
     {
-        if constexpr (detail::SharesMemory<Transport>::value)
-            return transport_.blockAt(other, place, byteCount);
-        else
-            return nullptr;
+        return link_->blockAt(other, place, byteCount);
     }
 
     // All ranks have found that they were set up alike, which includes `checksums`; from any thread, any number of
@@ -256,13 +235,13 @@ public:
     // As long as it lives, messages are looked for often.
     class Hurry {
     public:
-        explicit Hurry(Messenger& messenger) : progress_(messenger.progress_) { progress_.hurry(true); }
+        explicit Hurry(Connection& connection) : progress_(connection.progress_) { progress_.hurry(true); }
         Hurry(const Hurry&) = delete;
         Hurry& operator=(const Hurry&) = delete;
         ~Hurry() { progress_.hurry(false); }
 
     private:
-        ProgressThread<Transport>& progress_;
+        ProgressThread& progress_;
     };
 
     // For a thread that waits: moves messages in place of the progress thread, where there is one. True if any moved.
@@ -270,14 +249,14 @@ public:
     bool hasProgressThread() const noexcept { return progress_.running(); }
 
     // Whether poll() is what the calling thread must do while it waits, and whether somebody else does so.
-    bool needsCaller() const noexcept { return transport_.needsPolling() && !progress_.running(); }
-    bool mayPoll() const noexcept { return transport_.mayPoll(); }
-    bool quiet() const { return transport_.quiet(); }
-    void nap(std::chrono::nanoseconds limit) { transport_.nap(limit); }
+    bool needsCaller() const noexcept { return link_->needsPolling() && !progress_.running(); }
+    bool mayPoll() const noexcept { return link_->mayPoll(); }
+    bool quiet() const { return link_->quiet(); }
+    void nap(std::chrono::nanoseconds limit) { link_->nap(limit); }
     void interrupt()
     {
         if (needsCaller())
-            transport_.interrupt();
+            link_->interrupt();
     }
 
     bool failed() const noexcept override { return failed_; }
@@ -318,12 +297,6 @@ private:
         Buffer message;
     };
 
-    static MessengerOptions resolved(MessengerOptions options, const typename Transport::Communicator& communicator)
-    {
-        options.progress = detail::resolved<Transport>(options.progress, communicator);
-        return options;
-    }
-
     void leave(const char* why)
     {
         ErrorInfo error;
@@ -337,11 +310,11 @@ private:
     {
         progress_.stop();
         if (failed_) // what tells the others of it should still leave, but not at any cost
-            for (int tries = 0; tries < 100 && transport_.mayPoll() && !transport_.quiet(); ++tries) {
-                transport_.poll();
+            for (int tries = 0; tries < 100 && link_->mayPoll() && !link_->quiet(); ++tries) {
+                link_->poll();
                 std::this_thread::sleep_for(std::chrono::milliseconds(1));
             }
-        transport_.stop(!failed_);
+        link_->stop(!failed_);
     }
 
     static std::uint32_t checksumOf(const Buffer& message)
@@ -450,7 +423,7 @@ private:
 
     // --- signs of life
 
-    bool hasOwnThread() const { return transport_.needsPolling() && options_.progress == Progress::Thread; }
+    bool hasOwnThread() const { return link_->needsPolling() && options_.progress == Progress::Thread; }
 
     std::chrono::milliseconds peerTimeout() const
     {
@@ -506,9 +479,8 @@ private:
         error.message = "this rank is lost: it has ended, is stopped or can not be reached. Rank "
                         + std::to_string(rank()) + " has heard nothing of it for "
                         + std::to_string(options_.peerTimeoutMs) + " ms (peerTimeoutMs)";
-        if constexpr (detail::CanAbort<Transport>::value)
-            if (!options_.onPeerLost)
-                transport_.abort(error.describe());
+        if (link_->canAbort() && !options_.onPeerLost)
+            link_->abort(error.describe());
         if (giveUp(error) && options_.onPeerLost)
             options_.onPeerLost(error);
     }
@@ -519,20 +491,21 @@ private:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         for (const auto& [address, receiver] : receivers_)
-            receiver->messengerFailed();
+            receiver->connectionFailed();
     }
 
-    const MessengerOptions options_;
+    const ConnectionOptions options_;
     const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;
-    Transport transport_;
+    std::unique_ptr<Link> link_;
+    const int rank_ = link_->rank(), size_ = link_->size();
     std::atomic<std::int64_t> duplicates_{0};
     std::atomic<bool> isAlike_{false};
 
     mutable std::mutex peersMutex_;
     // Under peersMutex_:
     std::unordered_map<int, Peer> peers_; // made when first needed
-    detail::Heartbeat heartbeat_{transport_.rank(), transport_.size(), peerTimeout()};
+    detail::Heartbeat heartbeat_{rank_, size_, peerTimeout()};
     std::set<int> askers_; // that want a sign of life
 
     std::atomic<bool> isAsked_{false}; // there are askers
@@ -549,8 +522,19 @@ private:
     std::optional<ErrorInfo> failure_;
     std::atomic<bool> failed_{false};
 
-    ProgressThread<Transport> progress_{transport_, longestNap(),
-                                        [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
+    ProgressThread progress_{*link_, longestNap(),
+                             [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
 };
+
+// Collective, like the end of what it returns: connects the ranks of a communicator. Throws TransportError.
+template <class Transport = MpiTransport>
+std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator,
+                                    ConnectionOptions options = {})
+{
+    options.progress = detail::resolved<Transport>(options.progress, communicator);
+    auto pool = MemoryPool::create(options.sharedMemory);
+    auto link = std::make_unique<detail::LinkOver<Transport>>(communicator, pool, options.progress);
+    return std::make_shared<Connection>(std::move(options), std::move(pool), std::move(link));
+}
 
 } // namespace dfb

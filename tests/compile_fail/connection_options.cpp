@@ -1,25 +1,25 @@
-// How messages travel is said once, to the messenger: a framebuffer that is given one has no place to say it again.
+// How messages travel is said once, to the connection: a framebuffer that is given one has no place to say it again.
 #include <dfb/dfb.hpp>
 
 #include <memory>
 #include <type_traits>
 
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
-using Given = std::shared_ptr<dfb::Messenger<dfb::InprocTransport>>;
+using Given = std::shared_ptr<dfb::Connection>;
 
-inline void make(dfb::FrameBufferConfig& config, dfb::MessengerOptions& options)
+inline void make(dfb::FrameBufferConfig& config, dfb::ConnectionOptions& options)
 {
 #if defined(CASE_PROGRESS_IN_CONFIG) // expect: no member named
     config.progress = dfb::Progress::Caller;
-#elif defined(CASE_CHECKSUMS_IN_CONFIG) // expect: no member named
+#elif defined(CASE_CHECKSUMS_IN_CONFIG)       // expect: no member named
     config.checksums = true;
-#elif defined(CASE_MEMORY_IN_CONFIG) // expect: no member named
+#elif defined(CASE_MEMORY_IN_CONFIG)          // expect: no member named
     config.sharedMemory = false;
-#elif defined(CASE_TIMEOUT_IN_CONFIG) // expect: no member named
+#elif defined(CASE_TIMEOUT_IN_CONFIG)         // expect: no member named
     config.peerTimeoutMs = 4000;
-#elif defined(CASE_HANDLER_IN_CONFIG) // expect: no member named
+#elif defined(CASE_HANDLER_IN_CONFIG)         // expect: no member named
     config.onPeerLost = [](const dfb::ErrorInfo&) {};
-#elif defined(CASE_OPTIONS_WITH_A_MESSENGER) // expect: no matching
+#elif defined(CASE_OPTIONS_WITH_A_CONNECTION) // expect: no matching
     using Made = decltype(FrameBuffer(std::declval<Given>(), config, options));
 #else
     options.peerTimeoutMs = 4000;

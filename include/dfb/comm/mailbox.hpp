@@ -1,10 +1,10 @@
-// Messaging: the messages of one object on all ranks: an inbox that is emptied by tasks, messages with and without
+// Mailbox: the messages of one object on all ranks: an inbox that is emptied by tasks, messages with and without
 // credit, reductions, and waiting without spinning.
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
-#include <dfb/comm/messenger.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/detail/fifo.hpp>
 #include <dfb/detail/quiescence.hpp>
@@ -27,7 +27,7 @@
 namespace dfb::detail {
 
 // What the messages are handed to; it knows what they mean.
-class MessageHandler {
+class MailboxOwner {
 public:
     // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
     // but for those of reduce().
@@ -39,11 +39,10 @@ public:
     virtual void polled() {}  // messages have moved while this rank waits and nobody else would move them
 
 protected:
-    ~MessageHandler() = default;
+    ~MailboxOwner() = default;
 };
 
-template <class Transport>
-class Messaging final : private MessageReceiver {
+class Mailbox final : private MessageReceiver {
 public:
     using Bytes = ReductionTable::Bytes;
     using Clock = std::chrono::steady_clock;
@@ -51,16 +50,16 @@ public:
     static constexpr std::uint32_t ownScope = 0, quietScope = ~std::uint32_t{0};
 
     // `poolBytes`: see FlowControl.
-    Messaging(std::shared_ptr<Messenger<Transport>> messenger, std::shared_ptr<Executor> executor,
-              std::size_t poolBytes, MessageHandler& handler)
-        : messenger_(std::move(messenger)), executor_(std::move(executor)), handler_(handler),
-          flow_(messenger_->size(), poolBytes,
-                {[this](int to, Buffer&& message) { messenger_->send(to, std::move(message)); },
+    Mailbox(std::shared_ptr<Connection> connection, std::shared_ptr<Executor> executor, std::size_t poolBytes,
+            MailboxOwner& handler)
+        : connection_(std::move(connection)), executor_(std::move(executor)), handler_(handler),
+          flow_(connection_->size(), poolBytes,
+                {[this](int to, Buffer&& message) { connection_->send(to, std::move(message)); },
                  [this](int to, const FlowControl::Request& request) {
                      sendStruct(to, MessageKind::CreditRequest, request);
                  },
                  [this](int to, const FlowControl::Credit& credit) { sendStruct(to, MessageKind::Credit, credit); }}),
-          reductions_(messenger_->rank(), messenger_->size(),
+          reductions_(connection_->rank(), connection_->size(),
                       [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) {
                           sendReduction(to, key, up, bytes);
                       })
@@ -68,15 +67,15 @@ public:
         inbox_.reserve(256); // how many wait at once depends on time: mostly no more
     }
 
-    // From here on the handler is called. Collective, in the same order for all objects of a messenger.
-    void start() { messenger_->attach(*this, address_); }
+    // From here on the handler is called. Collective, in the same order for all objects of a connection.
+    void start() { connection_->attach(*this, address_); }
 
-    ~Messaging() { stop(); }
+    ~Mailbox() { stop(); }
 
     // Afterwards the handler is not called any more.
     void stop()
     {
-        messenger_->detach(address_);
+        connection_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
         isEnding_ = true;
         while (tasks_ > 0) {
@@ -88,11 +87,11 @@ public:
         }
     }
 
-    int rank() const noexcept { return messenger_->rank(); }
-    int size() const noexcept { return messenger_->size(); }
-    bool failed() const noexcept { return messenger_->failed(); }
+    int rank() const noexcept { return connection_->rank(); }
+    int size() const noexcept { return connection_->size(); }
+    bool failed() const noexcept { return connection_->failed(); }
     std::uint32_t address() const noexcept { return address_; }
-    Messenger<Transport>& messenger() noexcept { return *messenger_; }
+    Connection& connection() noexcept { return *connection_; }
     Executor& executor() const noexcept { return *executor_; }
 
     // Credits are counted from here again; see FlowControl. No message with credit may be in a task.
@@ -112,7 +111,7 @@ public:
             return;
         }
         countSent(message);
-        messenger_->send(destination, std::move(message));
+        connection_->send(destination, std::move(message));
     }
 
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
@@ -121,7 +120,7 @@ public:
         header.kind = kind;
         header.receiver = address_;
         header.number = number;
-        send(destination, makeMessage(*messenger_->pool(), header, body.data(), body.size()));
+        send(destination, makeMessage(*connection_->pool(), header, body.data(), body.size()));
     }
 
     // Messages that carry pixels need credit of their receiver, and are kept until they have it. Never blocks.
@@ -151,7 +150,7 @@ public:
         const auto done = [&] { return roomy() || failed() || over(); };
         if (done())
             return true;
-        const typename Messenger<Transport>::Hurry hurry(*messenger_);
+        const Connection::Hurry hurry(*connection_);
         for (auto lastChange = Clock::now(); !done();) {
             if (const std::size_t now = flow_.underWay(); now < before) {
                 before = now;
@@ -161,11 +160,11 @@ public:
             }
             if (executor_->help())
                 continue;
-            if (messenger_->needsCaller()) {
-                if (!messenger_->mayPoll())
+            if (connection_->needsCaller()) {
+                if (!connection_->mayPoll())
                     return true;
-                if (!messenger_->poll() && !done())
-                    messenger_->nap(std::chrono::microseconds(50));
+                if (!connection_->poll() && !done())
+                    connection_->nap(std::chrono::microseconds(50));
             } else {
                 std::unique_lock<std::mutex> lock(mutex_);
                 changed_.wait_for(lock, std::chrono::microseconds(200), [&] { return !inbox_.empty() || roomy(); });
@@ -178,7 +177,7 @@ public:
     // progress that it would wait for.
     void requireProgress() const
     {
-        if (messenger_->needsCaller() && !messenger_->mayPoll())
+        if (connection_->needsCaller() && !connection_->mayPoll())
             throw InvalidArgument("at this thread level of MPI calls that wait belong to the thread that initialised "
                                   "it");
     }
@@ -200,7 +199,7 @@ public:
             if (tasks_ > 0)
                 return std::nullopt;
         }
-        if (!flow_.allSent() || !messenger_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
+        if (!flow_.allSent() || !connection_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
             return std::nullopt;
         return counts; // they were these when there was no task
     }
@@ -263,7 +262,7 @@ public:
     {
         error.rank = rank();
         error.from = source;
-        messenger_->giveUp(error);
+        connection_->giveUp(error);
     }
 
     // Wakes those in wait(), to ask again.
@@ -273,7 +272,7 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             changed_.notify_all();
         }
-        messenger_->interrupt();
+        connection_->interrupt();
     }
 
     // Waits until `ready()`, which must not lock what is held while calling notify(); makes progress if that is the
@@ -284,9 +283,9 @@ public:
         const auto over = [&] { return failed() || ready(); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
         waitAwake(over);
-        const typename Messenger<Transport>::Hurry hurry(*messenger_);
+        const Connection::Hurry hurry(*connection_);
         std::unique_lock<std::mutex> lock(mutex_);
-        if (!messenger_->needsCaller()) {
+        if (!connection_->needsCaller()) {
             while (!over() && !late()) {
                 const auto next = Clock::now() + std::chrono::milliseconds(2);
                 changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next,
@@ -300,10 +299,10 @@ public:
             }
         } else {
             // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
-            while ((!over() || (!failed() && !messenger_->quiet())) && !late()) {
+            while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
-                if (!executor_->help() && !messenger_->poll() && !over())
-                    messenger_->nap(std::chrono::microseconds(50));
+                if (!executor_->help() && !connection_->poll() && !over())
+                    connection_->nap(std::chrono::microseconds(50));
                 handler_.polled();
                 lock.lock();
             }
@@ -311,7 +310,7 @@ public:
         const bool isReady = ready();
         lock.unlock();
         if (!isReady)
-            messenger_->throwIfFailed();
+            connection_->throwIfFailed();
         return isReady;
     }
 
@@ -328,7 +327,7 @@ public:
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         const std::int64_t number = reductionCount_++;
         auto damage = takeDamage(); // now: when the others have this rank's part, they may go on to what comes after
-        messenger_->expectMessages(true);
+        connection_->expectMessages(true);
         try {
             try {
                 reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
@@ -340,14 +339,14 @@ public:
             } catch (const Error& e) { // of what ranks below in the tree have sent before
                 ErrorInfo error = e.info();
                 error.rank = rank();
-                messenger_->giveUp(error);
+                connection_->giveUp(error);
             }
             waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
         } catch (...) {
-            messenger_->expectMessages(false);
+            connection_->expectMessages(false);
             throw;
         }
-        messenger_->expectMessages(false);
+        connection_->expectMessages(false);
         return result->bytes;
     }
 
@@ -380,7 +379,7 @@ private:
     void waitForResult(const Ready& ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
-        const std::chrono::milliseconds late(messenger_->options().peerTimeoutMs);
+        const std::chrono::milliseconds late(connection_->options().peerTimeoutMs);
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
         if (damage)
@@ -407,11 +406,11 @@ private:
     template <class Over>
     void waitAwake(const Over& over)
     {
-        if (!messenger_->hasProgressThread())
+        if (!connection_->hasProgressThread())
             return;
         constexpr std::chrono::microseconds patience{200}, taken{50};
         for (auto last = Clock::now(); !over();) {
-            const bool did = executor_->help() || messenger_->helpProgress();
+            const bool did = executor_->help() || connection_->helpProgress();
             const auto now = Clock::now();
             if (did) {
                 last = now;
@@ -555,11 +554,11 @@ private:
         submit([this, source, error] { handler_.undecodable(source, error); });
     }
 
-    void messengerFailed() override { notify(); }
+    void connectionFailed() override { notify(); }
 
-    std::shared_ptr<Messenger<Transport>> messenger_;
+    std::shared_ptr<Connection> connection_;
     std::shared_ptr<Executor> executor_;
-    MessageHandler& handler_;
+    MailboxOwner& handler_;
     std::uint32_t address_ = 0;
     std::atomic<std::int64_t> epoch_{0};
     FlowControl flow_;
