@@ -8,6 +8,7 @@
 #include "plot.hpp"
 #include "results.hpp"
 
+#include <dfb/detail/wire.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>

@@ -6,7 +6,7 @@ include(CMakePackageConfigHelpers)
 set(_dfb_config_dir ${CMAKE_INSTALL_LIBDIR}/cmake/dfb)
 target_include_directories(dfb_core INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}>)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}
-  FILES_MATCHING PATTERN "*.hpp")
+  FILES_MATCHING PATTERN "*.hpp" PATTERN "compiled.cpp")
 
 install(TARGETS dfb_core dfb_strict_fp EXPORT dfb-core)
 foreach(_dfb_component IN LISTS DFB_COMPONENTS)
@@ -26,7 +26,7 @@ install(EXPORT dfb-testing NAMESPACE dfb:: FILE dfb-testing.cmake DESTINATION ${
   COMPONENT testing EXCLUDE_FROM_ALL)
 
 configure_package_config_file(${CMAKE_CURRENT_LIST_DIR}/dfbConfig.cmake.in
-  ${PROJECT_BINARY_DIR}/dfbConfig.cmake INSTALL_DESTINATION ${_dfb_config_dir})
+  ${PROJECT_BINARY_DIR}/dfbConfig.cmake INSTALL_DESTINATION ${_dfb_config_dir} PATH_VARS CMAKE_INSTALL_INCLUDEDIR)
 write_basic_package_version_file(${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake
   COMPATIBILITY SameMinorVersion ARCH_INDEPENDENT)
 install(FILES ${PROJECT_BINARY_DIR}/dfbConfig.cmake ${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake

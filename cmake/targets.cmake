@@ -1,6 +1,7 @@
 # dfb::core        the library, on threads alone
 # dfb::mpi, dfb::tbb, dfb::snappy   core and one dependency more, which the definition DFB_HAS_... tells the headers
 # dfb::dfb         core and all of these that are switched on
+# dfb::compiled    dfb::dfb, but what the library does is compiled once, for all that link it
 # dfb::testing     core and, with an include folder of its own, what tests are made of: an exact reference, checks of tile
 #                  operations and transports. Not part of dfb::dfb
 # dfb::strict_fp   for bitwise equal images over compilers: no contraction of a * b + c to one rounding
@@ -66,3 +67,10 @@ add_library(dfb::dfb ALIAS dfb)
 foreach(_dfb_component IN LISTS DFB_COMPONENTS)
   target_link_libraries(dfb INTERFACE dfb_${_dfb_component})
 endforeach()
+
+# Made where it is used: by the project that links it, with that project's compiler and flags.
+add_library(dfb_compiled STATIC EXCLUDE_FROM_ALL ${PROJECT_SOURCE_DIR}/include/dfb/compiled.cpp)
+add_library(dfb::compiled ALIAS dfb_compiled)
+target_compile_definitions(dfb_compiled PUBLIC DFB_COMPILED)
+target_link_libraries(dfb_compiled PUBLIC dfb)
+set_target_properties(dfb_compiled PROPERTIES POSITION_INDEPENDENT_CODE ON)

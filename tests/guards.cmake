@@ -87,18 +87,27 @@ if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   endif()
   foreach(_program IN LISTS _programs)
     get_filename_component(_name ${_program} NAME_WE)
-    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -I${_include} -I${_testing_include} -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1
-      -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
+    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -DDFB_COMPILED -I${_include} -I${_testing_include}
+      -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1 -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
     set_tests_properties(guard.${_name} PROPERTIES LABELS guard)
   endforeach()
 endif()
 
 # Two translation units that use everything make one program; the headers stay quiet under stricter warnings.
 add_executable(test_odr odr/first.cpp odr/second.cpp)
-target_link_libraries(test_odr PRIVATE dfb_developer)
+target_link_libraries(test_odr PRIVATE dfb_developer_headers)
 target_compile_options(test_odr PRIVATE -Wconversion)
 add_test(NAME guard.odr COMMAND test_odr)
 set_tests_properties(guard.odr PROPERTIES LABELS guard)
+
+# A program of which some files link dfb::compiled and others have the library as headers is refused by the linker.
+if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
+  add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
+    ${CMAKE_CURRENT_SOURCE_DIR}/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/mixed/compiled.cpp
+    $<TARGET_FILE:dfb_compiled> -pthread -o guard_compiled_mixed)
+  set_tests_properties(guard.compiled_mixed PROPERTIES LABELS guard
+    PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none: TLS definition")
+endif()
 
 # Wrong use gives our message, as the first error. The cases stand in the files: a line
 #   #elif defined(CASE_<NAME>) // expect: <message>      or   // flags: <flag>... expect: <message>
@@ -106,7 +115,7 @@ set_tests_properties(guard.odr PROPERTIES LABELS guard)
 function(_dfb_add_compile_fail file)
   set(path ${CMAKE_CURRENT_SOURCE_DIR}/compile_fail/${file}.cpp)
   set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS ${path})
-  add_test(NAME compile_fail.${file}.control COMMAND ${_compile} -I${_include} ${path})
+  add_test(NAME compile_fail.${file}.control COMMAND ${_compile} -DDFB_COMPILED -I${_include} ${path})
   set_tests_properties(compile_fail.${file}.control PROPERTIES LABELS compile_fail)
   file(STRINGS ${path} lines REGEX "defined\\(CASE_")
   foreach(line IN LISTS lines)
@@ -118,7 +127,7 @@ function(_dfb_add_compile_fail file)
     string(REGEX REPLACE "([][+.*()^?|$\\])" "\\\\\\1" message "${CMAKE_MATCH_5}")
     string(TOLOWER ${case} name)
     add_test(NAME compile_fail.${file}.${name}
-      COMMAND ${_compile} -Wfatal-errors -I${_include} ${flags} -DCASE_${case} ${path})
+      COMMAND ${_compile} -Wfatal-errors -DDFB_COMPILED -I${_include} ${flags} -DCASE_${case} ${path})
     set_tests_properties(compile_fail.${file}.${name} PROPERTIES
       LABELS compile_fail PASS_REGULAR_EXPRESSION "error:[^\n]*${message}")
   endforeach()

@@ -3,28 +3,33 @@
 cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
-set(level_0 version.hpp fwd.hpp comm/compression_gains.hpp detail/fifo.hpp detail/hidden_tiles.hpp detail/quiescence.hpp detail/small_bytes.hpp testing/reference.hpp)
-set(level_1 channels.hpp moments.hpp error.hpp buffer.hpp processors.hpp comm/checksum.hpp comm/compression.hpp comm/compression_trial.hpp comm/heartbeat.hpp
-            double_double.hpp cpu.hpp detail/float_environment.hpp detail/plane_filter.hpp testing/error_report.hpp)
-set(level_2 levels.hpp detail/background_pixels.hpp wire_codes.hpp detail/image_gate.hpp comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
-            comm/transport.hpp exec.hpp detail/blend_kernels.hpp detail/sort_kernels.hpp)
-set(level_3 wire_format.hpp tbb_executor.hpp comm/flow_control.hpp comm/reduction.hpp comm/inproc_transport.hpp comm/link.hpp comm/mpi_transport.hpp
-            detail/frame_gate.hpp detail/job_share.hpp detail/manifest.hpp testing/detail/conformance_tools.hpp)
-set(level_4 comm/progress.hpp comm/mpi_session.hpp testing/fault_transport.hpp
-            testing/transport_conformance.hpp image.hpp render/world.hpp)
-set(level_5 comm/connection.hpp dither.hpp tile.hpp render/footprint.hpp)
-set(level_6 comm/mailbox.hpp compositing.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
-set(level_7 fragment_compositor.hpp tile_op.hpp frame.hpp detail/active_pixels.hpp detail/wire_losses.hpp render/visibility.hpp)
-set(level_8 pixel_op.hpp detail/wire.hpp render/cameras.hpp render/shared_world.hpp ops/sort_last.hpp render/sampling.hpp render/tile_loop.hpp
-            detail/tile_table.hpp detail/frame_terms.hpp)
-set(level_9 detail/finished_record.hpp testing/tile_op_test.hpp ops/image_parallel.hpp ops/progressive.hpp ops/pixel_ops.hpp render/data_parallel.hpp render/deep_parallel.hpp render/image_parallel.hpp render/mixed_parallel.hpp
-            testing/verified.hpp detail/verdict.hpp)
-set(level_10 detail/final_gather.hpp detail/frame_figures.hpp detail/outcome.hpp testing/adversarial.hpp)
-set(level_11 detail/tile_pipeline.hpp)
-set(level_12 detail/frame_engine.hpp)
-set(level_13 display_wall.hpp distributed_framebuffer.hpp)
-set(level_14 dfb.hpp)
-set(last_level 14)
+set(level_0 channels.hpp comm/checksum.hpp comm/compression_gains.hpp comm/compression_trial.hpp detail/fifo.hpp
+            detail/hidden_tiles.hpp detail/quiescence.hpp detail/small_bytes.hpp fwd.hpp moments.hpp
+            render/tile_loop.hpp testing/reference.hpp version.hpp)
+set(level_1 buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp cpu.hpp detail/float_environment.hpp
+            detail/plane_filter.hpp double_double.hpp error.hpp processors.hpp testing/error_report.hpp)
+set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
+            comm/transport.hpp detail/background_pixels.hpp detail/blend_kernels.hpp detail/image_gate.hpp
+            detail/sort_kernels.hpp exec.hpp levels.hpp render/world.hpp wire_codes.hpp)
+set(level_3 comm/flow_control.hpp comm/link.hpp comm/reduction.hpp compositing.hpp detail/frame_gate.hpp image.hpp
+            tbb_executor.hpp testing/detail/conformance_tools.hpp wire_format.hpp)
+set(level_4 comm/progress.hpp dither.hpp render/footprint.hpp testing/transport_conformance.hpp tile.hpp)
+set(level_5 comm/connection.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
+set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp detail/active_pixels.hpp
+            detail/wire_losses.hpp fragment_compositor.hpp frame.hpp tile_op.hpp)
+set(level_7 comm/mpi_session.hpp detail/frame_terms.hpp detail/job_share.hpp detail/manifest.hpp detail/wire.hpp
+            ops/sort_last.hpp pixel_op.hpp render/image_parallel.hpp render/sampling.hpp render/visibility.hpp
+            testing/fault_transport.hpp)
+set(level_8 detail/finished_record.hpp detail/operations.hpp ops/image_parallel.hpp ops/pixel_ops.hpp
+            ops/progressive.hpp render/cameras.hpp render/data_parallel.hpp render/deep_parallel.hpp
+            render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp)
+set(level_9 detail/engine.hpp detail/final_gather.hpp detail/tile_table.hpp detail/verdict.hpp
+            render/mixed_parallel.hpp testing/adversarial.hpp)
+set(level_10 detail/frame_figures.hpp detail/outcome.hpp detail/tile_pipeline.hpp display_wall.hpp)
+set(level_11 detail/frame_engine.hpp)
+set(level_12 distributed_framebuffer.hpp)
+set(level_13 dfb.hpp)
+set(last_level 13)
 
 # A dependency has one door.
 set(door_of_mpi comm/mpi_transport.hpp)
@@ -41,7 +46,7 @@ set(pixels "^(image|levels|tile|tile_layout|fragment|dependency_tracker|channels
 
 set(headers "")
 foreach(root IN LISTS ROOTS)
-  file(GLOB_RECURSE found RELATIVE ${root}/dfb ${root}/dfb/*)
+  file(GLOB_RECURSE found RELATIVE ${root}/dfb ${root}/dfb/*.hpp)
   if(NOT found)
     message(FATAL_ERROR "no headers in ${root}/dfb")
   endif()

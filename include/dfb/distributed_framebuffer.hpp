@@ -3,10 +3,10 @@
 // post-processes it, and it goes to the display rank (section 3 of the paper).
 #pragma once
 
-#include <dfb/detail/frame_engine.hpp>
+#include <dfb/detail/engine.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/fwd.hpp>
-#include <dfb/ops/pixel_ops.hpp>
+#include <dfb/pixel_op.hpp>
 
 #include <algorithm>
 #include <any>
@@ -27,15 +27,16 @@ class DistributedFrameBuffer {
     static_assert(detail::checkPixelOp<PixelOp>());
     static_assert(detail::checkTransport<Transport>());
 
-    using Engine = detail::FrameEngine<TileOp, PixelOp>;
+    using Engine = detail::Engine;
+    using Operations = detail::OperationsOf<TileOp, PixelOp>;
 
 public:
     using Config = FrameBufferConfig;
     using Communicator = typename Transport::Communicator;
-    using Tile = typename Engine::Tile;
-    using TileView = typename Engine::TileView;
-    using TileFrameData = typename Engine::TileFrameData;
-    using PixelFrameData = typename Engine::PixelFrameData;
+    using Tile = dfb::Tile<TileOp::channels, detail::TileSizeOf<TileOp>::value>;
+    using TileView = dfb::TileView<TileOp::channels, detail::TileSizeOf<TileOp>::value>;
+    using TileFrameData = typename Operations::TileFrameData;
+    using PixelFrameData = typename Operations::PixelFrameData;
 
     // A frame that has begun. Leaving its scope without end() cancels it on all ranks.
     class Frame {
@@ -56,9 +57,18 @@ public:
 
         // Makes `tile` this frame's tile of that index and pass: all pixels cleared, generation 0, no children, source
         // this rank, part 0. Throws InvalidArgument for an index or a pass that the frame does not have.
-        void start(Tile& tile, int tileIndex, int pass = 0) const { engine_->start(tile, tileIndex, pass); }
+        void start(Tile& tile, int tileIndex, int pass = 0) const
+        {
+            static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
+            tile.clear(engine_->sent());
+        }
         // The same for a view, of nothing yet.
-        void start(TileView& tile, int tileIndex, int pass = 0) const { engine_->start(tile, tileIndex, pass); }
+        void start(TileView& tile, int tileIndex, int pass = 0) const
+        {
+            const TileHeader header = engine_->headerOf(tileIndex, pass);
+            tile = TileView();
+            static_cast<TileHeader&>(tile) = header;
+        }
 
         // Hands over a rendered tile; the active pixels leave for the owner at once, and `tile` can be used again.
         // From any thread. Waits only while this rank has more under way than messagePoolBytes, and meanwhile runs
@@ -77,8 +87,8 @@ public:
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
         // Whether `tile`, which has been set, hides those of a higher generation: if so, let the ranks know that have
         // any.
-        bool hidesRest(const Tile& tile) const { return engine_->hidesRest(tile); }
-        bool hidesRest(const TileView& tile) const { return engine_->hidesRest(tile); }
+        bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
+        bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         // Lets `rank` know that inputs from this generation on can not be seen. What it has sent by then is dropped by
         // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
@@ -203,10 +213,12 @@ public:
     DistributedFrameBuffer(std::shared_ptr<Connection> connection, Config config, PixelOp pixelOp = {})
     {
         if (!config.executor)
-            config.executor = std::make_shared<ThreadExecutor>(connection->threadShare());
+            config.executor = detail::makeThreads(*connection);
         try {
-            for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
-                engines_.push_back(std::make_unique<Engine>(connection, config, pixelOp, slot));
+            for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot) {
+                operations_.push_back(std::make_unique<Operations>(pixelOp));
+                engines_.push_back(detail::makeEngine(connection, config, *operations_.back(), slot));
+            }
         } catch (const InvalidArgument&) {
             // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
             engines_.clear();
@@ -259,23 +271,20 @@ public:
                 const PixelFrameData& pixelData = {})
     {
         Engine& engine = *engines_[next_];
-        engine.begin(params, tileData, pixelData);
+        operations_[next_]->offer(tileData, pixelData);
+        engine.begin(params);
         next_ = (next_ + 1) % engines_.size();
         return Frame(this, &engine);
     }
 
-    enum class Reduce : std::uint8_t { Sum, Min, Max };
+    using Reduce = dfb::Reduce;
 
     // Collective, outside frames: combines `values` element by element over all ranks; the result is the same
     // everywhere; a sum that is too large wraps around. For a user's own figures, or to agree on whether all ranks
     // could load their data. Throws InvalidArgument on every rank if their numbers of values differ.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
-        return engine().allReduce(values, [how](std::int64_t x, std::int64_t y) {
-            if (how == Reduce::Sum)
-                return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
-            return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
-        });
+        return engine().allReduce(values, how);
     }
 
     // Collective, outside frames: the bytes of each rank, by rank, on all ranks.
@@ -288,9 +297,15 @@ private:
     Engine& engine() noexcept { return *engines_.front(); }
     const Engine& engine() const noexcept { return *engines_.front(); }
 
-    std::vector<std::unique_ptr<Engine>> engines_; // each has one frame at a time; they take turns
+    // Each pair has one frame at a time; they take turns.
+    std::vector<std::unique_ptr<Operations>> operations_;
+    std::vector<std::unique_ptr<Engine>> engines_;
     std::size_t next_ = 0;
     Engine* lastEnded_ = nullptr;
 };
 
 } // namespace dfb
+
+#if DFB_HAS_BODIES
+#include <dfb/detail/frame_engine.hpp>
+#endif

@@ -98,6 +98,25 @@ struct FrameParams {
     bool allowPartial = false;
 };
 
+// One input that a rank will send for a tile (for each pass of the frame): generation 1, without children.
+struct TileInput {
+    int tile = 0;
+    std::uint32_t source = 0;
+    std::uint16_t part = 0;
+};
+inline bool operator==(const TileInput& a, const TileInput& b) noexcept
+{
+    return a.tile == b.tile && a.source == b.source && a.part == b.part;
+}
+
+// Jobs [begin, end).
+struct JobRange {
+    std::int64_t begin = 0, end = 0;
+};
+
+// How the values of ranks are combined.
+enum class Reduce : std::uint8_t { Sum, Min, Max };
+
 // What its operation says of a tile that was finished in a frame.
 struct TileError {
     int tile = 0;

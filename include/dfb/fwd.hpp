@@ -3,7 +3,7 @@
 
 namespace dfb {
 
-struct NoPixelOp;      // ops/pixel_ops.hpp
+struct NoPixelOp;      // pixel_op.hpp
 class MpiTransport;    // comm/mpi_transport.hpp
 class InprocTransport; // comm/inproc_transport.hpp
 class Executor;        // exec.hpp

@@ -69,6 +69,13 @@ struct HasPixelNewFrame<
 template <class T>
 inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::HasProcess<T>::value;
 
+// Leaves the tile as it is: it is rounded to the output format straight from double.
+struct NoPixelOp {
+    static constexpr bool pointwise = true;
+    void process(PixelTile&) const noexcept {}
+};
+static_assert(is_pixel_op_v<NoPixelOp>);
+
 namespace detail {
 
 template <class T>

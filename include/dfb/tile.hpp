@@ -197,8 +197,6 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
 
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
-    static constexpr std::size_t rowStride() noexcept { return Size; }
-    Region validRegion() const noexcept { return region; }
     // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region.
     bool isOpaque() const noexcept { return detail::isOpaque(*this); }
 };
@@ -234,8 +232,37 @@ struct TileView : TileHeader {
     {
         return color + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
     }
-    std::size_t rowStride() const noexcept { return stride; }
     bool isOpaque() const noexcept { return color && validRegion() == region && detail::isOpaque(*this); }
 };
+
+namespace detail {
+
+// A Tile or a TileView of any size and channels: its header, and where its pixels lie. Behind the door of the
+// framebuffer nothing is a template on the type of a tile.
+struct InputPixels : TileHeader {
+    template <ChannelMask Channels, int Size>
+    InputPixels(const Tile<Channels, Size>& from)
+        : TileHeader(from), channels(Channels), at(from.planes()), stride(Size), valid(from.region)
+    {
+    }
+    template <ChannelMask Channels, int Size>
+    InputPixels(const TileView<Channels, Size>& from)
+        : TileHeader(from), channels(Channels), at(from.planes()), stride(from.stride), valid(from.validRegion())
+    {
+    }
+
+    const ConstPlanes& planes() const noexcept { return at; }
+    const float* pixel(int x, int y) const noexcept
+    {
+        return floatsOf(at.at[Color]) + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
+    }
+
+    ChannelMask channels;
+    ConstPlanes at;     // to the first pixel of the region; null: not there
+    std::size_t stride; // from a row to the next, in pixels
+    Region valid;       // of the region; pixels outside of it have nothing, and are not read
+};
+
+} // namespace detail
 
 } // namespace dfb

@@ -5,6 +5,7 @@
 // body. The other rank is played: when the input has nothing more it gives the frame up, as a rank does that works.
 #include "fuzz.hpp"
 
+#include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
@@ -276,7 +277,6 @@ void sendAll(Peer& peer, fuzz::Input& in, Way way, std::int64_t frame)
 template <class TileOp, class PixelOp>
 class Player {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, PlayedTransport>;
-    using Pipeline = d::TilePipeline<TileOp, PixelOp>;
 
 public:
     Player(Way way, fuzz::Input& in) : way_(way), in_(in), peer_(std::make_shared<Peer>())
@@ -329,9 +329,10 @@ private:
         options.progress = dfb::Progress::Caller;
         options.sharedMemory = false;
         options.checksums = way_.has(Checksums);
+        const auto traits = d::OperationTraits::of<TileOp, PixelOp>();
         const auto agreement =
-            d::Agreement::of<TileOp, PixelOp>(config, options.checksums, 1, side, Pipeline::travelling(config),
-                                              tileCount, [](int tile) { return ownerOf(tile); });
+            d::Agreement::of(traits, config, options.checksums, 1, d::TilePipeline::travelling(traits, config),
+                             tileCount, [](int tile) { return ownerOf(tile); });
         const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
             peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
         };
@@ -483,9 +484,9 @@ std::string inputFor(Way way, int index, bool isDense)
         depth = static_cast<float>(x);
     });
     d::InputFaults faults;
-    const dfb::Buffer message =
-        d::encodeFragment(*pool, *tile, d::TilePipeline<TileOp, dfb::NoPixelOp>::travelling(config), 0,
-                          config.codec.get(), d::WireCoder(config.wire), config.wire.color, faults);
+    const dfb::Buffer message = d::encodeFragment(
+        *pool, *tile, d::TilePipeline::travelling(d::OperationTraits::of<TileOp, dfb::NoPixelOp>(), config), 0,
+        config.codec.get(), d::WireCoder(config.wire), config.wire.color, faults);
     const std::size_t prefix = sizeof(d::MessageHeader);
     return fuzz::textOf(message.data() + prefix, message.size() - prefix);
 }

@@ -5,6 +5,8 @@
 #include "forward.hpp"
 #include "scene.hpp"
 
+#include <dfb/detail/wire.hpp>
+
 #include <algorithm>
 #include <atomic>
 #include <chrono>

@@ -4,6 +4,8 @@
 #include "board.hpp"
 #include "catch.hpp"
 
+#include <dfb/detail/wire.hpp>
+
 #include <algorithm>
 #include <array>
 #include <atomic>

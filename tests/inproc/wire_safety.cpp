@@ -4,6 +4,8 @@
 #include "catch.hpp"
 #include "scene.hpp"
 
+#include <dfb/detail/wire.hpp>
+
 #include <algorithm>
 #include <atomic>
 #include <cstdint>

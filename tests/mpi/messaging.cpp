@@ -6,6 +6,8 @@
 #include "catch.hpp"
 #include "ranks.hpp"
 
+#include <dfb/detail/wire.hpp>
+
 #include <algorithm>
 #include <atomic>
 #include <chrono>

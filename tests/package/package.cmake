@@ -80,6 +80,13 @@ foreach(_component IN LISTS _others)
     COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
 endforeach()
 
+# The library compiled once, by the stranger's project: of the package, with core alone, and of the sources.
+dfb_add_package_test(find_package_compiled HOW find_package EXPECT ${_others} OPTIONS -DFRAME=ON -DCOMPILED=ON)
+dfb_add_package_test(find_package_core_compiled HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy
+  OPTIONS -DFRAME=ON -DCOMPILED=ON)
+dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
+  OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
+
 # What tests are made of, beside what is asked for.
 dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
   WITHOUT MPI TBB Snappy)

@@ -2,7 +2,9 @@
 // by the sending thread.
 #pragma once
 
+#include <dfb/comm/connection.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/compiled.hpp>
 
 #include <chrono>
 #include <cstddef>
@@ -201,6 +203,8 @@ private:
 };
 
 static_assert(is_transport_v<InprocTransport>);
+DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&,
+                                                                           ConnectionOptions));
 
 // Calls `body(communicator)` on `rankCount` threads, one per rank, and waits for all. If a body throws, the ranks that
 // wait for it get a TransportError, and the first exception is rethrown. With `shuffleSeed` messages arrive in a

@@ -14,9 +14,11 @@
 // packetFormat. That must stay as it is.
 #pragma once
 
+#include <dfb/comm/connection.hpp>
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/detail/fifo.hpp>
 #include <dfb/processors.hpp>
 
@@ -941,5 +943,6 @@ private:
 };
 
 static_assert(is_transport_v<MpiTransport>);
+DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<MpiTransport>(const MPI_Comm&, ConnectionOptions));
 
 } // namespace dfb

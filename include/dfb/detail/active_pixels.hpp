@@ -181,8 +181,7 @@ inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::si
 }
 
 // One per thread, to be used again and again. A pixel of colour 0 and alpha 0 contributes nothing, whatever its depth;
-// one with colour and alpha 0 is emission and does. By depth, what has one below +infinity does, and nothing else. What
-// it is called with is a Tile or a TileView.
+// one with colour and alpha 0 is emission and does. By depth, what has one below +infinity does, and nothing else.
 struct ActivePixels {
     std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
     std::vector<Span> spans;
@@ -192,10 +191,9 @@ struct ActivePixels {
     // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
     // `colors`, which has room for all pixels of the tile, and the rest to where plane() says. Each row is copied as
     // soon as its spans are found: rows of a large image are far apart in memory, and so are read there once.
-    template <class TileType>
-    void gather(const TileType& tile, ChannelMask channels, bool byDepth, float* colors)
+    void gather(const InputPixels& tile, ChannelMask channels, bool byDepth, float* colors)
     {
-        const ConstPlanes planes = tile.planes();
+        const ConstPlanes& planes = tile.planes();
         const auto most =
             static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
         struct Target {
@@ -229,8 +227,8 @@ struct ActivePixels {
     std::uint64_t nanDepths() const noexcept { return nanDepths_; }
 
     // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
-    template <class TileType, class F>
-    void find(const TileType& tile, bool byDepth, const F& f)
+    template <class F>
+    void find(const InputPixels& tile, bool byDepth, const F& f)
     {
         rowCounts.clear();
         spans.clear();
@@ -238,12 +236,12 @@ struct ActivePixels {
         pixels = 0;
         nanDepths_ = 0;
         const float* depths = byDepth ? floatsOf(tile.planes().at[Depth]) : nullptr;
-        const Region valid = tile.validRegion();
+        const Region valid = tile.valid;
         const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
         const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
         const int ahead = width < 64 ? 1 : std::max(1, 384 / width); // rows: 6 KiB were best where it was measured
         for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.rowStride();
+            const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.stride;
             if (y + ahead < yEnd)
                 prefetch(tile.pixel(x0, y + ahead), width);
             if (depths)
@@ -271,12 +269,12 @@ struct ActivePixels {
     }
 
     // The same for those that were found in `tile`.
-    template <class TileType, class F>
-    void forEachSpan(const TileType& tile, const F& f) const
+    template <class F>
+    void forEachSpan(const InputPixels& tile, const F& f) const
     {
         const Span* span = spans.data();
         for (std::size_t row = 0; row < rowCounts.size(); ++row) {
-            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * tile.rowStride();
+            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * tile.stride;
             for (int i = 0; i < rowCounts[row]; ++i, ++span)
                 f(begin + span->x, static_cast<int>(span->count));
         }

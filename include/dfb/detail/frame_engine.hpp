@@ -5,6 +5,7 @@
 #include <dfb/comm/compression_gains.hpp>
 #include <dfb/comm/compression_trial.hpp>
 #include <dfb/comm/mailbox.hpp>
+#include <dfb/detail/engine.hpp>
 #include <dfb/detail/frame_figures.hpp>
 #include <dfb/detail/frame_gate.hpp>
 #include <dfb/detail/hidden_tiles.hpp>
@@ -33,21 +34,17 @@
 namespace dfb::detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
-template <class TileOp, class PixelOp>
-class FrameEngine final : private MailboxOwner {
+class FrameEngine final : public Engine, private MailboxOwner {
 public:
-    using Pipeline = TilePipeline<TileOp, PixelOp>;
-    using Tile = typename Pipeline::Tile;
-    using TileView = typename Pipeline::TileView;
-    using TileFrameData = typename FrameDataOf<TileOp>::type;
-    using PixelFrameData = typename FrameDataOf<PixelOp>::type;
     using Bytes = ReductionTable::Bytes;
 
-    // `slot`: which of config.framesInFlight engines this is.
-    FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, PixelOp pixelOp, int slot = 0)
-        : pool_(connection->pool()), config_(std::move(config)), gate_(slot + 1, std::max(1, config_.framesInFlight))
+    // `operations` must live as long as this; `slot`: which of config.framesInFlight engines this is.
+    FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, Operations& operations, int slot = 0)
+        : pool_(connection->pool()), config_(std::move(config)), operations_(operations),
+          gate_(slot + 1, std::max(1, config_.framesInFlight))
     {
-        config_.messagePoolBytes = std::max(config_.messagePoolBytes, 4 * Pipeline::largestMessage(config_));
+        config_.messagePoolBytes =
+            std::max(config_.messagePoolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
         MailboxOwner& self = *this;
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messagePoolBytes, self);
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, gate_, FrameVerdict);
@@ -58,10 +55,10 @@ public:
             if (config_.displayRank < 0 || config_.displayRank >= size())
                 throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
                                       + std::to_string(size()));
-            if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && KeepsState<TileOp>::value))
+            if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
                 throw InvalidArgument("there can not be " + std::to_string(config_.framesInFlight)
                                       + " frames in flight: 1 or more, and only 1 if the tile operation keeps state");
-            if (config_.aux & ~(TileOp::channels & imageAuxChannels))
+            if (config_.aux & ~(traits().channels & imageAuxChannels))
                 throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
                                       + ") that the inputs of this tile operation do not have");
             if (const int ms = mailbox_->connection().options().peerTimeoutMs; ms != 0 && ms < 100)
@@ -69,12 +66,11 @@ public:
             if (config_.quietMs < 1)
                 throw InvalidArgument("quietMs is " + std::to_string(config_.quietMs) + ": it must be 1 or more");
             checkWire();
-            pipeline_ =
-                std::make_unique<Pipeline>(pool_, config_, std::move(pixelOp), rank(), size(), mailbox_->address(),
-                                           [this](Buffer&& message) { sendToDisplay(std::move(message)); });
-            mine = Agreement::of<TileOp, PixelOp>(config_, mailbox_->connection().options().checksums, rank(),
-                                                  Tile::size, Pipeline::travelling(config_), layout().tileCount(),
-                                                  [this](int tile) { return tileOwner(tile); });
+            pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), mailbox_->address(),
+                                                       [this](Buffer&& message) { sendToDisplay(std::move(message)); });
+            mine = Agreement::of(traits(), config_, mailbox_->connection().options().checksums, rank(),
+                                 TilePipeline::travelling(traits(), config_), layout().tileCount(),
+                                 [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
             mine = {false, e.info().message, rank()};
         } catch (const OutOfMemory& e) {
@@ -102,21 +98,21 @@ public:
 
     FrameEngine(const FrameEngine&) = delete;
     FrameEngine& operator=(const FrameEngine&) = delete;
-    ~FrameEngine() { mailbox_->stop(); }
+    ~FrameEngine() override { mailbox_->stop(); }
 
-    int rank() const noexcept { return mailbox_->rank(); }
-    int size() const noexcept { return mailbox_->size(); }
-    const FrameBufferConfig& config() const noexcept { return config_; }
-    const TileLayout& layout() const noexcept { return pipeline_->table().layout(); }
-    int tileOwner(int tile) const noexcept { return pipeline_->table().owner(tile); }
-    const std::vector<int>& ownedTiles() const noexcept { return pipeline_->table().owned(); }
-    const Image& image() const noexcept { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
-    std::int64_t imageFrame() const noexcept { return pipeline_->gather().imageFrame(); }
-    bool isComplete(int tile) const { return pipeline_->gather().isComplete(tile); }
-    std::int64_t frame() const noexcept { return gate_.frame(); }
-    bool failed() const noexcept { return outcome_->failed(); }
+    int rank() const noexcept override { return mailbox_->rank(); }
+    int size() const noexcept override { return mailbox_->size(); }
+    const FrameBufferConfig& config() const noexcept override { return config_; }
+    const TileLayout& layout() const noexcept override { return pipeline_->table().layout(); }
+    int tileOwner(int tile) const noexcept override { return pipeline_->table().owner(tile); }
+    const std::vector<int>& ownedTiles() const noexcept override { return pipeline_->table().owned(); }
+    const Image& image() const noexcept override { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
+    std::int64_t imageFrame() const noexcept override { return pipeline_->gather().imageFrame(); }
+    bool isComplete(int tile) const override { return pipeline_->gather().isComplete(tile); }
+    std::int64_t frame() const noexcept override { return gate_.frame(); }
+    bool failed() const noexcept override { return outcome_->failed(); }
 
-    void begin(const FrameParams& params, const TileFrameData& tileData, const PixelFrameData& pixelData)
+    void begin(const FrameParams& params) override
     {
         if (frameOpen_)
             throw InvalidArgument("begin() while a frame is open: end() it first");
@@ -139,17 +135,16 @@ public:
         info.passes = params.passes;
         info.firstSample = firstSampleOf(params);
         info.accumulationId = params.accumulationId;
-        info.wanted = Pipeline::imageChannels(config_);
+        info.wanted = TilePipeline::imageChannels(config_);
         info.background = params.background;
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.displayRank) != nullptr,
-                                tileData, pixelData);
+            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.displayRank) != nullptr);
         } catch (...) {
             userError = std::current_exception();
         }
         jobs_.newFrame();
-        if (OpaqueHides<TileOp>::value)
+        if (traits().opaqueHides)
             hidden_.newFrame(layout().tileCount());
         outcome_->newFrame();
         quiescence_.newFrame(std::chrono::milliseconds(config_.quietMs));
@@ -163,7 +158,7 @@ public:
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
         for (const int tile : ownedTiles()) {
             const bool rendered = pipeline_->table().samples(tile).count > 0;
-            if (!rendered && !IsPointwise<PixelOp>::value)
+            if (!rendered && !traits().pixelOpIsPointwise)
                 kept.push_back(tile);
             if (rendered && !params.declared)
                 ++tilesLeft_;
@@ -189,14 +184,10 @@ public:
             tilesLess(countUnknown);
     }
 
-    template <class AnyTile>
-    void start(AnyTile& tile, int index, int pass) const
-    {
-        pipeline_->start(tile, index, pass);
-    }
+    TileHeader headerOf(int tile, int pass) const override { return pipeline_->headerOf(tile, pass); }
+    ChannelMask sent() const noexcept override { return pipeline_->sent(); }
 
-    template <class AnyTile>
-    void setTile(const AnyTile& tile)
+    void setTile(const InputPixels& tile) override
     {
         checkTile(tile, layout(), pipeline_->table().frameInfo(),
                   [this](int index) { return pipeline_->table().samples(index).count; });
@@ -220,13 +211,9 @@ public:
     }
 
     // See Frame.
-    bool isHidden(int tile, int generation) const { return generation >= hidden_.from(tile); }
-    template <class AnyTile>
-    bool hidesRest(const AnyTile& tile) const
-    {
-        return pipeline_->opaqueHides(tile.tile) && tile.isOpaque();
-    }
-    void hide(int tile, int generation, int other)
+    bool isHidden(int tile, int generation) const override { return generation >= hidden_.from(tile); }
+    bool opaqueHides(int tile) const override { return pipeline_->opaqueHides(tile); }
+    void hide(int tile, int generation, int other) override
     {
         if (!pipeline_->opaqueHides(tile))
             throw InvalidArgument("hide() with a tile operation or a frame to which everything counts");
@@ -236,13 +223,13 @@ public:
             sendBody(other, MessageKind::Hidden, HiddenTiles::Message{tile, generation});
     }
 
-    void expectLayers(int layers) { pipeline_->setLayers(layers); }
-    TileSamples samples(int tile) const { return pipeline_->table().samples(tile); }
+    void expectLayers(int layers) override { pipeline_->setLayers(layers); }
+    TileSamples samples(int tile) const override { return pipeline_->table().samples(tile); }
 
-    void addFigure(std::uint64_t key, double value) { figures_.add(key, value); }
-    void noteMergeError(int tile, double bound) { figures_.addMergeError(tile, bound / samples(tile).count); }
+    void addFigure(std::uint64_t key, double value) override { figures_.add(key, value); }
+    void noteMergeError(int tile, double bound) override { figures_.addMergeError(tile, bound / samples(tile).count); }
 
-    JobRange nextJobs(std::int64_t count)
+    JobRange nextJobs(std::int64_t count) override
     {
         std::optional<JobRange> range = jobs_.take(count, rank(), size());
         askForJobs(count); // for the next time, while this one is worked on
@@ -274,7 +261,7 @@ public:
         failWith(std::make_exception_ptr(Error(std::move(info))));
     }
 
-    void declare(const std::vector<TileInput>& inputs)
+    void declare(const std::vector<TileInput>& inputs) override
     {
         if (!params_.declared)
             throw InvalidArgument("declare() in a frame that was not begun with declared inputs");
@@ -295,16 +282,16 @@ public:
             enterAllDeclared();
     }
 
-    std::any& loopMemory() noexcept { return loopMemory_; }
+    std::any& loopMemory() noexcept override { return loopMemory_; }
 
-    void abort(const std::exception_ptr& reason, int tile)
+    void abort(const std::exception_ptr& reason, int tile) override
     {
         ErrorInfo where;
         where.tile = tile;
         failWith(reason, where);
     }
 
-    bool poll()
+    bool poll() override
     {
         bool did = mailbox_->connection().poll();
         Executor& executor = mailbox_->executor();
@@ -325,9 +312,9 @@ public:
         poll();
     }
 
-    void requireProgress() const { mailbox_->requireProgress(); }
+    void requireProgress() const override { mailbox_->requireProgress(); }
 
-    FrameReport end()
+    FrameReport end() override
     {
         if (params_.declared && !manifests_.declared() && !outcome_->failed()) {
             const auto reason = outcome_->reason(); // why declare() was not called, in a frame that may be partial
@@ -365,7 +352,7 @@ public:
         return report;
     }
 
-    void cancel(std::int64_t frame)
+    void cancel(std::int64_t frame) override
     {
         if (!gate_.enter(frame))
             return; // it is over
@@ -374,7 +361,7 @@ public:
     }
 
     // A frame that is left without end(), mostly while an exception passes.
-    void leave() noexcept
+    void leave() noexcept override
     {
         try {
             if (outcome_->failed())
@@ -389,13 +376,16 @@ public:
         }
     }
 
-    template <class Operation>
-    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
+    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) override
     {
-        return mailbox_->allReduce(values, operation);
+        return mailbox_->allReduce(values, [how](std::int64_t x, std::int64_t y) {
+            if (how == Reduce::Sum)
+                return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
+            return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
+        });
     }
 
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) override
     {
         ByteWriter out; // of each rank: which it is, the size, the bytes
         out.put(static_cast<std::int32_t>(rank()));
@@ -422,6 +412,8 @@ public:
     }
 
 private:
+    const OperationTraits& traits() const noexcept { return operations_.traits(); }
+
     using Clock = std::chrono::steady_clock;
     enum Scope : std::uint32_t { AllDeclared = Mailbox::ownScope + 1, FrameVerdict, Quiet = Mailbox::quietScope };
 
@@ -690,7 +682,7 @@ private:
     void arrive(Buffer&& message, int source)
     {
         ErrorInfo where;
-        typename TileTable<TileOp>::Arrival arrival;
+        TileTable::Arrival arrival;
         guarded([&] { pipeline_->arrive(std::move(message), source >= 0 ? source : rank(), where, arrival); }, where,
                 source);
         if (arrival.spoilt) {
@@ -751,7 +743,7 @@ private:
         if (outcome_->failed())
             return;
         // A pixel operation that is not pointwise sees background tiles too.
-        const bool all = !IsPointwise<PixelOp>::value;
+        const bool all = !traits().pixelOpIsPointwise;
         ErrorInfo where;
         const bool declared = guarded(
             [&] {
@@ -967,7 +959,7 @@ private:
     // Whether what the last frame left behind is of use.
     bool accumulates(const FrameParams& params) const
     {
-        return KeepsState<TileOp>::value && !lastFailed_ && params.accumulationId == lastAccumulationId_;
+        return traits().keepsState && !lastFailed_ && params.accumulationId == lastAccumulationId_;
     }
 
     // Without a plan: of each tile.
@@ -992,7 +984,7 @@ private:
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
                 throw InvalidArgument("a tile can not have " + std::to_string(t.count) + " samples from "
                                       + std::to_string(t.first) + " on");
-            if (!KeepsState<TileOp>::value && (t.count == 0 || t.first > 0))
+            if (!traits().keepsState && (t.count == 0 || t.first > 0))
                 throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
             if ((t.first > 0 || t.count == 0) && !accumulates(params))
                 throw InvalidArgument("what was accumulated is of no use, as the last frame failed or had another "
@@ -1162,7 +1154,8 @@ private:
 
     std::shared_ptr<MemoryPool> pool_;
     FrameBufferConfig config_;
-    std::unique_ptr<Pipeline> pipeline_;
+    Operations& operations_;
+    std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
     ManifestExchange manifests_;
     std::any loopMemory_; // see Frame
@@ -1192,5 +1185,18 @@ private:
 
     std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE std::shared_ptr<Executor> makeThreads(const Connection& connection)
+{
+    return std::make_shared<ThreadExecutor>(connection.threadShare());
+}
+
+DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
+                                                     Operations& operations, int slot)
+{
+    return std::make_unique<FrameEngine>(std::move(connection), std::move(config), operations, slot);
+}
+#endif
 
 } // namespace dfb::detail

@@ -4,20 +4,12 @@
 
 #include <dfb/comm/message.hpp>
 #include <dfb/detail/fifo.hpp>
+#include <dfb/frame.hpp>
 
 #include <algorithm>
 #include <cstdint>
 #include <mutex>
 #include <optional>
-
-namespace dfb {
-
-// Jobs [begin, end).
-struct JobRange {
-    std::int64_t begin = 0, end = 0;
-};
-
-} // namespace dfb
 
 namespace dfb::detail {
 

@@ -8,6 +8,7 @@
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
+#include <dfb/frame.hpp>
 
 #include <algorithm>
 #include <cstddef>
@@ -17,21 +18,6 @@
 #include <tuple>
 #include <utility>
 #include <vector>
-
-namespace dfb {
-
-// One input that a rank will send for a tile (for each pass of the frame): generation 1, without children.
-struct TileInput {
-    int tile = 0;
-    std::uint32_t source = 0;
-    std::uint16_t part = 0;
-};
-inline bool operator==(const TileInput& a, const TileInput& b) noexcept
-{
-    return a.tile == b.tile && a.source == b.source && a.part == b.part;
-}
-
-} // namespace dfb
 
 namespace dfb::detail {
 

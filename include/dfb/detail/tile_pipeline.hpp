@@ -4,11 +4,11 @@
 
 #include <dfb/detail/final_gather.hpp>
 #include <dfb/detail/float_environment.hpp>
+#include <dfb/detail/operations.hpp>
 #include <dfb/detail/tile_table.hpp>
 #include <dfb/detail/wire.hpp>
 #include <dfb/detail/wire_losses.hpp>
 #include <dfb/frame.hpp>
-#include <dfb/ops/pixel_ops.hpp>
 
 #include <algorithm>
 #include <array>
@@ -22,29 +22,24 @@
 #include <memory>
 #include <mutex>
 #include <string>
-#include <type_traits>
 #include <utility>
 #include <vector>
 
 namespace dfb::detail {
 
-template <class TileOp, class PixelOp>
 class TilePipeline {
 public:
-    using Tile = dfb::Tile<TileOp::channels, TileSizeOf<TileOp>::value>;
-    using TileView = dfb::TileView<TileOp::channels, TileSizeOf<TileOp>::value>;
-
-    // Throws InvalidArgument for a configuration that can not be.
-    TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, PixelOp pixelOp, int rank,
+    // `config` and `operations` must live as long as this. Throws InvalidArgument for a configuration that can not be.
+    TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
                  int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay)
-        : pool_(std::move(pool)), config_(config), address_(address), pixelOp_(std::move(pixelOp)),
-          table_(TileLayout(config.width, config.height, Tile::size), config.ownerMap ? config.ownerMap : latticeOwner,
-                 rank, rankCount),
+        : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
+          table_(TileLayout(config.width, config.height, traits().tileSize),
+                 config.ownerMap ? config.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
               pool_, table_.layout(), {config.format, imageChannels(config), address, config.codec, config.dither},
               rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
-          coder_(config.wire, ActiveByDepth<TileOp>::value)
+          coder_(config.wire, traits().activeByDepth)
     {
     }
 
@@ -55,39 +50,38 @@ public:
     }
     // What of a tile is read at all: by the operation, for the image, or to tell in which of several passes what gives
     // position and ids is the nearest.
-    static ChannelMask travelling(const FrameBufferConfig& config, bool comparesPasses = true)
+    static ChannelMask travelling(const OperationTraits& traits, const FrameBufferConfig& config,
+                                  bool comparesPasses = true)
     {
         const bool comparesDepths =
             comparesPasses && (config.aux & (positionChannel | primitiveIdChannel | instanceIdChannel)) != 0;
         return static_cast<ChannelMask>(
-            Tile::channels
-            & (NeededChannelsOf<TileOp>::value | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
+            traits.channels & (traits.neededChannels | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
     }
 
     // The most that one message with pixels can have.
-    static std::size_t largestMessage(const FrameBufferConfig& config)
+    static std::size_t largestMessage(const OperationTraits& traits, const FrameBufferConfig& config)
     {
-        return std::max(largestFragment(Tile::size, Tile::size, travelling(config)),
-                        FinalGather::largestMessage(Tile::size, config.format, imageChannels(config)));
+        const int size = traits.tileSize;
+        return std::max(largestFragment(size, size, travelling(traits, config)),
+                        FinalGather::largestMessage(size, config.format, imageChannels(config)));
     }
 
-    TileTable<TileOp>& table() noexcept { return table_; }
-    const TileTable<TileOp>& table() const noexcept { return table_; }
+    TileTable& table() noexcept { return table_; }
+    const TileTable& table() const noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
     // `compresses`: whether finished tiles are compressed. Throws what user code throws: then all is ready but its
     // data.
-    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses,
-                  const typename FrameDataOf<TileOp>::type& tileData,
-                  const typename FrameDataOf<PixelOp>::type& pixelData)
+    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses)
     {
         nonFinite_ = alphaOutside_ = 0;
         reports_ = {};
         const bool hasPasses =
             plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
-        sent_ = travelling(config_, KeepsState<TileOp>::value || hasPasses);
+        sent_ = travelling(traits(), config_, traits().keepsState || hasPasses);
         gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
         background_ = info.background;
@@ -96,35 +90,22 @@ public:
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.wire.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(maxLayers);
-        table_.setData(tileData);
-        if constexpr (HasPixelNewFrame<PixelOp>::value)
-            pixelOp_.newFrame(pixelData);
-        else
-            (void)pixelData;
+        operations_.newFrame();
     }
 
-    // Makes `tile` a cleared tile of this frame. Throws InvalidArgument.
-    void start(Tile& tile, int index, int pass) const
-    {
-        static_cast<TileHeader&>(tile) = headerOf(index, pass);
-        tile.clear(sent_);
-    }
-    void start(TileView& tile, int index, int pass) const
-    {
-        tile = TileView();
-        static_cast<TileHeader&>(tile) = headerOf(index, pass);
-    }
+    ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame
 
     // Throws InvalidArgument if there is a colour but not what else has to travel.
-    void checkPlanes(const Tile&) const {}
-    void checkPlanes(const TileView& tile) const
+    void checkPlanes(const InputPixels& tile) const
     {
-        if (tile.color && tile.stride < static_cast<std::size_t>(tile.region.width()))
+        const ConstPlanes& planes = tile.planes();
+        if (!planes.at[Color])
+            return;
+        if (tile.stride < static_cast<std::size_t>(tile.region.width()))
             throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " with rows of "
                                   + std::to_string(tile.stride) + " pixels");
-        const ConstPlanes planes = tile.planes();
         for (std::size_t c = 0; c < channelCount; ++c)
-            if (tile.color && !planes.at[c] && hasChannel(sent_, c))
+            if (!planes.at[c] && hasChannel(sent_, c))
                 throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without its " + channelNames[c]
                                       + ", which is needed");
     }
@@ -132,14 +113,9 @@ public:
     // Whether inputs of a tile are hidden by an opaque one.
     bool opaqueHides(int tile) const
     {
-        if constexpr (OpaqueHides<TileOp>::value) {
-            TileInfo info = table_.frameInfo();
-            info.passes = table_.samples(tile).count;
-            return TileOp::opaqueHides(info);
-        } else {
-            (void)tile;
-            return false;
-        }
+        TileInfo info = table_.frameInfo();
+        info.passes = table_.samples(tile).count;
+        return operations_.opaqueHides(info);
     }
 
     TileHeader headerOf(int index, int pass) const
@@ -162,8 +138,7 @@ public:
     }
 
     // The message for a tile that has been checked. `codec` may be null.
-    template <class AnyTile>
-    Buffer encode(const AnyTile& tile, const Codec* codec)
+    Buffer encode(const InputPixels& tile, const Codec* codec)
     {
         const FloatEnvironment floatEnvironment;
         InputFaults faults;
@@ -177,7 +152,7 @@ public:
 
     // Takes an input of rank `from`. `where` gets what is known of the place: the tile. See TileTable::arrive() for the
     // rest.
-    void arrive(Buffer&& message, int from, ErrorInfo& where, typename TileTable<TileOp>::Arrival& arrival)
+    void arrive(Buffer&& message, int from, ErrorInfo& where, TileTable::Arrival& arrival)
     {
         Fragment fragment = decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
@@ -207,7 +182,7 @@ public:
         if (table_.isSpoilt(tile))
             return; // why has been said
         // The display rank knows how the background looks.
-        if (EmptyIsBackground<TileOp>::value && IsPointwise<PixelOp>::value && !table_.hasPixels(tile)) {
+        if (traits().emptyIsBackground && traits().pixelOpIsPointwise && !table_.hasPixels(tile)) {
             table_.setFinished(tile);
             return;
         }
@@ -215,7 +190,7 @@ public:
         const FloatEnvironment floatEnvironment;
         const Region region = table_.layout().region(tile);
         BackgroundPixels& background = table_.backgroundPixels(tile);
-        if constexpr (std::is_same_v<PixelOp, NoPixelOp>) {
+        if (!traits().hasPixelOp) {
             auto place = gather_.reserve(tile);
             background.newFrame(region.width(), region.height(), place.imageEpoch);
             FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither, &background);
@@ -243,7 +218,7 @@ public:
             pixels.depth = floatsOf(planes.at[Depth]);
             pixels.aux = {floatsOf(planes.at[Normal]), floatsOf(planes.at[Albedo]), floatsOf(planes.at[Position]),
                           idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
-            std::as_const(pixelOp_).process(pixels);
+            operations_.process(pixels);
             auto place = gather_.reserve(tile);
             background.newFrame(region.width(), region.height(), 0);
             for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
@@ -264,7 +239,7 @@ public:
         }
         if (inTime)
             table_.setFinished(tile);
-        if constexpr (HasReport<TileOp>::value)
+        if (traits().reports)
             addReport(tile);
         if (isLossy()) {
             const double bound = losses_.boundOf(tile, std::max(1, table_.samples(tile).count));
@@ -292,17 +267,17 @@ public:
     // What the pixel operation makes of the background; throws what it throws.
     void finishBackground()
     {
-        if constexpr (IsPointwise<PixelOp>::value) {
-            const float depth = std::numeric_limits<float>::infinity();
-            PixelTile pixel;
-            pixel.frame = table_.frameInfo().frame;
-            pixel.region = {0, 0, 1, 1};
-            pixel.color = background_.data();
-            pixel.depth = config_.depth ? &depth : nullptr;
-            backgroundIsFine_ = false; // if it throws
-            std::as_const(pixelOp_).process(pixel);
-            backgroundIsFine_ = true;
-        }
+        if (!traits().pixelOpIsPointwise)
+            return;
+        const float depth = std::numeric_limits<float>::infinity();
+        PixelTile pixel;
+        pixel.frame = table_.frameInfo().frame;
+        pixel.region = {0, 0, 1, 1};
+        pixel.color = background_.data();
+        pixel.depth = config_.depth ? &depth : nullptr;
+        backgroundIsFine_ = false; // if it throws
+        operations_.process(pixel);
+        backgroundIsFine_ = true;
     }
 
     // On the display rank, when all tiles are there: fills in those that nobody touched.
@@ -342,6 +317,8 @@ public:
     }
 
 private:
+    const OperationTraits& traits() const noexcept { return operations_.traits(); }
+
     // For each rank, whether it has finished tiles to send to that one.
     std::vector<bool> sendersTo(int displayRank, int rankCount) const
     {
@@ -377,8 +354,8 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     const FrameBufferConfig& config_;
     std::uint32_t address_; // of the framebuffer
-    PixelOp pixelOp_;
-    TileTable<TileOp> table_;
+    Operations& operations_;
+    TileTable table_;
     FinalGather gather_;
     ChannelMask sent_ = 0; // of the inputs of this frame
     std::array<float, 4> background_{};

@@ -5,6 +5,7 @@
 #include <dfb/dependency_tracker.hpp>
 #include <dfb/detail/background_pixels.hpp>
 #include <dfb/detail/manifest.hpp>
+#include <dfb/detail/operations.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
@@ -57,14 +58,11 @@ void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo&
 }
 
 // arrive() and declare() may be called from any thread, for one frame at a time.
-template <class TileOp>
 class TileTable {
 public:
-    using FrameData = typename FrameDataOf<TileOp>::type;
-
-    // Throws InvalidArgument for owners that there are not, and OutOfMemory.
-    TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount)
-    try : layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
+    // `operations` must live as long as this. Throws InvalidArgument for owners that there are not, and OutOfMemory.
+    TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount, const Operations& operations)
+    try : operations_(operations), layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
         slotOf_(static_cast<std::size_t>(layout.tileCount()), -1) {
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const int owner = ownerMap(tile, layout, rankCount);
@@ -78,7 +76,7 @@ public:
             }
         }
         slots_.resize(owned_.size());
-        series_.resize(KeepsState<TileOp>::value ? owned_.size() : 0);
+        series_.resize(traits().keepsState ? owned_.size() : 0);
     } catch (const std::bad_alloc&) {
         constexpr std::size_t mostBytes = 2 * sizeof(std::int32_t) + sizeof(int) + sizeof(std::unique_ptr<Slot>);
         const auto tiles = static_cast<std::size_t>(layout.tileCount());
@@ -108,9 +106,6 @@ public:
                 series.next = s.first + s.count;
             }
     }
-    // Belongs to it. Throws what copying throws.
-    void setData(const FrameData& data) { data_ = data; }
-
     // Why the tile of an arrival is spoilt is known. Whether it is of all: before that the frame must not end.
     void saidWhy() { --unsaid_; }
     bool isSaid() const noexcept { return unsaid_ == 0; }
@@ -148,10 +143,8 @@ public:
                 return; // the op had enough
             }
             slot.hasPixels = slot.hasPixels || !fragment.empty();
-            slot.op.add(std::move(fragment));
-            bool enough = false;
-            if constexpr (HasIsComplete<TileOp>::value)
-                enough = slot.op.isComplete();
+            slot.op->add(std::move(fragment));
+            const bool enough = traits().endsEarly && slot.op->isComplete();
             const bool complete = tree.complete() && allComplete(slot);
             arrival.ready = becomesReady(slot, enough || complete);
             endedEarly_ += enough && !complete;
@@ -219,7 +212,7 @@ public:
     bool hasPixels(int tile) { return slotFor(tile).hasPixels; }
 
     // The tile must be complete. Nothing else touches its op any more.
-    void finish(int tile, FinishedTile& out) { slotFor(tile).op.finish(out); }
+    void finish(int tile, FinishedTile& out) { slotFor(tile).op->finish(out); }
 
     // Of the tile's place in the image; for whoever finishes it.
     BackgroundPixels& backgroundPixels(int tile) { return slotFor(tile).background; }
@@ -250,12 +243,7 @@ public:
     }
 
     // What the operation says of a tile that is finished.
-    TileReport report(int tile)
-    {
-        TileReport report;
-        slotFor(tile).op.report(report);
-        return report;
-    }
+    TileReport report(int tile) { return slotFor(tile).op->report(); }
 
     // What the tiles that are not complete wait for: the first of them, and all in words. `declared`: tiles that nobody
     // named wait for nothing.
@@ -323,7 +311,7 @@ private:
         bool counted = false; // by declare()
         std::vector<DependencyTracker> trees;                       // one per pass
         std::vector<std::pair<std::uint32_t, std::uint16_t>> names; // of the inputs that were declared
-        TileOp op;
+        std::unique_ptr<TileStage> op;                              // made with the slot
         BackgroundPixels background;
     };
 
@@ -345,8 +333,11 @@ private:
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
-        if (!slot)
-            slot = std::make_unique<Slot>();
+        if (!slot) {
+            auto made = std::make_unique<Slot>();
+            made->op = operations_.makeTile();
+            slot = std::move(made);
+        }
         if (slot->frame != info_.frame) {
             const bool isEmptyYet = goesOn(tile) && !hasSamples(tile);
             slot->frame = info_.frame;
@@ -365,10 +356,7 @@ private:
             info.firstSample = samples(tile).first;
             info.emptySamples = isEmptyYet ? info.firstSample : 0;
             try {
-                if constexpr (HasNewFrameWithData<TileOp>::value)
-                    slot->op.newFrame(info, data_);
-                else
-                    slot->op.newFrame(info);
+                slot->op->newFrame(info);
             } catch (...) {
                 slot->spoilt = true; // the op is of no use in this frame
                 throw;
@@ -381,7 +369,7 @@ private:
     bool goesOn(int tile) const
     {
         const auto i = static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)]);
-        return KeepsState<TileOp>::value && series_[i].goesOn;
+        return traits().keepsState && series_[i].goesOn;
     }
     // Whether the operation has had any of those: then it gets this frame's, too, also if there is nothing in them.
     bool hasSamples(int tile)
@@ -465,6 +453,9 @@ private:
         return true;
     }
 
+    const OperationTraits& traits() const noexcept { return operations_.traits(); }
+
+    const Operations& operations_;
     TileLayout layout_;
     int rank_;
     std::vector<std::int32_t> owners_, slotOf_;
@@ -477,7 +468,6 @@ private:
     std::atomic<std::int64_t> arrived_{0}, endedEarly_{0};
     std::atomic<int> unsaid_{0}; // spoilt tiles of which it is not known yet why
     SamplePlan plan_;            // null: all tiles as info_ says
-    FrameData data_{};
 };
 
 } // namespace dfb::detail

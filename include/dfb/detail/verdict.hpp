@@ -6,6 +6,7 @@
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/detail/frame_terms.hpp>
+#include <dfb/detail/operations.hpp>
 #include <dfb/frame.hpp>
 
 #include <algorithm>
@@ -24,7 +25,6 @@
 #include <string>
 #include <tuple>
 #include <type_traits>
-#include <typeinfo>
 #include <utility>
 #include <vector>
 
@@ -285,21 +285,21 @@ struct Agreement {
         std::string text_;
     };
 
-    // `checksums`: see ConnectionOptions; `tileSize`: of the tile operation; `sent`: those of its channels that travel;
-    // `ownerOf(tile)`: the owner map's answers.
-    template <class TileOp, class PixelOp, class OwnerOf>
-    static Agreement of(const FrameBufferConfig& c, bool checksums, int rank, int tileSize, ChannelMask sent,
-                        int tileCount, const OwnerOf& ownerOf)
+    // `checksums`: see ConnectionOptions; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
+    // the owner map's answers.
+    template <class OwnerOf>
+    static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, int rank,
+                        ChannelMask sent, int tileCount, const OwnerOf& ownerOf)
     {
         Fingerprint owners;
         for (int tile = 0; tile < tileCount; ++tile)
             owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
         Settings s;
         s.add("the version of dfb", std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR));
-        s.add(tileOperation, std::string(typeid(TileOp).name()));
-        s.add(pixelOperation, std::string(typeid(PixelOp).name()));
-        s.add("the size of tiles", tileSize);
-        s.add("the mask of channels", TileOp::channels);
+        s.add(tileOperation, operations.tileOp);
+        s.add(pixelOperation, operations.pixelOp);
+        s.add("the size of tiles", operations.tileSize);
+        s.add("the mask of channels", operations.channels);
         s.add("the mask of channels that travel", sent);
         s.add("width", c.width);
         s.add("height", c.height);

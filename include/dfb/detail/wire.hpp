@@ -139,13 +139,12 @@ inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const f
 
 // Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
 // its range. Adds to `faults`. `codec` may be null.
-template <class TileType>
-Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted, std::uint32_t receiver,
-                      const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
+inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelMask wanted, std::uint32_t receiver,
+                             const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
 {
     static thread_local ActivePixels active;
     static thread_local std::vector<float> wide; // colours that are to be rounded
-    const auto channels = static_cast<ChannelMask>((wanted & TileType::channels) | colorChannel);
+    const auto channels = static_cast<ChannelMask>((wanted & tile.channels) | colorChannel);
     const int width = tile.region.width(), height = tile.region.height();
     const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
     // Colours that travel as they are go straight to their place in the message.
@@ -192,7 +191,7 @@ Buffer encodeFragment(MemoryPool& pool, const TileType& tile, ChannelMask wanted
     faults.nonFinite += active.nanDepths();
     if (active.mayBeFaulty())
         active.forEachSpan(tile, [&](std::size_t first, int spanPixels) {
-            const ConstPlanes planes = tile.planes();
+            const ConstPlanes& planes = tile.planes();
             countFaults(floatsOf(planes.at[Color]) + 4 * first,
                         hasChannel(channels, Depth) ? floatsOf(planes.at[Depth]) + first : nullptr, spanPixels, faults);
         });

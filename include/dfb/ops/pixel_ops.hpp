@@ -1,4 +1,4 @@
-// The pixel operations that come with dfb: none, tone mapping, and a chain of two.
+// The pixel operations that come with dfb: tone mapping, and a chain of two.
 #pragma once
 
 #include <dfb/pixel_op.hpp>
@@ -7,12 +7,6 @@
 #include <cstddef>
 
 namespace dfb {
-
-// Leaves the tile as it is: it is rounded to the output format straight from double.
-struct NoPixelOp {
-    static constexpr bool pointwise = true;
-    void process(PixelTile&) const noexcept {}
-};
 
 // Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
 // (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. Pixels of
@@ -68,6 +62,6 @@ struct PixelOpChain {
     Second second{};
 };
 
-static_assert(is_pixel_op_v<NoPixelOp> && is_pixel_op_v<ToneMap> && is_pixel_op_v<PixelOpChain<ToneMap, ToneMap>>);
+static_assert(is_pixel_op_v<ToneMap> && is_pixel_op_v<PixelOpChain<ToneMap, ToneMap>>);
 
 } // namespace dfb

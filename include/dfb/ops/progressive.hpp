@@ -9,6 +9,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <limits>
 #include <string>
 #include <type_traits>
@@ -64,12 +65,13 @@ public:
     void finish(FinishedTile& out)
     {
         const auto width = static_cast<std::size_t>(out.width());
-        base_.compositePasses([&](int y, int pass, const CompositeRow& row) {
+        const auto passDone = [&](int y, int pass, const CompositeRow& row) {
             const std::size_t first = static_cast<std::size_t>(y) * width;
             for (std::size_t x = 0; x < width; ++x)
                 m2_[first + x] += Moments::growth(samples_ + pass, sums_.rgba(first + x), 1, row.rgba.data() + 4 * x);
             sums_.add(first, row);
-        });
+        };
+        base_.compositePasses(std::ref(passDone)); // so that nothing is allocated
         samples_ += info_.passes;
         for (int y = 0; y < out.height(); ++y)
             sums_.write(out, y, static_cast<std::size_t>(y) * width, std::max<std::int64_t>(1, samples_));

@@ -2,6 +2,7 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
+#include <dfb/compiled.hpp>
 #include <dfb/fragment_compositor.hpp>
 #include <dfb/tile_op.hpp>
 
@@ -10,6 +11,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <limits>
 #include <string>
 #include <tuple>
@@ -113,9 +115,10 @@ private:
 
 // The inputs of one tile, kept until they are all there; then composited pass by pass over the background, and
 // the passes averaged, in double.
-template <BlendRule Rule>
 class FragmentStore {
 public:
+    explicit FragmentStore(BlendRule rule) noexcept : rule_(rule) {}
+
     // `channels`: of the operation.
     void newFrame(const TileInfo& info, ChannelMask channels)
     {
@@ -133,60 +136,16 @@ public:
     }
 
     // Forgets what is behind a generation.
-    void removeBehind(int generation)
-    {
-        fragments_.erase(std::remove_if(fragments_.begin(), fragments_.end(),
-                                        [&](const Fragment& f) { return f.header().generation > generation; }),
-                         fragments_.end());
-    }
+    void removeBehind(int generation);
 
-    // Calls passDone(y, pass, row) for each row and pass, row by row, with the background below.
-    template <class PassDone>
-    void compositePasses(const PassDone& passDone)
-    {
-        Scratch& scratch = start();
-        const std::size_t passes = static_cast<std::size_t>(info_.passes);
-        const int width = info_.region.width();
-        const bool tracksOrder = (tracked_ & farChannel) != 0;
-        scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
-        for (int y = 0; y < info_.region.height(); ++y) {
-            std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
-            for (std::size_t pass = 0; pass < passes; ++pass) {
-                if (tracked_ != 0) // of colour and depth nothing stays from the last row
-                    scratch.row.resize(width, tracked_);
-                scratch.compositors[pass].nextRow(scratch.row);
-                overBackground(scratch.row, 0, width, info_.background.data());
-                for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
-                    scratch.isUndefined[x] |= scratch.row.isUndefined[x];
-                passDone(y, static_cast<int>(pass), std::as_const(scratch.row));
-            }
-            undefinedPixels_ += std::count(scratch.isUndefined.begin(), scratch.isUndefined.end(), 1);
-        }
-        fragments_.clear();
-    }
+    // Called with (y, pass, row).
+    using PassDone = std::function<void(int, int, const CompositeRow&)>;
+
+    // Calls passDone for each row and pass, row by row, with the background below.
+    void compositePasses(const PassDone& passDone);
 
     // Writes the mean of the passes.
-    void finish(FinishedTile& out)
-    {
-        static thread_local PixelSums sums;
-        const int last = info_.passes - 1;
-        if (last == 0 && tracked_ == 0 && !out.isDithered()) {
-            finishRuns(out);
-            return;
-        }
-        const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
-        compositePasses([&](int y, int pass, const CompositeRow& row) {
-            if (direct) {
-                roundExactly(out, y, out.setRow(y, row.rgba.data(), row.depth.data()));
-                return;
-            }
-            if (pass == 0)
-                sums.reset(static_cast<std::size_t>(out.width()), tracked_);
-            sums.add(0, row);
-            if (pass == last)
-                roundExactly(out, y, sums.write(out, y, 0, info_.passes));
-        });
-    }
+    void finish(FinishedTile& out);
 
     // Pixels in which inputs of the last finished frame overlapped in depth.
     std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
@@ -203,110 +162,23 @@ private:
         std::vector<DoubleDouble> mean;
         CompositeRow row;
         std::vector<const Fragment*> pointers;
-        FragmentCompositor compositor{Rule};
+        std::vector<FragmentCompositor> compositors; // one
     };
 
-    // Brings the fragments into their order, and a compositor for each pass to their first row.
-    Scratch& start()
+    // One of each thread and rule, so that a frame after the first allocates nothing.
+    template <class Which>
+    Which& scratch() const
     {
-        static thread_local Scratch scratch; // so that a frame after the first allocates nothing
-        std::sort(fragments_.begin(), fragments_.end(), [](const Fragment& a, const Fragment& b) {
-            const TileHeader &x = a.header(), &y = b.header();
-            if constexpr (Rule == BlendRule::InOrder)
-                return std::tie(x.pass, x.generation) < std::tie(y.pass, y.generation);
-            else
-                return std::tie(x.pass, x.source, x.part, x.generation)
-                       < std::tie(y.pass, y.source, y.part, y.generation);
-        });
-        const std::size_t passes = static_cast<std::size_t>(info_.passes);
-        while (scratch.compositors.size() < passes)
-            scratch.compositors.emplace_back(Rule);
-        std::size_t next = 0;
-        for (std::size_t pass = 0; pass < passes; ++pass) {
-            scratch.pointers.clear();
-            for (; next < fragments_.size() && static_cast<std::size_t>(fragments_[next].header().pass) == pass; ++next)
-                scratch.pointers.push_back(&fragments_[next]);
-            scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
-        }
-        scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
-        scratch.row.wantsGaps = scratch.row.wantsSingles = true;
-        scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
-        scratch.row.resize(info_.region.width(), tracked_);
-        return scratch;
+        static thread_local std::array<Which, 3> ofRules;
+        return ofRules.at(static_cast<std::size_t>(rule_));
     }
 
-    // One pass, and no more than colour and depth: what no input covers is not composited.
-    void finishRuns(FinishedTile& out)
-    {
-        Scratch& scratch = start();
-        CompositeRow& row = scratch.row;
-        row.wantsGaps = false;
-        row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are what comes out
-        std::array<std::byte, 16> background;
-        if (out.format() != OutputFormat::None)
-            convertPixels(info_.background.data(), 1, out.format(), background.data());
-        for (int y = 0; y < out.height(); ++y) {
-            scratch.compositors.front().nextRow(row);
-            int x = 0;
-            double farthest = 0;
-            for (const auto& run : scratch.compositors.front().runs()) {
-                out.fillPixels(x, y, run.x - x, background.data());
-                x = run.x + run.count;
-                if (run.color) {
-                    out.setPixels(run.x, y, run.count, run.color);
-                    continue;
-                }
-                overBackground(row, run.x, run.count, info_.background.data());
-                farthest = std::max(farthest, out.setPixels(run.x, y, run.count, row.rgba.data() + 4 * run.x,
-                                                            row.depth.data() + (row.wantsDepth ? run.x : 0)));
-            }
-            out.fillPixels(x, y, out.width() - x, background.data());
-            roundExactly(out, y, farthest);
-        }
-        fragments_.clear();
-    }
+    Scratch& start();
+    void finishRuns(FinishedTile& out);
+    void roundExactly(FinishedTile& out, int y, double farthest);
+    const std::vector<DoubleDouble>& exactRow(int y);
 
-    // Where double does not tell which 8-bit level is nearer, finds out. `farthest`: of setRow().
-    void roundExactly(FinishedTile& out, int y, double farthest)
-    {
-        // 3 roundings for each layer and pass.
-        const double layers = static_cast<double>(fragments_.size()) + info_.passes;
-        if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
-            return;
-        const std::vector<DoubleDouble>& exact = exactRow(y);
-        const int step = out.isDithered() ? 4 : 1; // then of alpha alone
-        for (int i = step - 1; i < 4 * out.width(); i += step) {
-            const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
-            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
-        }
-    }
-
-    // Row y in twice the precision, the mean of the passes. Holds until the thread's next call.
-    const std::vector<DoubleDouble>& exactRow(int y)
-    {
-        const int width = info_.region.width();
-        static thread_local Exact scratch;
-        auto& [mean, row, pointers, compositor] = scratch;
-        mean.assign(4 * static_cast<std::size_t>(width), {});
-        row.minTransmittance = static_cast<double>(info_.minTransmittance);
-        for (int pass = 0; pass < info_.passes; ++pass) {
-            pointers.clear();
-            for (const Fragment& fragment : fragments_)
-                if (fragment.header().pass == pass)
-                    pointers.push_back(&fragment);
-            compositor.start(pointers.begin(), pointers.end());
-            compositor.skipRows(y);
-            row.resize(width, 0, true);
-            compositor.nextRow(row);
-            overBackground(row, 0, width, info_.background.data());
-            for (std::size_t i = 0; i < mean.size(); ++i)
-                mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
-        }
-        for (DoubleDouble& value : mean)
-            value = value / info_.passes;
-        return mean;
-    }
-
+    BlendRule rule_;
     TileInfo info_;
     ChannelMask tracked_ = 0;
     std::vector<Fragment> fragments_;
@@ -329,14 +201,10 @@ public:
     void report(TileReport& report) const { report.orderUndefinedPixels = store_.undefinedPixels(); }
 
     // For operations on top of this one: calls passDone(y, pass, row) for each composited row and pass, row by row.
-    template <class PassDone>
-    void compositePasses(const PassDone& passDone)
-    {
-        store_.compositePasses(passDone);
-    }
+    void compositePasses(const FragmentStore::PassDone& passDone) { store_.compositePasses(passDone); }
 
 protected:
-    FragmentStore<Rule> store_;
+    FragmentStore store_{Rule};
 };
 
 } // namespace detail
@@ -430,3 +298,163 @@ using DepthComposite = BasicDepthComposite<>;
 static_assert(is_tile_op_v<AlphaBlend> && is_tile_op_v<OrderedBlend> && is_tile_op_v<DepthComposite>);
 
 } // namespace dfb
+
+#if DFB_HAS_BODIES
+namespace dfb::detail {
+
+DFB_COMPILED_ONCE void FragmentStore::removeBehind(int generation)
+{
+    fragments_.erase(std::remove_if(fragments_.begin(), fragments_.end(),
+                                    [&](const Fragment& f) { return f.header().generation > generation; }),
+                     fragments_.end());
+}
+
+DFB_COMPILED_ONCE void FragmentStore::compositePasses(const PassDone& passDone)
+{
+    Scratch& scratch = start();
+    const std::size_t passes = static_cast<std::size_t>(info_.passes);
+    const int width = info_.region.width();
+    const bool tracksOrder = (tracked_ & farChannel) != 0;
+    scratch.isUndefined.resize(tracksOrder ? static_cast<std::size_t>(width) : 0);
+    for (int y = 0; y < info_.region.height(); ++y) {
+        std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
+        for (std::size_t pass = 0; pass < passes; ++pass) {
+            if (tracked_ != 0) // of colour and depth nothing stays from the last row
+                scratch.row.resize(width, tracked_);
+            scratch.compositors[pass].nextRow(scratch.row);
+            overBackground(scratch.row, 0, width, info_.background.data());
+            for (std::size_t x = 0; x < scratch.isUndefined.size(); ++x)
+                scratch.isUndefined[x] |= scratch.row.isUndefined[x];
+            passDone(y, static_cast<int>(pass), std::as_const(scratch.row));
+        }
+        undefinedPixels_ += std::count(scratch.isUndefined.begin(), scratch.isUndefined.end(), 1);
+    }
+    fragments_.clear();
+}
+
+DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
+{
+    static thread_local PixelSums sums;
+    const int last = info_.passes - 1;
+    if (last == 0 && tracked_ == 0 && !out.isDithered()) {
+        finishRuns(out);
+        return;
+    }
+    const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
+    const auto passDone = [&](int y, int pass, const CompositeRow& row) {
+        if (direct) {
+            roundExactly(out, y, out.setRow(y, row.rgba.data(), row.depth.data()));
+            return;
+        }
+        if (pass == 0)
+            sums.reset(static_cast<std::size_t>(out.width()), tracked_);
+        sums.add(0, row);
+        if (pass == last)
+            roundExactly(out, y, sums.write(out, y, 0, info_.passes));
+    };
+    compositePasses(std::ref(passDone)); // so that nothing is allocated
+}
+
+// Brings the fragments into their order, and a compositor for each pass to their first row.
+DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
+{
+    auto& scratch = this->scratch<Scratch>();
+    std::sort(fragments_.begin(), fragments_.end(), [this](const Fragment& a, const Fragment& b) {
+        const TileHeader &x = a.header(), &y = b.header();
+        if (rule_ == BlendRule::InOrder)
+            return std::tie(x.pass, x.generation) < std::tie(y.pass, y.generation);
+        return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
+    });
+    const std::size_t passes = static_cast<std::size_t>(info_.passes);
+    while (scratch.compositors.size() < passes)
+        scratch.compositors.emplace_back(rule_);
+    std::size_t next = 0;
+    for (std::size_t pass = 0; pass < passes; ++pass) {
+        scratch.pointers.clear();
+        for (; next < fragments_.size() && static_cast<std::size_t>(fragments_[next].header().pass) == pass; ++next)
+            scratch.pointers.push_back(&fragments_[next]);
+        scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
+    }
+    scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
+    scratch.row.wantsGaps = scratch.row.wantsSingles = true;
+    scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
+    scratch.row.resize(info_.region.width(), tracked_);
+    return scratch;
+}
+
+// One pass, and no more than colour and depth: what no input covers is not composited.
+DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
+{
+    Scratch& scratch = start();
+    CompositeRow& row = scratch.row;
+    row.wantsGaps = false;
+    row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are what comes out
+    std::array<std::byte, 16> background;
+    if (out.format() != OutputFormat::None)
+        convertPixels(info_.background.data(), 1, out.format(), background.data());
+    for (int y = 0; y < out.height(); ++y) {
+        scratch.compositors.front().nextRow(row);
+        int x = 0;
+        double farthest = 0;
+        for (const auto& run : scratch.compositors.front().runs()) {
+            out.fillPixels(x, y, run.x - x, background.data());
+            x = run.x + run.count;
+            if (run.color) {
+                out.setPixels(run.x, y, run.count, run.color);
+                continue;
+            }
+            overBackground(row, run.x, run.count, info_.background.data());
+            farthest = std::max(farthest, out.setPixels(run.x, y, run.count, row.rgba.data() + 4 * run.x,
+                                                        row.depth.data() + (row.wantsDepth ? run.x : 0)));
+        }
+        out.fillPixels(x, y, out.width() - x, background.data());
+        roundExactly(out, y, farthest);
+    }
+    fragments_.clear();
+}
+
+// Where double does not tell which 8-bit level is nearer, finds out. `farthest`: of setRow().
+DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, double farthest)
+{
+    // 3 roundings for each layer and pass.
+    const double layers = static_cast<double>(fragments_.size()) + info_.passes;
+    if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
+        return;
+    const std::vector<DoubleDouble>& exact = exactRow(y);
+    const int step = out.isDithered() ? 4 : 1; // then of alpha alone
+    for (int i = step - 1; i < 4 * out.width(); i += step) {
+        const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
+        out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
+    }
+}
+
+// Row y in twice the precision, the mean of the passes. Holds until the thread's next call.
+DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
+{
+    const int width = info_.region.width();
+    auto& [mean, row, pointers, compositors] = scratch<Exact>();
+    if (compositors.empty())
+        compositors.emplace_back(rule_);
+    FragmentCompositor& compositor = compositors.front();
+    mean.assign(4 * static_cast<std::size_t>(width), {});
+    row.minTransmittance = static_cast<double>(info_.minTransmittance);
+    for (int pass = 0; pass < info_.passes; ++pass) {
+        pointers.clear();
+        for (const Fragment& fragment : fragments_)
+            if (fragment.header().pass == pass)
+                pointers.push_back(&fragment);
+        compositor.start(pointers.begin(), pointers.end());
+        compositor.skipRows(y);
+        row.resize(width, 0, true);
+        compositor.nextRow(row);
+        overBackground(row, 0, width, info_.background.data());
+        for (std::size_t i = 0; i < mean.size(); ++i)
+            mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
+    }
+    for (DoubleDouble& value : mean)
+        value = value / info_.passes;
+    return mean;
+}
+
+} // namespace dfb::detail
+#endif

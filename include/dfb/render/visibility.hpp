@@ -7,7 +7,7 @@
 // corners, or a std::vector of those (a stereo camera has two).
 #pragma once
 
-#include <dfb/detail/manifest.hpp>
+#include <dfb/frame.hpp>
 #include <dfb/render/footprint.hpp>
 #include <dfb/render/world.hpp>
 #include <dfb/tile_layout.hpp>

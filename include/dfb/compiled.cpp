@@ -1,0 +1,3 @@
+// All that dfb::compiled compiles once; see compiled.hpp.
+#define DFB_COMPILING
+#include <dfb/dfb.hpp>

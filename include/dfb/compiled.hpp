@@ -1,0 +1,42 @@
+// Where the functions of dfb are compiled: in each source file that uses them, which is the default, or once, in the
+// target dfb::compiled, which defines DFB_COMPILED for all that link it. What is compiled once stands in its header as
+//
+//   DFB_COMPILED_ONCE void f();
+//
+// and its body, with the same word before it, where DFB_HAS_BODIES is 1; an instantiation of a template as
+//
+//   DFB_COMPILED_TEMPLATE(class Template<Argument>);
+#pragma once
+
+#include <dfb/version.hpp>
+
+#if defined(DFB_COMPILED)
+#define DFB_COMPILED_ONCE
+#else
+#define DFB_COMPILED_ONCE inline
+#endif
+
+#if !defined(DFB_COMPILED) || defined(DFB_COMPILING) // the latter in dfb/compiled.cpp alone
+#define DFB_HAS_BODIES 1
+#else
+#define DFB_HAS_BODIES 0
+#endif
+
+#if defined(DFB_COMPILING)
+#define DFB_COMPILED_TEMPLATE(...) template __VA_ARGS__
+#elif defined(DFB_COMPILED)
+#define DFB_COMPILED_TEMPLATE(...) extern template __VA_ARGS__
+#else
+#define DFB_COMPILED_TEMPLATE(...) static_assert(true)
+#endif
+
+// A program has one of both: the linker refuses a variable that is of a thread in one file and of all in another.
+#if defined(__GNUC__) && defined(__ELF__)
+extern "C" {
+#if defined(DFB_COMPILING)
+int dfb_either_all_files_with_dfb_compiled_or_none = 0;
+#elif !defined(DFB_COMPILED)
+__attribute__((used, weak)) thread_local int dfb_either_all_files_with_dfb_compiled_or_none = 0;
+#endif
+}
+#endif

@@ -1,0 +1,71 @@
+// Engine: what is behind the door of a framebuffer: frames of one set of tiles, with operations of any type. What it
+// is made of is in detail/frame_engine.hpp, which a program that links dfb::compiled does not compile.
+#pragma once
+
+#include <dfb/comm/connection.hpp>
+#include <dfb/compiled.hpp>
+#include <dfb/detail/operations.hpp>
+#include <dfb/frame.hpp>
+#include <dfb/image.hpp>
+#include <dfb/tile.hpp>
+#include <dfb/tile_layout.hpp>
+
+#include <any>
+#include <cstddef>
+#include <cstdint>
+#include <exception>
+#include <memory>
+#include <vector>
+
+namespace dfb::detail {
+
+// The members are those of DistributedFrameBuffer and its Frame; see there.
+class Engine {
+public:
+    virtual ~Engine() = default;
+
+    virtual int rank() const noexcept = 0;
+    virtual int size() const noexcept = 0;
+    virtual const FrameBufferConfig& config() const noexcept = 0;
+    virtual const TileLayout& layout() const noexcept = 0;
+    virtual int tileOwner(int tile) const noexcept = 0;
+    virtual const std::vector<int>& ownedTiles() const noexcept = 0;
+    virtual const Image& image() const noexcept = 0;
+    virtual std::int64_t imageFrame() const noexcept = 0;
+    virtual bool isComplete(int tile) const = 0;
+    virtual bool poll() = 0;
+    virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) = 0;
+
+    virtual void begin(const FrameParams& params) = 0;
+    virtual std::int64_t frame() const noexcept = 0; // the number of the one that has begun last
+    virtual TileHeader headerOf(int tile, int pass) const = 0;
+    virtual ChannelMask sent() const noexcept = 0; // what of the inputs travels in this frame
+    virtual void setTile(const InputPixels& tile) = 0;
+    virtual bool isHidden(int tile, int generation) const = 0;
+    virtual bool opaqueHides(int tile) const = 0;
+    virtual void hide(int tile, int generation, int other) = 0;
+    virtual void declare(const std::vector<TileInput>& inputs) = 0;
+    virtual std::any& loopMemory() noexcept = 0;
+    virtual void expectLayers(int layers) = 0;
+    virtual TileSamples samples(int tile) const = 0;
+    virtual JobRange nextJobs(std::int64_t count) = 0;
+    virtual void addFigure(std::uint64_t key, double value) = 0;
+    virtual void noteMergeError(int tile, double bound) = 0;
+    virtual bool failed() const noexcept = 0;
+    virtual void abort(const std::exception_ptr& reason, int tile) = 0;
+    virtual void cancel(std::int64_t frame) = 0;
+    virtual void requireProgress() const = 0;
+    virtual FrameReport end() = 0;
+    virtual void leave() noexcept = 0; // in place of end(), by who throws
+};
+
+// Collective. `operations` must live as long as what it returns; `slot`: which of config.framesInFlight engines this
+// is. Throws as the constructor of DistributedFrameBuffer does.
+DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
+                                                     Operations& operations, int slot);
+
+// Threads for those processors that this rank of the connection has for itself.
+DFB_COMPILED_ONCE std::shared_ptr<Executor> makeThreads(const Connection& connection);
+
+} // namespace dfb::detail

@@ -1,0 +1,15 @@
+// As compiled with dfb::compiled; see headers.cpp.
+#define DFB_COMPILED
+#include <dfb/comm/inproc_transport.hpp>
+#include <dfb/detail/engine.hpp>
+
+int compiled();
+
+int compiled()
+{
+    int threads = 0;
+    dfb::runRanks(1, [&](const dfb::InprocCommunicator& communicator) {
+        threads = dfb::detail::makeThreads(*dfb::connect<dfb::InprocTransport>(communicator))->concurrency();
+    });
+    return threads > 0 ? 0 : 1;
+}
