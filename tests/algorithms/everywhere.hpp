@@ -1,18 +1,17 @@
-// Everywhere: runs a case on 1, 2, 3, 4 and 7 ranks in one process, or on all ranks of MPI and on one in this process;
-// the image must be the same bit for bit.
+// Everywhere: runs a case on 1, 2, 3, 4 and 7 ranks in one process (test_inproc), or on all ranks of MPI and on one in
+// this process (test_mpi); the image must be the same bit for bit.
 //
 // A case has   template <class Transport> static Result run(const typename Transport::Communicator&);
-// which is called on each rank, makes no use of Catch, and takes a second at most.
+// which is called on each rank, makes no use of Catch, and takes a second at most. Transport is AnyTransport.
 #pragma once
 
 #include "../inproc/scene.hpp"
+#include "any_transport.hpp"
 #include "catch.hpp"
 
 #include <cstdint>
-#include <functional>
 #include <mutex>
 #include <string>
-#include <vector>
 
 namespace algorithms {
 
@@ -27,9 +26,10 @@ struct Result {
     }
 };
 
+using Run = Result (*)(const AnyTransport::Communicator&);
+
 // What rank 0 had, with what was wrong on any.
-template <class Case>
-Result inProcess(int ranks)
+inline Result inProcess(Run run, int ranks)
 {
     Result first;
     std::mutex mutex;
@@ -37,8 +37,8 @@ Result inProcess(int ranks)
     try {
         dfb::runRanks(
             ranks,
-            [&](dfb::InprocCommunicator communicator) {
-                const Result mine = Case::template run<dfb::InprocTransport>(communicator);
+            [&](const dfb::InprocCommunicator& communicator) {
+                const Result mine = run(AnyTransport::Communicator::of<dfb::InprocTransport>(communicator, true));
                 const std::lock_guard<std::mutex> lock(mutex);
                 if (communicator.rank() == 0)
                     first = mine;
@@ -53,4 +53,20 @@ Result inProcess(int ranks)
     return first;
 }
 
+// Of the program: run/inproc.cpp or run/mpi.cpp. `atOnce`: with all numbers of ranks at once, for a case that mostly
+// waits.
+void runEverywhere(Run run, bool atOnce);
+
 } // namespace algorithms
+
+template <class Case>
+void everywhere()
+{
+    algorithms::runEverywhere(&Case::template run<AnyTransport>, false);
+}
+
+template <class Case>
+void everywhereAtOnce()
+{
+    algorithms::runEverywhere(&Case::template run<AnyTransport>, true);
+}

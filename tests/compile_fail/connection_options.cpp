@@ -11,13 +11,13 @@ inline void make(dfb::FrameBufferConfig& config, dfb::ConnectionOptions& options
 {
 #if defined(CASE_PROGRESS_IN_CONFIG) // expect: no member named
     config.progress = dfb::Progress::Caller;
-#elif defined(CASE_CHECKSUMS_IN_CONFIG)       // expect: no member named
+#elif defined(CASE_CHECKSUMS_IN_CONFIG) // expect: no member named
     config.checksums = true;
-#elif defined(CASE_MEMORY_IN_CONFIG)          // expect: no member named
+#elif defined(CASE_MEMORY_IN_CONFIG) // expect: no member named
     config.sharedMemory = false;
-#elif defined(CASE_TIMEOUT_IN_CONFIG)         // expect: no member named
+#elif defined(CASE_TIMEOUT_IN_CONFIG) // expect: no member named
     config.peerTimeoutMs = 4000;
-#elif defined(CASE_HANDLER_IN_CONFIG)         // expect: no member named
+#elif defined(CASE_HANDLER_IN_CONFIG) // expect: no member named
     config.onPeerLost = [](const dfb::ErrorInfo&) {};
 #elif defined(CASE_OPTIONS_WITH_A_CONNECTION) // expect: no matching
     using Made = decltype(FrameBuffer(std::declval<Given>(), config, options));

@@ -1,6 +1,6 @@
 // Auxiliary channels in every operation: positions and ids need no depth in the image; Verified compares them.
-#define ALGORITHMS_WITHOUT_TESTS
-#include "../algorithms/compositing.hpp"
+#include "../algorithms/aux.hpp"
+#include "catch.hpp"
 
 #include <dfb/testing/verified.hpp>
 

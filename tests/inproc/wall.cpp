@@ -1,8 +1,6 @@
-// The cases of tests/algorithms/wall.hpp; and what travels to whom.
+// DisplayWall: what travels to whom.
 #include "board.hpp"
-#include "everywhere.hpp"
-
-#include "../algorithms/wall.hpp"
+#include "catch.hpp"
 
 #include <map>
 

@@ -1,4 +1,0 @@
-// The cases of tests/algorithms/compositing.hpp.
-#include "everywhere.hpp"
-
-#include "../algorithms/compositing.hpp"

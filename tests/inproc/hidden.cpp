@@ -1,4 +1,0 @@
-// The cases of tests/algorithms/hidden.hpp.
-#include "everywhere.hpp"
-
-#include "../algorithms/hidden.hpp"

@@ -1,4 +1,0 @@
-// The cases of tests/algorithms/corners.hpp.
-#include "everywhere.hpp"
-
-#include "../algorithms/corners.hpp"

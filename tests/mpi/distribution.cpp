@@ -1,4 +1,0 @@
-// The cases of tests/algorithms/distribution.hpp.
-#include "everywhere.hpp"
-
-#include "../algorithms/distribution.hpp"

@@ -1,4 +1,0 @@
-// The cases of tests/algorithms/wall.hpp.
-#include "everywhere.hpp"
-
-#include "../algorithms/wall.hpp"
