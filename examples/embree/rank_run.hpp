@@ -155,15 +155,16 @@ inline void writeImage(const std::string& path, const dfb::Image& image, bool is
     }
 }
 
-template <class TileOp, class PixelOp, class Transport>
+template <class TileOp, class PixelOp>
 class RankRun {
-    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, Transport>;
+    // It is made over a connection, whatever the transport of that is.
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
     using Reduce = typename FrameBuffer::Reduce;
     static constexpr bool hasWall = std::is_same_v<PixelOp, dfb::ToWall> || std::is_same_v<PixelOp, ToneMapToWall>;
 
 public:
-    RankRun(const typename Transport::Communicator& communicator, const Options& o, int threads)
-        : o_(o), connection_(dfb::connect<Transport>(communicator, connectionOptionsOf(o))),
+    RankRun(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
+        : o_(o), transport_(transport), connection_(std::move(connection)),
           threads_(threads > 0 ? threads : connection_->threadShare())
     {
         dfb::FrameBufferConfig config = configOf(o, threads_);
@@ -535,7 +536,7 @@ private:
         stats.options = o_.values;
         stats.version = std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR) + '.'
                         + std::to_string(DFB_VERSION_PATCH);
-        stats.transport = Transport::name;
+        stats.transport = transport_;
         stats.mode = o_.mode == Mode::Data ? "data" : o_.mode == Mode::Image ? "image" : "mixed";
         stats.width = o_.width;
         stats.height = o_.height;
@@ -618,6 +619,7 @@ private:
 
     PhaseClock clock_;
     Options o_;
+    const char* transport_; // its name
     std::shared_ptr<dfb::Connection> connection_;
     int threads_;
     std::unique_ptr<dfb::DisplayWall> wall_; // outlives the framebuffer that sends to it
@@ -639,11 +641,10 @@ private:
 };
 
 // Picks the operations that the options ask for.
-template <class Transport>
-int runWith(const typename Transport::Communicator& communicator, const Options& o, int threads)
+inline int runOver(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
 {
     const auto run = [&](auto tileOp, auto pixelOp) {
-        return RankRun<decltype(tileOp), decltype(pixelOp), Transport>(communicator, o, threads).run();
+        return RankRun<decltype(tileOp), decltype(pixelOp)>(std::move(connection), transport, o, threads).run();
     };
     if (o.deep > 0 || o.interleave > 1)
         return run(dfb::DeepBlend(), dfb::NoPixelOp());

@@ -1,4 +1,4 @@
-// Run: one rank's whole run of dfb_render. There is a source file per transport, as each takes long to compile.
+// Run: one rank's whole run of dfb_render. It has a source file of its own, as it takes long to compile.
 #pragma once
 
 #include "options.hpp"
