@@ -2,51 +2,22 @@
 // paper). The framebuffer's own image format is None: no rank gets the pixels of another's displays.
 #pragma once
 
-#include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/verdict.hpp>
-#include <dfb/exec.hpp>
-#include <dfb/fwd.hpp>
+#include <dfb/comm/connection.hpp>
+#include <dfb/compiled.hpp>
+#include <dfb/frame.hpp>
 #include <dfb/image.hpp>
 #include <dfb/pixel_op.hpp>
+#include <dfb/wall_layout.hpp>
 
-#include <algorithm>
-#include <atomic>
-#include <chrono>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
-#include <map>
 #include <memory>
-#include <mutex>
-#include <new>
-#include <optional>
-#include <string>
-#include <string_view>
-#include <utility>
-#include <vector>
 
 namespace dfb {
 
-// Displays of equal size in columns and rows, 0 at the upper left, row by row. The framebuffer has the pixels of all of
-// them and those behind the bezels between them, so that a line that crosses a bezel goes on straight.
-struct WallLayout {
-    int columns = 1, rows = 1;
-    int displayWidth = 0, displayHeight = 0; // pixels
-    int bezelX = 0, bezelY = 0;              // pixels that are not seen between two displays
-    std::vector<int> ranks;                  // that drives each display; any number of displays each, from none to all
-
-    // Of the framebuffer.
-    int width() const noexcept { return columns * displayWidth + (columns - 1) * bezelX; }
-    int height() const noexcept { return rows * displayHeight + (rows - 1) * bezelY; }
-    int displayCount() const noexcept { return columns * rows; }
-
-    // What a display shows of the framebuffer.
-    Region region(int display) const noexcept
-    {
-        const int x0 = display % columns * (displayWidth + bezelX), y0 = display / columns * (displayHeight + bezelY);
-        return {x0, y0, x0 + displayWidth, y0 + displayHeight};
-    }
-};
+namespace detail {
+class Wall; // detail/wall.hpp
+}
 
 class DisplayWall;
 
@@ -68,43 +39,17 @@ struct ToWall {
 //
 // Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them
 // at most `poolBytes` each.
-class DisplayWall final : private detail::MailboxOwner {
+class DisplayWall {
 public:
     // Collective, in the same order as the framebuffers of the connection. `format`: of the displays' images. Throws
     // InvalidArgument on all ranks if the layout is none, is not the same on all, or some rank has no memory for it.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
-                std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20)
-        : layout_(layout), format_(format), pool_(connection->pool())
-    {
-        if (!executor)
-            executor = std::make_shared<ThreadExecutor>(connection->threadShare());
-        const std::size_t largest = prefix + std::size_t{256} * 256 * bytesPerPixel(OutputFormat::RGBA32F);
-        detail::MailboxOwner& self = *this;
-        mailbox_ = std::make_unique<detail::Mailbox>(std::move(connection), std::move(executor),
-                                                     std::max(poolBytes, 4 * largest), self);
-        mailbox_->start();
-        detail::Agreement mine{true, describe(), mailbox_->rank()};
-        if (const std::string wrong = whatIsWrong(); !wrong.empty())
-            mine = {false, wrong, mailbox_->rank()};
-        else
-            try {
-                takeMemory();
-            } catch (const std::exception& e) { // the others must not wait for this rank
-                mine = {false, e.what(), mailbox_->rank()};
-            }
-        const auto all = detail::agree(*mailbox_, mine);
-        if (!all.fine) {
-            mailbox_->stop();
-            mailbox_.reset();
-            all.refuse();
-        }
-        mailbox_->connection().setAlike();
-    }
+                std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
     // Collective. After the framebuffers whose pixel operation sends here.
-    ~DisplayWall() { mailbox_->stop(); }
+    ~DisplayWall();
 
     const WallLayout& layout() const noexcept { return layout_; }
 
@@ -124,430 +69,22 @@ public:
     // failed (MissingInput), or if a part of it, or of a later frame, was not to be believed (MalformedMessage). What
     // the displays show stays. Whatever the limit, waits for all ranks to call it, as
     // allReduce() does. Throws TransportError.
-    void finish(std::int64_t frame, int timeoutMs = 0)
-    {
-        mailbox_->requireProgress();
-        mailbox_->connection().expectMessages(true);
-        bool complete = true;
-        std::string missing;
-        try {
-            std::optional<std::chrono::steady_clock::time_point> deadline;
-            if (timeoutMs > 0)
-                deadline = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs);
-            tellSent(frame);
-            mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
-            missing = whatIsMissing(frame);
-            complete = missing.empty();
-        } catch (...) {
-            mailbox_->connection().expectMessages(false);
-            throw;
-        }
-        detail::Agreement mine{complete, complete ? "" : missing, mailbox_->rank()};
-        const auto all = detail::Agreement::from(mailbox_->reduce(mine.bytes(), detail::Agreement::combine));
-        mailbox_->connection().expectMessages(false);
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
-            for (auto& [display, picture] : *done->second)
-                std::swap(shown_.at(display), picture.image);
-        if (all.fine)
-            shownFrame_ = frame;
-        mailbox_->reductions().forget(SentPixels, frame);
-        coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
-        sent_.erase(sent_.begin(), sent_.upper_bound(frame));
-        allSent_.erase(allSent_.begin(), allSent_.upper_bound(frame));
-        last_ = frame;
-        if (isMalformed(missing) && frame >= errorFrame_)
-            error_.clear();
-        if (!all.fine) {
-            ErrorInfo info;
-            const bool isUnsent = all.text.find(unsent) != std::string::npos;
-            info.kind = isMalformed(all.text) ? ErrorKind::MalformedMessage
-                        : isUnsent            ? ErrorKind::MissingInput
-                                              : ErrorKind::TimedOut;
-            info.frame = frame;
-            info.message = all.text.substr(isMalformed(all.text) ? malformed.size() : 0);
-            throw Error(std::move(info));
-        }
-    }
+    void finish(std::int64_t frame, int timeoutMs = 0);
 
     // What this rank's display shows: the last frame that was finished well, which stays until the next one is. Empty
     // before the first. Throws InvalidArgument if another rank drives it. By the thread that calls finish(), as the
     // next.
-    const Image& image(int display) const
-    {
-        const auto found = shown_.find(display);
-        if (found == shown_.end())
-            throw InvalidArgument("display " + std::to_string(display) + " is not driven by this rank");
-        return found->second;
-    }
+    const Image& image(int display) const;
 
     // Which frame all displays show, as in FrameReport::frame; the same on all ranks. -1 before the first.
-    std::int64_t imageFrame() const noexcept { return shownFrame_; }
+    std::int64_t imageFrame() const noexcept;
 
     // Called by ToWall, from any thread.
-    void put(const PixelTile& tile)
-    {
-        noteFrame(tile.frame);
-        const std::size_t pixelBytes = bytesPerPixel(format_);
-        const auto tileWidth = static_cast<std::size_t>(tile.region.width());
-        for (int d = 0; d < layout_.displayCount(); ++d) {
-            const Region display = layout_.region(d), part = intersection(display, tile.region);
-            if (part.empty())
-                continue;
-            detail::MessageHeader header;
-            header.kind = detail::MessageKind::FinishedTiles;
-            header.receiver = mailbox_->address();
-            header.number = tile.frame;
-            const PartHeader where{
-                d, {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0, part.y1 - display.y0}};
-            const auto width = static_cast<std::size_t>(part.width());
-            Buffer message = pool_->acquire(prefix + width * static_cast<std::size_t>(part.height()) * pixelBytes);
-            std::memcpy(message.data(), &header, sizeof header);
-            std::memcpy(message.data() + sizeof header, &where, sizeof where);
-            std::byte* out = message.data() + prefix;
-            for (int y = part.y0; y < part.y1; ++y, out += width * pixelBytes) {
-                const std::size_t first = static_cast<std::size_t>(y - tile.region.y0) * tileWidth
-                                          + static_cast<std::size_t>(part.x0 - tile.region.x0);
-                convertPixels(tile.color + 4 * first, part.width(), format_, out);
-            }
-            mailbox_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
-            countSent(tile.frame, d, static_cast<std::int64_t>(part.width()) * part.height());
-        }
-    }
+    void put(const PixelTile& tile);
 
 private:
-    struct PartHeader {
-        std::int32_t display = 0;
-        Region region; // in the display
-        std::int32_t reserved = 0;
-    };
-    static constexpr std::size_t prefix = sizeof(detail::MessageHeader) + sizeof(PartHeader);
-
-    // So many frames the others may be ahead of this rank: of those in flight, and of some that have failed. What says
-    // it is of a later one is not believed, as each takes the memory of its pictures.
-    static constexpr std::int64_t framesAhead = 16;
-
-    // In front of an Agreement's text that is not about time.
-    static constexpr std::string_view malformed = "malformed: ";
-    static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
-    // At the end of what a display misses.
-    static constexpr std::string_view unsent = " that no rank has sent";
-
-    enum Scope : std::uint32_t { SentPixels = detail::Mailbox::ownScope + 1 }; // of reductions
-
-    struct Picture {
-        Image image;
-        std::int64_t pixelsLeft = 0;
-        std::vector<std::uint64_t> covered{}; // a bit for each pixel, each row from a word on
-    };
-    using Pictures = std::map<int, Picture>; // by display
-    using Sums = ReductionTable::Bytes;
-
-    std::string describe() const
-    {
-        const auto text = [](auto value) { return std::to_string(value); };
-        detail::Agreement::Settings settings;
-        settings.add("the wall's columns x rows", text(layout_.columns) + 'x' + text(layout_.rows));
-        settings.add("the size of its displays", text(layout_.displayWidth) + 'x' + text(layout_.displayHeight));
-        settings.add("the size of its bezels", text(layout_.bezelX) + 'x' + text(layout_.bezelY));
-        settings.add("its format", nameOf(format_));
-        std::string ranks;
-        for (const int rank : layout_.ranks)
-            ranks += (ranks.empty() ? "" : ", ") + text(rank);
-        settings.add("the list of its displays' ranks", '{' + ranks + '}');
-        settings.add("checksums", mailbox_->connection().options().checksums);
-        return settings.text();
-    }
-
-    std::string whatIsWrong() const
-    {
-        if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
-            || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
-            return "a wall of " + std::to_string(layout_.columns) + 'x' + std::to_string(layout_.rows) + " displays of "
-                   + std::to_string(layout_.displayWidth) + 'x' + std::to_string(layout_.displayHeight) + ", bezels of "
-                   + std::to_string(layout_.bezelX) + 'x' + std::to_string(layout_.bezelY) + ", format "
-                   + nameOf(format_) + ": can not be";
-        if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
-            return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
-                   + std::to_string(layout_.ranks.size()) + " ranks";
-        for (const int rank : layout_.ranks)
-            if (rank < 0 || rank >= mailbox_->size())
-                return "a display of the wall is driven by rank " + std::to_string(rank) + " of "
-                       + std::to_string(mailbox_->size());
-        return "";
-    }
-
-    // The displays of this rank, with nothing to show, and memory for the images that each of them will have, which it
-    // leaves in the pool.
-    void takeMemory()
-    {
-        std::vector<Image> images;
-        for (int d = 0; d < layout_.displayCount(); ++d)
-            if (layout_.ranks[static_cast<std::size_t>(d)] == mailbox_->rank()) {
-                shown_.emplace(d, Image());
-                for (int i = 0; i < 2; ++i)
-                    images.emplace_back(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0);
-            }
-    }
-
-    void incoming(int source, const detail::MessageHeader& header, Buffer&& message) override
-    {
-        const std::size_t byteCount = message.size();
-        if (source != mailbox_->rank() && mailbox_->needsCredit(header.kind))
-            mailbox_->flow().consumed(source, byteCount);
-        try {
-            switch (header.kind) {
-            case detail::MessageKind::CreditRequest:
-                mailbox_->flow().requested(source, bodyAs<detail::FlowControl::Request>(message));
-                break;
-            case detail::MessageKind::Credit:
-                mailbox_->flow().credited(source, bodyAs<detail::FlowControl::Credit>(message));
-                break;
-            case detail::MessageKind::FinishedTiles: store(header.number, message); break;
-            case detail::MessageKind::ReduceUp:
-            case detail::MessageKind::ReduceDown:
-                if (mailbox_->keyOf(header, message).scope == SentPixels) {
-                    receiveSent(source, header, message);
-                    break;
-                }
-                [[fallthrough]];
-            default:
-                detail::failMalformed("a message of a kind that no wall gets", -1,
-                                      static_cast<std::int64_t>(header.kind));
-            }
-        } catch (const Error& e) {
-            if (header.kind == detail::MessageKind::FinishedTiles)
-                refuse(source, e.info(), header.number);
-            else // it may have been one that finish() waits for
-                mailbox_->giveUp(source, e.info());
-        } catch (const std::bad_alloc& e) { // for more frames than one
-            ErrorInfo info;
-            info.kind = ErrorKind::Transport;
-            info.message = e.what();
-            mailbox_->giveUp(source, info);
-        }
-    }
-
-    void undecodable(int source, const ErrorInfo& error) override
-    {
-        mailbox_->keepDamage(source, error); // it may have been a part of what finish() waits for
-        refuse(source, error, 0);
-    }
-
-    // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: what the message says.
-    void refuse(int source, const ErrorInfo& error, std::int64_t frame)
-    {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            error_ = error.message + ", in a message from rank " + std::to_string(source) + " to the wall";
-            errorFrame_ = std::max({errorFrame_, newest_, coming_.empty() ? 0 : coming_.rbegin()->first,
-                                    frame <= lastPossible() ? frame : 0});
-        }
-        mailbox_->notify();
-    }
-
-    template <class Body>
-    static Body bodyAs(const Buffer& message)
-    {
-        if (message.size() != sizeof(detail::MessageHeader) + sizeof(Body))
-            detail::failMalformed("wrong message size");
-        return detail::loadAs<Body>(message.data() + sizeof(detail::MessageHeader));
-    }
-
-    void store(std::int64_t frame, const Buffer& message)
-    {
-        if (message.size() < prefix)
-            detail::failMalformed("a part of a display is too short");
-        const auto where = detail::loadAs<PartHeader>(message.data() + sizeof(detail::MessageHeader));
-        const Region whole{0, 0, layout_.displayWidth, layout_.displayHeight}, part = where.region;
-        if (shown_.count(where.display) == 0 || part.empty() || intersection(whole, part) != part)
-            detail::failMalformed("a part of a display that this rank does not drive, or outside of it");
-        const std::size_t pixelBytes = bytesPerPixel(format_),
-                          rowBytes = static_cast<std::size_t>(part.width()) * pixelBytes;
-        if (message.size() != prefix + rowBytes * static_cast<std::size_t>(part.height()))
-            detail::failMalformed("a part of a display has the wrong size");
-        std::shared_ptr<Pictures> pictures; // finish() may drop those of a frame that failed
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (frame <= last_)
-                return;
-            if (frame > lastPossible())
-                detail::failMalformed("a part of a display's frame that no rank can have begun", lastPossible(), frame);
-            pictures = picturesOf(frame);
-            cover(pictures->at(where.display), part);
-        }
-        Picture& picture = pictures->at(where.display);
-        std::byte* pixels = picture.image.bytes();
-        const std::byte* in = message.data() + prefix;
-        for (int y = part.y0; y < part.y1; ++y, in += rowBytes)
-            std::memcpy(pixels
-                            + (static_cast<std::size_t>(y) * static_cast<std::size_t>(layout_.displayWidth)
-                               + static_cast<std::size_t>(part.x0))
-                                  * pixelBytes,
-                        in, rowBytes);
-        bool complete = false;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            picture.pixelsLeft -= static_cast<std::int64_t>(part.width()) * part.height();
-            complete = picture.pixelsLeft == 0;
-        }
-        if (complete)
-            mailbox_->notify();
-    }
-
-    // Takes note that these pixels have come, and must not come again; under mutex_.
-    void cover(Picture& picture, const Region& part) const
-    {
-        std::uint64_t twice = 0;
-        for (int y = part.y0; y < part.y1; ++y)
-            for (int x = part.x0; x < part.x1; x = (x / 64 + 1) * 64) {
-                const int count = std::min(64 - x % 64, part.x1 - x);
-                const std::uint64_t pixels = ~std::uint64_t{0} >> (64 - count) << x % 64;
-                std::uint64_t& word =
-                    picture.covered[static_cast<std::size_t>(y) * wordsPerRow() + static_cast<std::size_t>(x) / 64];
-                twice |= word & pixels;
-                word |= pixels;
-            }
-        if (twice != 0)
-            detail::failMalformed("a part of a display overlaps another");
-    }
-    std::size_t wordsPerRow() const { return (static_cast<std::size_t>(layout_.displayWidth) + 63) / 64; }
-
-    // Under mutex_.
-    std::int64_t lastPossible() const { return std::max(last_, newest_) + framesAhead; }
-
-    // This rank has begun it.
-    void noteFrame(std::int64_t frame)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        newest_ = std::max(newest_, frame);
-    }
-
-    // Of all displays of this rank; under mutex_.
-    std::shared_ptr<Pictures> picturesOf(std::int64_t frame)
-    {
-        std::shared_ptr<Pictures>& pictures = coming_[frame];
-        if (!pictures) {
-            pictures = std::make_shared<Pictures>();
-            for (const auto& [d, shown] : shown_)
-                pictures->emplace(d, Picture{Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0),
-                                             static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight,
-                                             std::vector<std::uint64_t>(static_cast<std::size_t>(layout_.displayHeight)
-                                                                        * wordsPerRow())});
-        }
-        return pictures;
-    }
-
-    // ---- how many pixels of a frame all ranks have sent to each display
-
-    void countSent(std::int64_t frame, int display, std::int64_t pixels)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        auto& sent = sent_[frame];
-        sent.resize(static_cast<std::size_t>(layout_.displayCount()));
-        sent[static_cast<std::size_t>(display)] += pixels;
-    }
-
-    // This rank has sent all of its frame. Waits for nothing.
-    void tellSent(std::int64_t frame)
-    {
-        std::vector<std::int64_t> mine;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            mine = sent_[frame];
-        }
-        mine.resize(static_cast<std::size_t>(layout_.displayCount()));
-        const auto* first = reinterpret_cast<const std::byte*>(mine.data());
-        mailbox_->reductions().enter(
-            {SentPixels, frame}, Sums(first, first + mine.size() * sizeof mine[0]),
-            [](const Sums& a, const Sums& b) { // equally long: receiveSent()
-                detail::ByteReader x(a), y(b);
-                detail::ByteWriter sums;
-                while (x.left() > 0)
-                    sums.put(x.get<std::uint64_t>() + y.get<std::uint64_t>());
-                return sums.bytes();
-            },
-            [this, frame](const Sums& all) {
-                {
-                    const std::lock_guard<std::mutex> lock(mutex_);
-                    if (frame <= last_)
-                        return;
-                    auto& sent = allSent_[frame];
-                    sent.resize(static_cast<std::size_t>(layout_.displayCount()));
-                    std::copy(all.begin(), all.end(), reinterpret_cast<std::byte*>(sent.data()));
-                }
-                mailbox_->notify();
-            });
-    }
-
-    void receiveSent(int source, const detail::MessageHeader& header, const Buffer& message)
-    {
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (header.number > lastPossible())
-                detail::failMalformed("word of a frame that no rank can have begun", lastPossible(), header.number);
-        }
-        if (mailbox_->bytesOf(message).size()
-            != static_cast<std::size_t>(layout_.displayCount()) * sizeof(std::int64_t))
-            detail::failMalformed("word of what was sent to other displays than there are");
-        mailbox_->receiveReduction(source, header, message);
-    }
-
-    // Under mutex_: what has not come to a display of this rank, and whether nothing more will.
-    std::int64_t pixelsLeft(std::int64_t frame, int display) { return picturesOf(frame)->at(display).pixelsLeft; }
-    bool hasAllSent(std::int64_t frame, int display)
-    {
-        const auto found = allSent_.find(frame);
-        const std::int64_t pixels = static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight;
-        return found != allSent_.end()
-               && found->second[static_cast<std::size_t>(display)] == pixels - pixelsLeft(frame, display);
-    }
-
-    // No display of this rank has to wait any more.
-    bool isOver(std::int64_t frame)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
-            return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
-        });
-    }
-    bool hasError()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return !error_.empty();
-    }
-
-    std::string whatIsMissing(std::int64_t frame)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (!error_.empty())
-            return std::string(malformed) + error_;
-        std::string text;
-        for (const auto& [display, image] : shown_) {
-            const std::int64_t left = pixelsLeft(frame, display);
-            if (left > 0)
-                text += (text.empty() ? "display " : ", display ") + std::to_string(display) + " of rank "
-                        + std::to_string(mailbox_->rank()) + " misses " + std::to_string(left) + " pixels"
-                        + std::string(hasAllSent(frame, display) ? unsent : "");
-        }
-        return text;
-    }
-
     WallLayout layout_;
-    OutputFormat format_;
-    std::shared_ptr<MemoryPool> pool_;
-    std::map<int, Image> shown_; // of this rank's displays; changed in finish(), as the next
-    std::int64_t shownFrame_ = -1;
-
-    std::mutex mutex_;
-    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, but for the pixels
-    std::map<std::int64_t, std::vector<std::int64_t>> sent_, allSent_; // pixels by frame and display; under mutex_
-    std::int64_t last_ = 0;                                            // finished; under mutex_
-    std::int64_t newest_ = 0;     // of which this rank has put() a tile; under mutex_
-    std::string error_;           // under mutex_
-    std::int64_t errorFrame_ = 0; // the last that error_ may be about; under mutex_
-
-    std::unique_ptr<detail::Mailbox> mailbox_; // last: its tasks use the others
+    std::unique_ptr<detail::Wall> wall_;
 };
 
 inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
@@ -555,3 +92,27 @@ inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
 static_assert(is_pixel_op_v<ToWall>);
 
 } // namespace dfb
+
+#if DFB_HAS_BODIES
+#include <dfb/detail/wall.hpp>
+
+#include <utility>
+
+namespace dfb {
+
+DFB_COMPILED_ONCE DisplayWall::DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout,
+                                           OutputFormat format, std::shared_ptr<Executor> executor,
+                                           std::size_t poolBytes)
+    : layout_(layout),
+      wall_(std::make_unique<detail::Wall>(std::move(connection), layout, format, std::move(executor), poolBytes))
+{
+}
+DFB_COMPILED_ONCE DisplayWall::~DisplayWall() = default;
+
+DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, int timeoutMs) { wall_->finish(frame, timeoutMs); }
+DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
+DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
+DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }
+
+} // namespace dfb
+#endif

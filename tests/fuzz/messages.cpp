@@ -6,6 +6,7 @@
 #include "fuzz.hpp"
 
 #include <dfb/detail/tile_pipeline.hpp>
+#include <dfb/detail/verdict.hpp>
 #include <dfb/dfb.hpp>
 
 #include <algorithm>

@@ -6,6 +6,8 @@
 #include "forward.hpp"
 #include "scene.hpp"
 
+#include <dfb/comm/reduction.hpp>
+
 #include <algorithm>
 #include <array>
 #include <atomic>
