@@ -211,13 +211,15 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         return recordOf(record, tile, pixels.planes, splits);
     };
     const auto add = [&](const std::string& name, std::uint8_t what, std::uint8_t flags, const std::string& batch,
-                         std::int64_t count, const std::string& placed = "", bool isGood = true) {
+                         std::int32_t tiles, const std::string& placed = "", bool isGood = true,
+                         std::int32_t batches = -1) {
         all.emplace_back(name, Output()
                                    .put(what)
                                    .put(flags)
                                    .put(static_cast<std::uint16_t>(batch.size()))
                                    .text(batch)
-                                   .put(count)
+                                   .put(tiles)
+                                   .put(batches < 0 ? std::int32_t{!batch.empty()} : batches)
                                    .text(placed)
                                    .bytes());
         require(take(Input(all.back().second)) == isGood, "what is good is taken, and nothing else");
@@ -245,7 +247,10 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("batch_with_header", 0, 0, Output().put(h).text(three).bytes(), 3);
     const std::string placed = Output().put(std::int32_t{1}).put(std::int32_t{3}).bytes();
     add("count_of_placed", 0, MakeHeader | Shared, make(0, 5, false, some), 3, placed);
-    add("count_of_placed_only", 0, MakeHeader | Shared, "", 2, placed);
+    add("count_of_placed_only", 0, MakeHeader | Shared, "", 2, placed, true, 1);
+    add("batch_count_too_low", 0, MakeHeader, three, 3, "", false, 0);
+    add("batch_count_too_high", 0, MakeHeader, three, 3, "", false, 2);
+    add("tile_count_too_low", 0, MakeHeader, three, 2, "", false);
     add("count_of_placed_too_low", 0, MakeHeader | Shared, "", 1, placed, false);
     add("count_of_placed_where_none_can_be", 0, MakeHeader, "", 2, placed, false);
     return all;

@@ -211,10 +211,17 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
     std::int32_t ofDisplay = 0; // a tile that rank 1 does not own
     while (dfb::latticeOwner(ofDisplay, layout, 3) == 1)
         ++ofDisplay;
-    std::int64_t owned = 0; // by rank 1
+    std::int32_t owned = 0; // by rank 1
     for (int tile = 0; tile < layout.tileCount(); ++tile)
         owned += dfb::latticeOwner(tile, layout, 3) == 1;
-    const auto oneLess = [](dfb::Buffer& m) { put(m, body, dfb::detail::loadAs<std::int64_t>(m.data() + body) - 1); };
+    // What a rank says of its finished tiles: how many there are, and in how many messages.
+    const auto oneLess = [](dfb::Buffer& m) { put(m, body, dfb::detail::loadAs<std::int32_t>(m.data() + body) - 1); };
+    const auto oneMessageLess = [](dfb::Buffer& m) {
+        put(m, body + 4, dfb::detail::loadAs<std::int32_t>(m.data() + body + 4) - 1);
+    };
+    const auto oneMessageMore = [](dfb::Buffer& m) {
+        put(m, body + 4, dfb::detail::loadAs<std::int32_t>(m.data() + body) + 1);
+    };
     const std::vector<Lie> lies{
         {"an input of a frame far ahead", MessageKind::Fragment, 2,
          [](dfb::Buffer& m) { put(m, offsetof(MessageHeader, number), std::int64_t{1000}); }, "no rank can have begun"},
@@ -244,12 +251,17 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
         {"a batch that is longer than it says", MessageKind::FinishedTiles, 1,
          [](dfb::Buffer& m) { put(m, body, std::uint64_t{16}); }, "a batch of tiles has the wrong size"},
         {"more finished tiles than there are", MessageKind::TilesDone, 1,
-         [](dfb::Buffer& m) { put(m, body, std::int64_t{1000}); }, "a count of tiles that can not be"},
+         [](dfb::Buffer& m) { put(m, body, std::int32_t{1000}); }, "a count of tiles that can not be"},
         {"more finished tiles than the rank owns", MessageKind::TilesDone, 1,
          [=](dfb::Buffer& m) { put(m, body, owned + 1); }, "a count of tiles that can not be"},
         {"fewer finished tiles than come", MessageKind::TilesDone, 1, oneLess, "more finished tiles than were counted"},
         {"fewer finished tiles than come after it", MessageKind::TilesDone, 1, oneLess,
          "more finished tiles than were counted", MessageKind::FinishedTiles},
+        {"fewer messages of finished tiles than come", MessageKind::TilesDone, 1, oneMessageLess,
+         "finished tiles than were counted"},
+        {"fewer messages of finished tiles than come after it", MessageKind::TilesDone, 1, oneMessageLess,
+         "fewer finished tiles than were counted", MessageKind::FinishedTiles},
+        {"more messages than tiles", MessageKind::TilesDone, 1, oneMessageMore, "a count of tiles that can not be"},
     };
     for (const Lie& lie : lies) {
         const Changed c = changed(lie.kind, 0, lie.sender, lie.change, lie.overtaken);

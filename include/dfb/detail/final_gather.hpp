@@ -90,16 +90,14 @@ public:
         compresses_ = compresses && settings_.codec;
         batch_.reset();
         flushed_ = false;
-        tilesSent_ = 0;
+        sent_ = {};
         placed_.clear();
         placedPixels_ = 0;
-        tilesReceived_ = 0;
-        tilesAnnounced_ = 0;
-        ranksDone_ = 0;
+        ranksComplete_ = 0;
         incomplete_.clear();
-        for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
-            tilesOf_[r].received = 0;
-            tilesOf_[r].announced = senders_[r] ? -1 : 0;
+        for (TilesOf& its : tilesOf_) {
+            its.received = {};
+            its.announced.reset();
         }
         for (auto& s : state_)
             if (s == TileState::Received)
@@ -239,7 +237,7 @@ public:
                 return false;
             placed_.push_back(tile);
             placedPixels_ += writtenPixels;
-            ++tilesSent_;
+            ++sent_.tiles;
             return true; // and with `place` the writer leaves
         }
         static thread_local FinishedRecord::Plan plan;
@@ -260,12 +258,13 @@ public:
                 batch_ = takeSpare();
                 batch_->message = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
                 batch_->used = prefix;
+                ++sent_.batches;
             }
             batch = batch_;
             record = batch->message.data() + batch->used;
             batch->used += plan.bytes();
             ++batch->writers;
-            ++tilesSent_;
+            ++sent_.tiles;
         }
         if (full)
             sendBatch(std::move(full));
@@ -300,11 +299,11 @@ public:
                 batch_.reset();
             }
             const MessageHeader header = messageHeader(MessageKind::TilesDone);
-            done = pool_->acquire(sizeof header + sizeof tilesSent_ + sizeof(std::int32_t) * placed_.size());
+            done = pool_->acquire(sizeof header + sizeof sent_ + sizeof(std::int32_t) * placed_.size());
             std::memcpy(done.data(), &header, sizeof header);
-            std::memcpy(done.data() + sizeof header, &tilesSent_, sizeof tilesSent_);
+            std::memcpy(done.data() + sizeof header, &sent_, sizeof sent_);
             std::copy(placed_.begin(), placed_.end(),
-                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof tilesSent_));
+                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof sent_));
         }
         if (last)
             sendBatch(std::move(last));
@@ -335,6 +334,7 @@ public:
             in = raw.data();
             left = h.rawBytes;
         }
+        SentCount here{0, 1};
         while (left > 0) {
             const std::size_t bytes = record_.read(in, left, layout_, [this, source](int tile, const Region& region) {
                 checkOwner(tile, source);
@@ -343,58 +343,54 @@ public:
             });
             in += bytes;
             left -= bytes;
-            TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
-            const std::int64_t received = ++its.received, announced = its.announced;
-            if (announced >= 0 && received > announced)
-                failMalformed("more finished tiles than were counted", announced, received);
-            ++tilesReceived_;
+            ++here.tiles;
         }
+        const std::lock_guard<std::mutex> lock(mutex_);
+        addReceived(tilesOf_[static_cast<std::size_t>(source)], here);
     }
 
     void receiveDone(int source, const Buffer& message)
     {
         requireDisplay();
         const std::byte* in = message.data() + sizeof(MessageHeader);
-        const std::size_t placedBytes = std::max(message.size(), sizeof(MessageHeader) + sizeof(std::int64_t))
-                                        - sizeof(MessageHeader) - sizeof(std::int64_t);
-        if (message.size() < sizeof(MessageHeader) + sizeof(std::int64_t) || placedBytes % sizeof(std::int32_t) != 0)
+        const std::size_t bytes = message.size() - std::min(message.size(), sizeof(MessageHeader));
+        if (bytes < sizeof(SentCount) || (bytes - sizeof(SentCount)) % sizeof(std::int32_t) != 0)
             failMalformed("a count of tiles has the wrong size");
-        const auto count = loadAs<std::int64_t>(in);
-        for (std::size_t at = 0; at < placedBytes; at += sizeof(std::int32_t)) {
-            const auto tile = loadAs<std::int32_t>(in + sizeof count + at);
+        const auto count = loadAs<SentCount>(in);
+        SentCount placed;
+        for (std::size_t at = sizeof count; at < bytes; at += sizeof(std::int32_t), ++placed.tiles) {
+            const auto tile = loadAs<std::int32_t>(in + at);
             if (tile < 0 || tile >= layout_.tileCount() || !imageGate_)
                 failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
             checkOwner(tile, source);
             receiveOnce(tile);
-            ++tilesOf_[static_cast<std::size_t>(source)].received;
-            ++tilesReceived_;
         }
+        const std::lock_guard<std::mutex> lock(mutex_);
         TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
-        std::int64_t expected = -1;
-        if (count < 0 || count > its.owned || !its.announced.compare_exchange_strong(expected, count))
-            failMalformed("a count of tiles that can not be", -1, count);
-        // Either this or receiveTiles() sees it. Thus, when all have counted, no rank's tiles stand for another's.
-        if (const std::int64_t received = its.received; received > count)
-            failMalformed("more finished tiles than were counted", count, received);
-        tilesAnnounced_ += count;
-        ++ranksDone_; // after the count: who sees all ranks done sees all counts
+        if (its.announced || count.tiles < 0 || count.tiles > its.owned || count.batches < 0
+            || count.batches > count.tiles)
+            failMalformed("a count of tiles that can not be", its.owned, count.tiles);
+        its.announced = count;
+        addReceived(its, placed);
     }
 
     // All tiles of the other ranks are in the image.
-    bool complete() const { return !displays() || (ranksDone_ == senderCount() && tilesReceived_ == tilesAnnounced_); }
+    bool complete() const { return !displays() || ranksComplete_ == senderCount(); }
 
-    // How many ranks have tiles for this one, how many of these have said how many, and in words whose have not come.
+    // How many ranks have tiles for this one, of how many all are here, and in words whose have not come.
     int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
-    int ranksDone() const noexcept { return ranksDone_; }
+    int ranksComplete() const noexcept { return ranksComplete_; }
     std::string missing() const
     {
+        const std::lock_guard<std::mutex> lock(mutex_);
         std::string text;
         for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
             if (!isMissing(r))
                 continue;
-            const std::int64_t announced = tilesOf_[r].announced, received = tilesOf_[r].received;
+            const TilesOf& its = tilesOf_[r];
             text += (text.empty() ? "finished tiles have not come from rank " : ", rank ") + std::to_string(r) + " ("
-                    + std::to_string(received) + " of " + (announced < 0 ? "all" : std::to_string(announced)) + ")";
+                    + std::to_string(its.received.tiles) + " of "
+                    + (its.announced ? std::to_string(its.announced->tiles) : "all") + ")";
         }
         return text;
     }
@@ -402,6 +398,7 @@ public:
     // The first of those ranks, or -1.
     int firstMissing() const
     {
+        const std::lock_guard<std::mutex> lock(mutex_);
         for (std::size_t r = 0; r < tilesOf_.size(); ++r)
             if (isMissing(r))
                 return static_cast<int>(r);
@@ -441,8 +438,9 @@ public:
     {
         if (!displays() || owner == rank_)
             return false;
-        const TilesOf& t = tilesOf_[static_cast<std::size_t>(owner)];
-        return t.received != t.announced && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return isMissing(static_cast<std::size_t>(owner))
+               && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
     // The same: the tile of a frame that is over is not to be seen.
     void setIncomplete(int tile)
@@ -467,9 +465,39 @@ public:
     }
 
 private:
-    bool isMissing(std::size_t r) const
+    // What a rank has sent to the display rank: tiles, those that it has put into the image included, and messages.
+    struct SentCount {
+        std::int32_t tiles = 0, batches = 0;
+    };
+
+    struct TilesOf {
+        SentCount received;
+        std::optional<SentCount> announced;
+        std::int32_t owned = 0; // the most that there can be
+        bool isComplete() const
+        {
+            return announced && received.tiles == announced->tiles && received.batches == announced->batches;
+        }
+    };
+
+    // Under mutex_.
+    bool isMissing(std::size_t r) const { return senders_[r] && !tilesOf_[r].isComplete(); }
+
+    // Under mutex_. These have come as well. With a rank's last message its tiles must be as many as it has counted:
+    // thus a wrong count never ends a frame too early. Throws Error (MalformedMessage).
+    void addReceived(TilesOf& its, const SentCount& here)
     {
-        return static_cast<int>(r) != rank_ && tilesOf_[r].received != tilesOf_[r].announced;
+        its.received.tiles += here.tiles;
+        its.received.batches += here.batches;
+        if (!its.announced)
+            return;
+        if (its.received.tiles > its.announced->tiles || its.received.batches > its.announced->batches)
+            failMalformed("more finished tiles than were counted", its.announced->tiles, its.received.tiles);
+        if (its.received.batches < its.announced->batches)
+            return;
+        if (its.received.tiles < its.announced->tiles)
+            failMalformed("fewer finished tiles than were counted", its.announced->tiles, its.received.tiles);
+        ++ranksComplete_;
     }
 
     enum class TileState : std::uint8_t { Undefined, Background, Old, Received };
@@ -479,12 +507,6 @@ private:
         std::size_t used = 0;
         int writers = 0;
         bool closed = false;
-    };
-    struct TilesOf {
-        std::atomic<std::int64_t> received{0}, announced{-1};
-        std::int64_t owned = 0; // the most that there can be
-        TilesOf() = default;
-        TilesOf(const TilesOf&) {} // for the vector, which never copies a used one
     };
     struct BatchHeader {
         std::uint64_t rawBytes = 0;
@@ -611,7 +633,7 @@ private:
     std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
     std::vector<std::shared_ptr<Batch>> spareBatches_;
     bool flushed_ = false;
-    std::int64_t tilesSent_ = 0;
+    SentCount sent_;
     SharedImage remote_;               // of the display rank, if this one sees it
     std::vector<std::int32_t> placed_; // tiles that are in it
     std::int64_t placedPixels_ = 0;
@@ -622,9 +644,8 @@ private:
     std::array<float, 4> background_{}, lastBackground_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::set<int> incomplete_;                  // of the last frame
-    std::atomic<std::int64_t> tilesReceived_{0}, tilesAnnounced_{0};
-    std::atomic<int> ranksDone_{0};
-    std::vector<TilesOf> tilesOf_; // per rank, on the display rank
+    std::vector<TilesOf> tilesOf_;              // per rank, on the display rank; under mutex_
+    std::atomic<int> ranksComplete_{0};         // of those that send
 };
 
 } // namespace dfb::detail

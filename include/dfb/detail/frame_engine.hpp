@@ -856,7 +856,7 @@ private:
             info->message = pipeline_->gather().missing();
             info->from = pipeline_->gather().firstMissing();
             info->expected = pipeline_->gather().senderCount();
-            info->got = pipeline_->gather().ranksDone();
+            info->got = pipeline_->gather().ranksComplete();
         } else {
             info.emplace();
             addWaitedFor(*info, "no verdict from", outcome_->key());
