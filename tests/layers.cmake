@@ -11,7 +11,7 @@ set(level_1 buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp cpu.
 set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
             comm/transport.hpp detail/background_pixels.hpp detail/blend_kernels.hpp detail/image_gate.hpp
             detail/sort_kernels.hpp exec.hpp levels.hpp render/world.hpp wire_codes.hpp)
-set(level_3 comm/flow_control.hpp comm/link.hpp comm/reduction.hpp compositing.hpp detail/frame_gate.hpp image.hpp
+set(level_3 comm/flow_control.hpp comm/link.hpp comm/reduction.hpp compositing.hpp detail/open_frame.hpp image.hpp
             tbb_executor.hpp testing/detail/conformance_tools.hpp wire_format.hpp)
 set(level_4 comm/progress.hpp dither.hpp render/footprint.hpp testing/transport_conformance.hpp tile.hpp
             wall_layout.hpp)
@@ -26,11 +26,12 @@ set(level_8 detail/finished_record.hpp detail/operations.hpp ops/image_parallel.
             render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp)
 set(level_9 detail/engine.hpp detail/final_gather.hpp detail/tile_table.hpp detail/verdict.hpp
             render/mixed_parallel.hpp testing/adversarial.hpp)
-set(level_10 detail/frame_figures.hpp detail/outcome.hpp detail/tile_pipeline.hpp detail/wall.hpp)
-set(level_11 detail/frame_engine.hpp display_wall.hpp)
-set(level_12 distributed_framebuffer.hpp)
-set(level_13 dfb.hpp)
-set(last_level 13)
+set(level_10 detail/frame_figures.hpp detail/tile_pipeline.hpp detail/wall.hpp)
+set(level_11 detail/outcome.hpp display_wall.hpp)
+set(level_12 detail/frame_engine.hpp)
+set(level_13 distributed_framebuffer.hpp)
+set(level_14 dfb.hpp)
+set(last_level 14)
 
 # A dependency has one door.
 set(door_of_mpi comm/mpi_transport.hpp)

@@ -520,7 +520,7 @@ std::pair<std::string, std::string> finished(Way way)
     settings.channels = config.depth ? dfb::depthChannel : 0;
     settings.codec = config.codec;
     const dfb::TileLayout layout(width, height, side);
-    d::FinalGather gather(pool, layout, settings, false, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
+    d::FinalGather gather(pool, layout, settings, 0, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });

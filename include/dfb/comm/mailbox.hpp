@@ -204,6 +204,18 @@ public:
         return counts; // they were these when there was no task
     }
 
+    // Takes a message about credit of the current epoch. False if it is none. Throws Error (MalformedMessage).
+    bool receiveCredit(int source, const MessageHeader& header, const Buffer& message)
+    {
+        if (header.kind == MessageKind::CreditRequest)
+            flow_.requested(source, bodyOf<FlowControl::Request>(message));
+        else if (header.kind == MessageKind::Credit)
+            flow_.credited(source, bodyOf<FlowControl::Credit>(message));
+        else
+            return false;
+        return true;
+    }
+
     // Message bytes and messages to other ranks since the start.
     std::int64_t bytesSent() const noexcept { return bytesSent_; }
     std::int64_t messagesSent() const noexcept { return messagesSent_; }

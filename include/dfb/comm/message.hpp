@@ -66,6 +66,16 @@ T loadAs(const std::byte* bytes)
     throw Error(std::move(info));
 }
 
+// What a message has after its header, if that is a Body and nothing else. Throws Error (MalformedMessage).
+template <class Body>
+Body bodyOf(const Buffer& message)
+{
+    if (message.size() != sizeof(MessageHeader) + sizeof(Body))
+        failMalformed("wrong message size", sizeof(MessageHeader) + sizeof(Body),
+                      static_cast<std::int64_t>(message.size()));
+    return loadAs<Body>(message.data() + sizeof(MessageHeader));
+}
+
 // Checks and returns the header of a message. Throws Error (MalformedMessage).
 inline MessageHeader readMessageHeader(const Buffer& message)
 {

@@ -54,10 +54,10 @@ public:
 
     // `senders`: which ranks have finished tiles for the display rank; `ownerOf(tile)`: which. `send`: to it, batches
     // and the count of tiles.
-    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, bool isDisplay, int rank,
-                std::vector<bool> senders, OwnerOf ownerOf, Send send)
-        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), isDisplay_(isDisplay), rank_(rank),
-          senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
+    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, int displayRank,
+                int rank, std::vector<bool> senders, OwnerOf ownerOf, Send send)
+        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), displayRank_(displayRank),
+          rank_(rank), senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
           record_(settings_.format, settings_.channels)
     {
         if (displays()) {
@@ -69,7 +69,7 @@ public:
             for (auto& s : state_)
                 s = TileState::Undefined;
         }
-        if (!isDisplay_ && enabled())
+        if (!isDisplay() && enabled())
             for (int i = 0; i < 3; ++i) // as many as one worker and a thread that waits have at once
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
@@ -78,7 +78,7 @@ public:
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
     bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
-    bool displays() const noexcept { return isDisplay_ && enabled(); }
+    bool displays() const noexcept { return isDisplay() && enabled(); }
 
     // `compresses`: whether the codec, if there is one, is used. `background`: what the image shows beside the tiles.
     void newFrame(std::int64_t frame, bool compresses, const std::array<float, 4>& background)
@@ -138,11 +138,14 @@ public:
         return h.isTried ? prefix + h.rawBytes : 0;
     }
 
-    // On another rank. `blockAt(place, byteCount)`: what lies there, or null. Throws Error (MalformedMessage).
+    // On another rank, with the places that shareImage() has told rank `source`. `blockAt(place, byteCount)`: what lies
+    // there, or null. Throws Error (MalformedMessage).
     template <class BlockAt>
-    void useImage(const ImagePlaces& places, const BlockAt& blockAt)
+    void receivePlaces(int source, const ImagePlaces& places, const BlockAt& blockAt)
     {
-        if (isDisplay_ || !enabled())
+        if (source != displayRank_)
+            failMalformed("a rank that displays nothing has an image", displayRank_, source);
+        if (isDisplay() || !enabled())
             return;
         SharedImage image;
         image.gate = reinterpret_cast<ImageGate*>(blockAt(places.gate, sizeof(ImageGate)));
@@ -200,7 +203,7 @@ public:
         if (!enabled())
             return place;
         const Region region = layout_.region(tile);
-        if (isDisplay_)
+        if (isDisplay())
             return inImage(image_.planesAt(0), region);
         if (SharedImage image = remote(); image.gate)
             if (ImageWriter writer(*image.gate, frame_); writer) {
@@ -227,7 +230,7 @@ public:
     {
         if (!enabled())
             return true;
-        if (isDisplay_) {
+        if (isDisplay()) {
             state_[static_cast<std::size_t>(tile)] = TileState::Received;
             return true;
         }
@@ -310,7 +313,19 @@ public:
         send_(std::move(done));
     }
 
-    // The display rank's side of a FinishedTiles message. Throws Error (MalformedMessage).
+    static bool isFinishedTile(MessageKind kind)
+    {
+        return kind == MessageKind::FinishedTiles || kind == MessageKind::TilesDone;
+    }
+
+    // The display rank's side of one of these. Throws Error (MalformedMessage).
+    void receive(int source, const MessageHeader& header, Buffer&& message)
+    {
+        if (header.kind == MessageKind::FinishedTiles)
+            receiveTiles(source, std::move(message));
+        else
+            receiveDone(source, message);
+    }
     void receiveTiles(int source, Buffer&& message)
     {
         requireDisplay();
@@ -453,7 +468,7 @@ public:
     // The same: nothing has come for it in this frame.
     bool hasNothing(int tile) const
     {
-        return isDisplay_ && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+        return isDisplay() && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
     bool isComplete(int tile) const { return imageFrame_ >= 0 && incomplete_.count(tile) == 0; }
 
@@ -516,6 +531,7 @@ private:
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
+    bool isDisplay() const noexcept { return rank_ == displayRank_; }
     bool travels(std::size_t channel) const { return hasChannel(settings_.channels | colorChannel, channel); }
     static std::size_t pixelsIn(const Region& region)
     {
@@ -620,8 +636,7 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     TileLayout layout_;
     Settings settings_;
-    bool isDisplay_;
-    int rank_;
+    int displayRank_, rank_;
     std::vector<bool> senders_; // of finished tiles, rank by rank
     OwnerOf ownerOf_;
     Send send_;

@@ -1,144 +1,460 @@
-// FrameOutcome: how a frame ends: the first failure on this rank, the abort that tells the others, and the one
-// reduction in which all ranks learn the same verdict.
+// FrameOutcome: how the open frame ends: what makes it fail, what end() waits for, and the one reduction in which all
+// ranks learn the same verdict.
 #pragma once
 
 #include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/frame_gate.hpp>
+#include <dfb/detail/open_frame.hpp>
+#include <dfb/detail/quiescence.hpp>
+#include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/detail/verdict.hpp>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <exception>
-#include <mutex>
+#include <functional>
 #include <optional>
 #include <string>
 #include <utility>
+#include <vector>
 
 namespace dfb::detail {
 
+// Members may be called from any thread, but for newFrame() and conclude().
 class FrameOutcome {
 public:
-    FrameOutcome(Mailbox& mailbox, const FrameGate& gate, std::uint32_t scope)
-        : mailbox_(mailbox), gate_(gate), scope_(scope)
+    using Clock = std::chrono::steady_clock;
+    using Bytes = ReductionTable::Bytes;
+    // Its reductions.
+    enum Scope : std::uint32_t { AllDeclared = Mailbox::ownScope + 1, FrameVerdict, Quiet = Mailbox::quietScope };
+
+    // `addFigures(verdict)` adds what this rank has counted in the frame to its vote. All must live as long as this.
+    FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, std::function<void(Verdict&)> addFigures)
+        : mailbox_(mailbox), frame_(frame), tiles_(tiles), addFigures_(std::move(addFigures))
     {
     }
 
-    // No other member may be running.
-    void newFrame()
+    struct Terms {
+        FrameTerms terms; // what all ranks must have in common
+        bool declared = false, allowPartial = false;
+        std::chrono::milliseconds timeout{0}; // 0: none
+        std::chrono::milliseconds quiet{1};   // until the first look whether anything is under way
+    };
+
+    // Before the frame is opened.
+    void newFrame(const Terms& terms)
     {
-        error_.reset();
+        terms_ = terms;
         verdict_.reset();
-        hasVerdict_ = failed_ = damaged_ = voted_ = told_ = false;
+        quiescence_.newFrame(terms.quiet);
     }
 
-    // The frame has failed on some rank, or the transport has. From any thread, as the rest.
-    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed) || mailbox_.failed(); }
+    // The frame has failed on some rank, or the transport has.
+    bool failed() const noexcept { return frame_.failed() || mailbox_.failed(); }
+    // The last frame did not end well.
+    bool lastFailed() const noexcept { return lastFailed_; }
 
-    // A message was damaged, here or where the frame failed first: it may be one that the verdict needs.
-    bool isDamaged() const noexcept { return damaged_; }
+    // ---- failure
 
-    // It has failed here: takes note of the reason, the first one, and tells the others. vote() must follow. False if
-    // this rank has voted: then it is up to the others, and if they all have, it is too late.
-    bool fail(const std::exception_ptr& reason, const ErrorInfo& where)
+    // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then, `source` whose
+    // message it was about, or -1. False if it did throw.
+    template <class Body>
+    bool guarded(const Body& body, const ErrorInfo& where = {}, int source = -1)
     {
-        ErrorInfo info = errorInfoOf(reason, where);
-        info.rank = mailbox_.rank();
-        info.frame = gate_.frame();
-        bool first = false, late = false;
-        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            late = voted_;
-            first = !std::exchange(told_, true);
-            if (!error_) // else one that the frame could bear
-                error_ = info;
+        try {
+            body();
+            return true;
+        } catch (...) {
+            ErrorInfo place = where;
+            place.from = source;
+            fail(std::current_exception(), place);
+            return false;
         }
-        failed_ = true;
-        if (first) {
-            ByteWriter body;
-            put(body, info);
-            for (int other = 0; other < mailbox_.size(); ++other)
-                if (other != mailbox_.rank())
-                    mailbox_.send(other, MessageKind::Abort, gate_.frame(), body.bytes());
+    }
+
+    // Something went wrong here: the frame fails, or goes on without it if it may be partial. False if this rank has
+    // voted already, so that its vote does not say it.
+    bool fail(const std::exception_ptr& reason, const ErrorInfo& where = {})
+    {
+        const ErrorInfo info = placed(errorInfoOf(reason, where));
+        if (!isBearable(info.kind))
+            return failWhole(info);
+        const bool inTime = frame_.note(info);
+        if (!inTime && !failed())
+            frame_.countLate(); // the verdict will not say it
+        return inTime;
+    }
+
+    // The same where the frame cannot go on, whether or not it may be partial.
+    bool failWhole(const ErrorInfo& reason)
+    {
+        const OpenFrame::Failure failure = frame_.fail(placed(reason));
+        if (failure.isFirst)
+            tellOthers(placed(reason));
+        if (!failure.inTime)
+            frame_.countLate(); // too late to matter to this frame
+        dropRest();
+        tryVote();
+        return failure.inTime;
+    }
+    bool failWhole(const std::exception_ptr& reason) { return failWhole(errorInfoOf(reason, {})); }
+
+    // The frame has failed: what has not left matters no more, unless what is finished is wanted.
+    void dropRest()
+    {
+        mailbox_.flow().drop([this](const Buffer& message) {
+            return terms_.allowPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
+        });
+        if (terms_.allowPartial && !frame_.areTilesFinished())
+            tiles_.gather().flush();
+    }
+
+    // ---- messages
+
+    // Takes a message about how the frame goes: Abort and reductions. False if it is none.
+    bool receive(int source, const MessageHeader& header, const Buffer& message)
+    {
+        switch (header.kind) {
+        case MessageKind::Abort: receiveAbort(header, message); return true;
+        case MessageKind::ReduceUp:
+        case MessageKind::ReduceDown: receiveReduction(source, header, message); return true;
+        default: return false;
         }
-        return !late;
     }
 
-    // Something was lost, but the frame goes on: the verdict will say so. False if this rank has voted: then it will
-    // not.
-    bool note(const std::exception_ptr& reason, const ErrorInfo& where)
-    {
-        ErrorInfo info = errorInfoOf(reason, where);
-        info.rank = mailbox_.rank();
-        info.frame = gate_.frame();
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (!error_)
-            error_ = info;
-        return !voted_;
-    }
+    // ---- the vote
 
-    // The first thing that went wrong as far as this rank knows, also if the frame goes on without it.
-    std::optional<ErrorInfo> reason()
+    // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
+    void tryVote()
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return error_;
-    }
-
-    // Another rank says that it has failed, and why. vote() must follow.
-    void failElsewhere(const ErrorInfo& info)
-    {
-        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (!error_)
-                error_ = info; // in case that rank has voted already
-            told_ = true;
-        }
-        failed_ = true;
-    }
-
-    // Enters the verdict, once: when `done()`, or when the frame has failed, and this rank `may()`. `figures()` gives
-    // its Verdict.
-    template <class IsDone, class May, class Figures>
-    void vote(const IsDone& done, const May& may, const Figures& figures)
-    {
+        if (mailbox_.failed() || !frame_.vote([this] { return isDone(); }, [this] { return mayVote(); }))
+            return;
         Verdict mine;
-        {
-            const std::lock_guard<std::mutex> lock(mutex_);
-            if (voted_ || mailbox_.failed() || !(failed_ || done()) || !may())
-                return;
-            voted_ = true;
-            mine = figures();
-            mine.error = error_;
-        }
-        mailbox_.reductions().enter(key(), mine.bytes(), Verdict::combine, [this](const ReductionTable::Bytes& result) {
+        mine.terms = terms_.terms;
+        addFigures_(mine);
+        if (terms_.allowPartial)
+            mine.incomplete = tiles_.table().unfinished(terms_.declared);
+        mine.error = frame_.reason();
+        mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
             verdict_ = Verdict::from(result);
-            hasVerdict_ = true;
+            frame_.decide();
             mailbox_.notify();
         });
     }
 
-    // Waits for the verdict of all ranks: null if it has not come before `deadline`. Throws TransportError.
-    const Verdict* wait(std::optional<std::chrono::steady_clock::time_point> deadline = std::nullopt)
+    // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError. Of the thread that
+    // is in end().
+    Verdict conclude()
     {
-        return mailbox_.wait([this] { return hasVerdict_.load(); }, deadline) ? &*verdict_ : nullptr;
+        frame_.finish();
+        nextLook_ = Clock::now() + quiescence_.interval();
+        std::exception_ptr transportError;
+        Verdict verdict;
+        try {
+            tryVote();
+            verdict = terms_.timeout.count() > 0 ? waitInTime() : waitWithoutLimit();
+            if (!verdict.error)
+                verdict.error = verdict.strayInputs();
+            if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
+                verdict.error->frame = frame_.number();
+            if (isPartial(verdict)) // not from ranks that send none
+                waitForFinishedTiles();
+        } catch (const TransportError&) {
+            transportError = std::current_exception();
+        }
+        frame_.close([this] { return mailbox_.executor().help(); });
+        mailbox_.reductions().forget(AllDeclared, frame_.number());
+        mailbox_.reductions().forget(Quiet, frame_.number());
+        mailbox_.connection().expectMessages(false);
+        lastFailed_ = transportError || verdict.error;
+        tiles_.gather().closeImage();
+        if (!transportError && isPartial(verdict))
+            tiles_.setIncomplete(verdict.incomplete);
+        else if (lastFailed_)
+            tiles_.gather().invalidate();
+        if (transportError)
+            std::rethrow_exception(transportError);
+        return verdict;
     }
 
-    // Of the reduction in which the verdict comes.
-    ReductionKey key() const { return {scope_, gate_.frame()}; }
+    // The frame has an image although something is missing.
+    bool isPartial(const Verdict& verdict) const
+    {
+        return terms_.allowPartial && verdict.error && verdict.error->kind != ErrorKind::Disagreement;
+    }
 
 private:
+    // So long end() waits between two looks at what nobody tells it.
+    static constexpr std::chrono::milliseconds untilAsked{2000};
+
+    ReductionKey verdictKey() const { return {FrameVerdict, frame_.number()}; }
+
+    ErrorInfo placed(ErrorInfo info) const
+    {
+        info.rank = mailbox_.rank();
+        info.frame = frame_.number();
+        return info;
+    }
+
+    // Whether a frame that may be partial goes on without what this was about.
+    bool isBearable(ErrorKind kind) const
+    {
+        return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
+               && kind != ErrorKind::Disagreement
+               && (kind != ErrorKind::MalformedMessage || terms_.timeout.count() > 0); // its content is waited for
+    }
+
+    void tellOthers(const ErrorInfo& info)
+    {
+        ByteWriter body;
+        put(body, info);
+        for (int other = 0; other < mailbox_.size(); ++other)
+            if (other != mailbox_.rank())
+                mailbox_.send(other, MessageKind::Abort, frame_.number(), body.bytes());
+    }
+
+    void receiveAbort(const MessageHeader& header, const Buffer& message)
+    {
+        ByteReader body(message.data() + sizeof header, message.size() - sizeof header);
+        ErrorInfo info = getErrorInfo(body);
+        body.end();
+        std::optional<ErrorInfo> mine;
+        if (isMissing(info.kind)) {
+            if (!failed())
+                mine = missing(info.kind);  // this rank's part of what is missing
+            info.tile = info.expected = -1; // it must not pass for the list of the rank that it came from
+        }
+        frame_.failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
+        dropRest();
+        tryVote();
+    }
+
+    // Ranks that were given different parameters may wait for different things, so that none of them would ever be
+    // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
+    void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
+    {
+        const std::uint32_t scope = mailbox_.keyOf(header, message).scope;
+        const bool isUp = header.kind == MessageKind::ReduceUp;
+        bool differs = false;
+        try {
+            if (scope == FrameVerdict) {
+                const Verdict verdict = Verdict::from(mailbox_.bytesOf(message));
+                const int tileCount = tiles_.table().layout().tileCount();
+                if (!verdict.fits(tileCount))
+                    failMalformed("a verdict on tiles that there are not", tileCount - 1);
+                differs = isUp && !verdict.terms.difference(terms_.terms).empty();
+            } else if (scope == AllDeclared) {
+                if (!mailbox_.bytesOf(message).empty())
+                    failMalformed("a declaration's reduction that carries something");
+                differs = isUp && !terms_.declared;
+            } else if (scope == Quiet) {
+                differs = !Round::from(mailbox_.bytesOf(message)).terms.difference(terms_.terms).empty();
+            } else {
+                failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
+            }
+            if (differs)
+                fail(std::make_exception_ptr(Error(Verdict::disagreement())));
+            mailbox_.receiveReduction(source, header, message);
+        } catch (const Error& e) {
+            // Without this message there would never be a result.
+            mailbox_.giveUp(source, e.info());
+        }
+    }
+
+    // This rank waits for nothing but the others.
+    bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
+
+    // Where only end() moves messages, all that others have sent must have been taken before any rank may leave: who
+    // polls no more takes nothing, and its sender would wait in end() for it to go.
+    bool mayVote() const
+    {
+        Connection& connection = mailbox_.connection();
+        return !connection.needsCaller() || (mailbox_.flow().allSent() && connection.quiet());
+    }
+
+    // ---- waiting
+
+    // Null if the verdict has not come before `deadline`. Throws TransportError.
+    const Verdict* wait(Clock::time_point deadline)
+    {
+        const auto isDecided = [this] { return frame_.state() == FrameState::Decided; };
+        return mailbox_.wait(isDecided, deadline) ? &*verdict_ : nullptr;
+    }
+
+    // The verdict, or a frame that fails for what is missing, or, if even that cannot be agreed on, TransportError.
+    Verdict waitInTime()
+    {
+        const auto start = Clock::now();
+        if (const Verdict* verdict = waitAndLook(start + terms_.timeout))
+            return *verdict;
+        if (!failed())
+            fail(std::make_exception_ptr(Error(missing(ErrorKind::TimedOut))));
+        if (const Verdict* verdict = wait(start + 2 * terms_.timeout))
+            return *verdict;
+        giveUpVerdict(2 * terms_.timeout);
+    }
+
+    // The verdict, however long others render. Only where a damaged message was noticed, which may have been part of
+    // the verdict, is it waited for no longer than for a rank of which nothing is heard.
+    Verdict waitWithoutLimit()
+    {
+        const auto limit = std::chrono::milliseconds(mailbox_.connection().options().peerTimeoutMs);
+        const auto step = limit.count() > 0 ? std::min(limit, untilAsked) : untilAsked;
+        std::optional<Clock::time_point> deadline;
+        for (;;) {
+            if (const Verdict* verdict = waitAndLook(Clock::now() + step))
+                return *verdict;
+            if (!deadline && limit.count() > 0 && frame_.isDamaged())
+                deadline = Clock::now() + limit;
+            if (deadline && Clock::now() >= *deadline)
+                giveUpVerdict(limit);
+        }
+    }
+
+    // The verdict; null if it has not come by then. Meanwhile this rank looks, now and then, whether anything is under
+    // way.
+    const Verdict* waitAndLook(Clock::time_point deadline)
+    {
+        for (;;) {
+            if (const Verdict* verdict = wait(std::min(deadline, nextLook_)))
+                return verdict;
+            const auto now = Clock::now();
+            if (now >= nextLook_) {
+                nextLook_ = now + quiescence_.interval();
+                look();
+            }
+            if (now >= deadline)
+                return nullptr;
+        }
+    }
+
+    // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
+    void waitForFinishedTiles()
+    {
+        const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
+        const bool hasLimit = terms_.timeout.count() > 0;
+        if (!hasLimit) // but what could not be read does not come again
+            mailbox_.wait([&] { return areThere() || frame_.isDamaged(); });
+        mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout : untilAsked));
+    }
+
+    // What travels in a round of quiescence_. Ranks that were given different parameters may wait for each other for
+    // ever: therefore it carries what they were given, and shows the difference on its way up the tree, as soon as two
+    // of them are in end(); see receiveReduction().
+    struct Round {
+        FrameTerms terms;
+        Quiescence::Report report;
+
+        Bytes bytes() const
+        {
+            ByteWriter out;
+            out.put(terms);
+            out.put(report);
+            return out.bytes();
+        }
+        static Round from(const Bytes& bytes)
+        {
+            ByteReader in(bytes);
+            Round round;
+            round.terms = in.get<FrameTerms>();
+            round.report = in.get<Quiescence::Report>();
+            in.end();
+            return round;
+        }
+        static Bytes combine(const Bytes& first, const Bytes& second)
+        {
+            const Round a = from(first), b = from(second);
+            return Round{a.terms, Quiescence::sum(a.report, b.report)}.bytes();
+        }
+    };
+
+    // Enters a round, if this rank rests, and the last one has come to its end. By the thread that is in end().
+    void look()
+    {
+        tryVote();
+        const auto counts = mailbox_.countsAtRest();
+        if (!counts || !quiescence_.mayEnter())
+            return;
+        const auto isWaiting = [this] { return !isDone() && !failed(); };
+        const Round mine{terms_.terms, {*counts, isWaiting() ? 1u : 0u}};
+        quiescence_.enter();
+        mailbox_.reductions().enter({Quiet, frame_.number()}, mine.bytes(), Round::combine,
+                                    [this, isWaiting](const Bytes& all) {
+                                        if (quiescence_.endRound(Round::from(all).report) && isWaiting())
+                                            fail(std::make_exception_ptr(Error(missing(ErrorKind::MissingInput))));
+                                    });
+    }
+
+    // ---- what is missing
+
+    // What this rank waits for; `kind`: how that is known to be missing.
+    ErrorInfo missing(ErrorKind kind)
+    {
+        ErrorInfo info;
+        if (!frame_.areTilesKnown()) {
+            info.message = "not all ranks have declared their inputs";
+            info.expected = mailbox_.size();
+            addWaitedFor(info, "no word from", {AllDeclared, frame_.number()});
+        } else if (!frame_.areTilesFinished()) {
+            if (const auto tile = tiles_.table().missing(terms_.declared))
+                info = *tile;
+            else
+                info.message = "tiles that have all their inputs are still being finished";
+        } else if (!tiles_.gather().complete()) {
+            info.message = tiles_.gather().missing();
+            info.from = tiles_.gather().firstMissing();
+            info.expected = tiles_.gather().senderCount();
+            info.got = tiles_.gather().ranksComplete();
+        } else {
+            addWaitedFor(info, "no verdict from", verdictKey());
+        }
+        info.kind = kind;
+        if (const std::string lost = mailbox_.connection().lost(); kind == ErrorKind::TimedOut && !lost.empty())
+            info.message += (info.message.empty() ? "" : "; ") + lost;
+        return placed(std::move(info));
+    }
+
+    // Says whose part of a reduction this rank waits for, and in `from`, if there is only one that it can be.
+    void addWaitedFor(ErrorInfo& info, const char* what, const ReductionKey& key)
+    {
+        const auto missing = mailbox_.reductions().missing(key);
+        std::string text;
+        for (const auto& part : missing) {
+            text += (text.empty() ? std::string(what) + " rank " : ", rank ") + std::to_string(part.rank);
+            if (part.rank < mailbox_.rank())
+                text += ", through which the result comes";
+            else if (part.last > part.rank)
+                text += " or another up to " + std::to_string(part.last) + ", whose part comes with that one's";
+        }
+        if (missing.size() == 1 && missing.front().rank > mailbox_.rank()
+            && missing.front().last == missing.front().rank)
+            info.from = missing.front().rank;
+        if (!text.empty())
+            info.message += (info.message.empty() ? "" : ", ") + text;
+    }
+
+    [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
+    {
+        ErrorInfo info = placed({});
+        info.kind = ErrorKind::Transport;
+        info.message = "no verdict after " + std::to_string(after.count()) + " ms";
+        addWaitedFor(info, "no verdict from", verdictKey());
+        if (const std::string lost = mailbox_.connection().lost(); !lost.empty())
+            info.message += "; " + lost;
+        mailbox_.connection().giveUp(info);
+        throw TransportError(std::move(info));
+    }
+
     Mailbox& mailbox_;
-    const FrameGate& gate_;
-    std::uint32_t scope_;
-    std::atomic<bool> failed_{false}, damaged_{false}, hasVerdict_{false};
-    std::optional<Verdict> verdict_; // set once, before hasVerdict_
-    std::mutex mutex_;
-    // Under mutex_:
-    bool voted_ = false;
-    bool told_ = false; // all ranks, by this one or another, that the frame has failed
-    std::optional<ErrorInfo> error_;
+    OpenFrame& frame_;
+    TilePipeline& tiles_;
+    std::function<void(Verdict&)> addFigures_;
+    Terms terms_;
+    bool lastFailed_ = false;
+    std::optional<Verdict> verdict_; // set once, before the frame is Decided
+    Quiescence quiescence_;
+    Clock::time_point nextLook_; // at it; of the thread that is in end()
 };
 
 } // namespace dfb::detail

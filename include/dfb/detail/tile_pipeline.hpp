@@ -37,7 +37,7 @@ public:
                  config.ownerMap ? config.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
               pool_, table_.layout(), {config.format, imageChannels(config), address, config.codec, config.dither},
-              rank == config.displayRank, rank, sendersTo(config.displayRank, rankCount),
+              config.displayRank, rank, sendersTo(config.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
           coder_(config.wire, traits().activeByDepth)
     {

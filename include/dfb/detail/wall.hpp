@@ -232,11 +232,9 @@ private:
         if (source != mailbox_->rank() && mailbox_->needsCredit(header.kind))
             mailbox_->flow().consumed(source, byteCount);
         try {
+            if (mailbox_->receiveCredit(source, header, message))
+                return;
             switch (header.kind) {
-            case MessageKind::CreditRequest:
-                mailbox_->flow().requested(source, bodyAs<FlowControl::Request>(message));
-                break;
-            case MessageKind::Credit: mailbox_->flow().credited(source, bodyAs<FlowControl::Credit>(message)); break;
             case MessageKind::FinishedTiles: store(header.number, message); break;
             case MessageKind::ReduceUp:
             case MessageKind::ReduceDown:
@@ -276,14 +274,6 @@ private:
                                     frame <= lastPossible() ? frame : 0});
         }
         mailbox_->notify();
-    }
-
-    template <class Body>
-    static Body bodyAs(const Buffer& message)
-    {
-        if (message.size() != sizeof(MessageHeader) + sizeof(Body))
-            failMalformed("wrong message size");
-        return loadAs<Body>(message.data() + sizeof(MessageHeader));
     }
 
     void store(std::int64_t frame, const Buffer& message)

@@ -1,0 +1,289 @@
+// OpenFrame: the frame that is open on this rank, as a state machine: its states, who causes a transition, what belongs
+// to it, and what it still waits for.
+//
+//   Closed --open()--> Rendering --finish()--> Finishing --vote()--> Voted --decide()--> Decided --close()--> Closed
+//                          |                       |
+//                          +--------fail()---------+----> Failed --vote()--> Voted
+//
+// open(), finish() and close() are called by the thread that is in begin() and end(); fail() by any, for a failure of
+// this rank or one that another has told; vote() by any that may have brought about the last thing to wait for;
+// decide() by the one that takes the result of the vote. close() is right in every state: in Voted and before when the
+// transport has failed, so that no verdict comes.
+#pragma once
+
+#include <dfb/comm/message.hpp>
+
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <cstdint>
+#include <mutex>
+#include <optional>
+#include <utility>
+#include <vector>
+
+namespace dfb::detail {
+
+enum class FrameState : std::uint8_t {
+    Closed,    // before begin() and after end()
+    Rendering, // end() was not called yet
+    Finishing, // end() waits for the tiles that this rank owns and, on the display rank, for those of the others
+    Failed,    // on this rank or another; this rank has not voted yet
+    Voted,     // this rank has said how the frame went for it, and waits for the others
+    Decided    // all ranks have: what still runs may come to its end
+};
+
+// All members may be called from any thread, but for open(), finish() and close(): one at a time.
+class OpenFrame {
+public:
+    struct Message {
+        int source;
+        MessageHeader header;
+        Buffer bytes;
+    };
+
+    // Frames are numbered from `first`, every `step`.
+    explicit OpenFrame(std::int64_t first = 1, std::int64_t step = 1) : number_(first - step), step_(step)
+    {
+        for (std::vector<Message>* messages : {&early_, &opened_})
+            messages->reserve(256); // how many come early depends on time: mostly no more
+    }
+
+    FrameState state() const noexcept { return state_; }
+    // The last frame that was opened; not positive before the first. And the one that comes next.
+    std::int64_t number() const noexcept { return number_; }
+    std::int64_t next() const noexcept { return number_ + step_; }
+
+    // ---- transitions
+
+    // Opens the next frame and returns the messages that came too early for it, to be taken before the next open().
+    // Throws InvalidArgument unless it is closed.
+    std::vector<Message>& open()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (state_ != FrameState::Closed)
+            throw InvalidArgument("begin() while a frame is open: end() it first");
+        number_ += step_;
+        state_ = FrameState::Rendering;
+        error_.reset();
+        failed_ = damaged_ = isTold_ = false;
+        tilesLeft_ = 0;
+        areTilesKnown_ = areTilesFinished_ = false;
+        opened_.clear();
+        opened_.swap(early_);
+        return opened_;
+    }
+
+    // end() was called.
+    void finish()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (state_ == FrameState::Rendering)
+            state_ = FrameState::Finishing;
+    }
+
+    struct Failure {
+        bool isFirst = false; // nobody has told the other ranks yet
+        bool inTime = false;  // this rank's vote will say so
+    };
+    // The frame has failed here. The first reason counts.
+    Failure fail(const ErrorInfo& info)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        Failure result;
+        result.isFirst = !std::exchange(isTold_, true);
+        result.inTime = failNow(info);
+        return result;
+    }
+    // The same, by word of another rank, which has told all.
+    void failElsewhere(const ErrorInfo& info)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        isTold_ = true;
+        failNow(info);
+    }
+    // Something was lost, but the frame goes on: the vote says so. False if this rank has voted: then it does not.
+    bool note(const ErrorInfo& info)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (!error_)
+            error_ = info;
+        return isBeforeVote();
+    }
+
+    // Makes this rank vote, once: when it has called end() and `isDone()`, or the frame has failed, and `may()`. True
+    // if it is to vote now.
+    template <class IsDone, class May>
+    bool vote(const IsDone& isDone, const May& may)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const bool isReady = state_ == FrameState::Failed || (state_ == FrameState::Finishing && isDone());
+        if (!isReady || !may())
+            return false;
+        state_ = FrameState::Voted;
+        return true;
+    }
+
+    // The verdict of all ranks is here.
+    void decide()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (state_ == FrameState::Voted)
+            state_ = FrameState::Decided;
+    }
+
+    // Lets nothing more in, and waits until all have left. `help()` runs what some of them may be waiting for, and is
+    // false if there is nothing.
+    template <class Help>
+    void close(const Help& help)
+    {
+        std::unique_lock<std::mutex> lock(mutex_);
+        state_ = FrameState::Closed;
+        while (inside_ > 0) {
+            lock.unlock();
+            const bool did = help();
+            lock.lock();
+            if (!did)
+                empty_.wait_for(lock, std::chrono::milliseconds(2), [this] { return inside_ == 0; });
+        }
+    }
+
+    // ---- how it goes
+
+    // It has failed on some rank, as far as this one knows. After close(): the last one had.
+    bool failed() const noexcept { return failed_.load(std::memory_order_relaxed); }
+    // A message was damaged, here or where the frame failed first: it may be one that the verdict needs.
+    bool isDamaged() const noexcept { return damaged_; }
+    // The first thing that went wrong as far as this rank knows, also if the frame goes on without it.
+    std::optional<ErrorInfo> reason() const
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return error_;
+    }
+
+    // ---- the tiles of this rank
+
+    // So many more are to be finished.
+    void expectTiles(std::int64_t count)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        tilesLeft_ += count;
+    }
+    // One of them is. True if that was the last of all.
+    bool tileFinished()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        --tilesLeft_;
+        return finishesTiles();
+    }
+    // There are no more than have been expected. True if none is left.
+    bool expectNoMore()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        areTilesKnown_ = true;
+        return finishesTiles();
+    }
+    bool areTilesKnown() const noexcept { return areTilesKnown_; }
+    bool areTilesFinished() const noexcept { return areTilesFinished_; }
+    // To be called when what the last of them leaves to do is done, before vote().
+    void setTilesFinished() noexcept { areTilesFinished_ = true; }
+
+    // ---- what belongs to it
+
+    enum class Entry : std::uint8_t {
+        Inside, // it may be worked on now; leave() must follow
+        Kept,   // it belongs to the frame to come
+        Late,   // it is of no use any more, and has been counted
+        Absurd  // no rank can be so far ahead: a frame ends only when all ranks have begun it
+    };
+
+    Entry enter(int source, const MessageHeader& header, Buffer& message)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (header.number > next())
+            return Entry::Absurd;
+        if (header.number > number_) {
+            early_.push_back({source, header, std::move(message)});
+            return Entry::Kept;
+        }
+        if (header.number < number_ || state_ == FrameState::Closed) {
+            // Of control messages a late one is no sign of anything.
+            late_ += header.kind == MessageKind::Fragment || header.kind == MessageKind::FinishedTiles;
+            return Entry::Late;
+        }
+        ++inside_;
+        return Entry::Inside;
+    }
+
+    // For work that is no message: whether it may go on. leave() must follow if so.
+    bool enter(std::int64_t number)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const bool isOpen = number == number_ && state_ != FrameState::Closed;
+        inside_ += isOpen;
+        return isOpen;
+    }
+
+    // The same for work of whichever frame is open.
+    bool enterAny()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const bool isOpen = state_ != FrameState::Closed;
+        inside_ += isOpen;
+        return isOpen;
+    }
+
+    // Once more, by somebody who is inside, for work that goes on after he has left: close() waits for that, too, also
+    // if it has begun to wait already.
+    void enterAgain()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ++inside_;
+    }
+
+    void leave()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (--inside_ == 0)
+            empty_.notify_all();
+    }
+
+    void countLate() noexcept { ++late_; }
+    std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
+
+private:
+    // Under mutex_, as are the next ones.
+    bool isBeforeVote() const noexcept
+    {
+        return state_ == FrameState::Rendering || state_ == FrameState::Finishing || state_ == FrameState::Failed;
+    }
+    // True if this rank's vote will say so.
+    bool failNow(const ErrorInfo& info)
+    {
+        damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
+        if (!error_) // else one that the frame could bear, or the reason of an earlier call
+            error_ = info;
+        failed_ = true;
+        const bool inTime = isBeforeVote();
+        if (inTime)
+            state_ = FrameState::Failed;
+        return inTime;
+    }
+    bool finishesTiles() const noexcept { return areTilesKnown_ && tilesLeft_ == 0; }
+
+    mutable std::mutex mutex_;
+    std::condition_variable empty_;
+    std::atomic<FrameState> state_{FrameState::Closed};
+    std::atomic<std::int64_t> number_, late_{0};
+    std::int64_t step_;
+    std::atomic<bool> failed_{false}, damaged_{false};
+    std::atomic<bool> areTilesKnown_{false}, areTilesFinished_{false};
+    // Under mutex_:
+    std::optional<ErrorInfo> error_;
+    bool isTold_ = false; // to all ranks, by this one or another: the frame has failed
+    std::int64_t tilesLeft_ = 0;
+    int inside_ = 0;
+    std::vector<Message> early_, opened_; // for the next frame; for the one that is open
+};
+
+} // namespace dfb::detail
