@@ -123,6 +123,7 @@ public:
         c.format = dfb::OutputFormat::RGBA32F;
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<Op> fb(comm_, c);
+        dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
         bench::ExactImage exact{width};
         for (int i = 0; i < width * height; ++i) {
             dfb::testing::Pixel pixel;
@@ -138,7 +139,7 @@ public:
             s.config = config;
             s.output = "float";
             const auto bytes = std::make_shared<std::pair<std::int64_t, std::int64_t>>();
-            s.compositor.frame = [&fb, &accumulation, render, samples, threshold, bytes] {
+            s.compositor.frame = [&fb, &loop, &accumulation, render, samples, threshold, bytes] {
                 *bytes = {0, 0};
                 const auto take = [&](const dfb::FrameReport& report) {
                     bytes->first += report.bytesSent;
@@ -150,11 +151,10 @@ public:
                 if (threshold > 0) {
                     dfb::AdaptiveSampler sampler(fb.layout(), {threshold, 8, samples, 64});
                     while (!sampler.done())
-                        sampler.update(take(dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, render,
-                                                                     sampler.next(params))));
+                        sampler.update(take(loop.render(render, sampler.next(params))));
                 } else {
                     params.passes = samples;
-                    take(dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, render, params));
+                    take(loop.render(render, params));
                 }
             };
             s.compositor.floats = [&fb] { return fb.image().rgba32f(); };

@@ -220,6 +220,7 @@ public:
         config.format = c.format;
         config.executor = executor;
         FrameBuffer fb(connection, config);
+        dfb::ImageParallelLoop loop(fb);
         GathervImage plain(fb, comm_);
         const Renderer renderer(c.cost, 100e-6, stepsPerSecond_);
 
@@ -233,7 +234,7 @@ public:
                 bench::meet(comm_);
                 const double start = bench::now(), cpuBefore = bench::processCpuSeconds();
                 if (v == 0)
-                    dfb::renderImageParallel(fb, renderer);
+                    loop.render(renderer);
                 else
                     plain.render(renderer, v == 1 ? Waiting::Blocking : Waiting::Nap);
                 const double end = bench::now(), cpuSpent = bench::processCpuSeconds() - cpuBefore;

@@ -292,6 +292,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         world.add({static_cast<std::uint32_t>(rank),
                    {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
                     {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
+        dfb::DataParallelLoop loop(fb, world);
         const auto find = dfb::inPlace([&image](const dfb::Brick&, auto& view) {
             const std::size_t first = image.indexOf(view.region.x0, view.region.y0);
             view.stride = static_cast<std::size_t>(image.width);
@@ -304,7 +305,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
             counters->received[rank].reset();
             counters->meet();
             const double start = bench::now(), cpu = bench::processCpuSeconds();
-            const dfb::FrameReport report = dfb::renderDataParallel(fb, world, PixelCamera(), find);
+            const dfb::FrameReport report = loop.render(PixelCamera(), find);
             counters->meet();
             if (rank == 0) {
                 result.report = report;

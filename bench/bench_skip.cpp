@@ -159,10 +159,14 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
+        dfb::DataParallelLoop loop(fb, world);
         std::optional<dfb::SharedWorld> shared; // all bricks, front to back
+        dfb::RoundRobinBricks owner;
+        std::optional<dfb::OrderedLoop<FrameBuffer, dfb::RoundRobinBricks>> orderedLoop;
         std::vector<int> order;
         if constexpr (TileOp::rule == dfb::BlendRule::InOrder) {
             shared.emplace(fb, world);
+            orderedLoop.emplace(fb, *shared, owner);
             order.resize(shared->bricks().size());
             std::iota(order.begin(), order.end(), 0);
         }
@@ -182,12 +186,10 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
             const double start = bench::now();
             dfb::FrameParams params;
             params.maxLayers = ranks;
-            if constexpr (TileOp::rule == dfb::BlendRule::InOrder) {
-                dfb::RoundRobinBricks owner;
-                dfb::renderOrdered(fb, *shared, PixelCamera(), order, owner, find, params);
-            } else {
-                dfb::renderDataParallel(fb, world, PixelCamera(), find, params);
-            }
+            if constexpr (TileOp::rule == dfb::BlendRule::InOrder)
+                orderedLoop->render(PixelCamera(), order, find, params);
+            else
+                loop.render(PixelCamera(), find, params);
             const double end = bench::now();
             counters->meet();
             if (rank != 0)
@@ -279,6 +281,7 @@ Sampling sample(int width, int height)
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(fb.rank(), {0, 0, width, height});
+        dfb::DataParallelLoop loop(fb, world);
         dfb::AdaptiveSampler sampler(fb.layout(), {0.02, 4, 256, 64});
         dfb::SamplePlan plan;
         const auto render = [&](const dfb::Brick& brick, auto& tile) {
@@ -302,7 +305,7 @@ Sampling sample(int width, int height)
             counters->meet();
             dfb::FrameParams params = sampler.next();
             plan = params.samples;
-            sampler.update(dfb::renderDataParallel(fb, world, PixelCamera(), render, params));
+            sampler.update(loop.render(PixelCamera(), render, params));
             counters->meet();
         };
         int frames = 0;

@@ -16,6 +16,7 @@
 #include <functional>
 #include <limits>
 #include <memory>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -146,6 +147,7 @@ public:
         config_.format = dfb::OutputFormat::RGBA32F;
         ordered_ = std::make_unique<Ordered>(connection_, config_);
         shared_ = std::make_unique<dfb::SharedWorld>(*ordered_, world_);
+        orderedLoop_.emplace(*ordered_, *shared_, owner_);
         for (const dfb::PerspectiveCamera& camera : orbitOf(viewCount, grid_.size(), 1.9f)) {
             MarchedView view{camera, {}};
             for (const int brick : dfb::visibilityOrder(*shared_, camera.eye()))
@@ -168,8 +170,7 @@ public:
         const auto report = std::make_shared<dfb::FrameReport>();
         return {name,
                 [this, report](const MarchedView& view) {
-                    dfb::RoundRobinBricks owner;
-                    auto frame = dfb::startOrdered(*ordered_, *shared_, view.camera, view.order, owner, renderer(view));
+                    auto frame = orderedLoop_->start(view.camera, view.order, renderer(view));
                     const double rendered = now();
                     *report = frame.end();
                     return rendered;
@@ -181,11 +182,13 @@ public:
     // dfb as in the paper: what comes is sorted. Collective.
     MarchedSystem sorted(const std::string& name)
     {
-        const auto fb = std::make_shared<dfb::DistributedFrameBuffer<dfb::AlphaBlend>>(connection_, config_);
+        using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
+        const auto fb = std::make_shared<FrameBuffer>(connection_, config_);
+        const auto loop = std::make_shared<dfb::DataParallelLoop<FrameBuffer>>(*fb, world_);
         const auto report = std::make_shared<dfb::FrameReport>();
         return {name,
-                [this, fb, report](const MarchedView& view) {
-                    auto frame = dfb::startDataParallel(*fb, world_, view.camera, renderer(view));
+                [this, loop, report](const MarchedView& view) {
+                    auto frame = loop->start(view.camera, renderer(view));
                     const double rendered = now();
                     *report = frame.end();
                     return rendered;
@@ -271,6 +274,8 @@ private:
     dfb::World world_;
     std::unique_ptr<Ordered> ordered_;
     std::unique_ptr<dfb::SharedWorld> shared_;
+    dfb::RoundRobinBricks owner_;
+    std::optional<dfb::OrderedLoop<Ordered, dfb::RoundRobinBricks>> orderedLoop_;
     std::vector<MarchedView> views_;
     std::vector<float> image_; // what IceT is given
 };

@@ -38,8 +38,9 @@ public:
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::ImageParallel>;
         hold(whole, {{0, 0, 0}, unit});
-        return wayOf<FrameBuffer>("dfb", name, format, [this, distribution](FrameBuffer& fb, int view) {
-            return dfb::startImageParallel(fb, distribution, [&](auto& tile) { render(whole, view, tile); });
+        return wayOf<FrameBuffer>("dfb", name, format, [this, distribution](FrameBuffer& fb) {
+            const auto loop = std::make_shared<dfb::ImageParallelLoop<FrameBuffer>>(fb, distribution);
+            return [this, loop](int view) { return loop->start([&](auto& tile) { render(whole, view, tile); }); };
         });
     }
 
@@ -47,9 +48,13 @@ public:
     PaperWay dataParallel(const std::string& name, dfb::OutputFormat format)
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
-        return wayOf<FrameBuffer>("dfb", name, format, [this, world = worldOf(1)](FrameBuffer& fb, int view) {
-            return dfb::startDataParallel(fb, world, camera(view),
-                                          [&](const dfb::Brick& brick, auto& tile) { render(brick.id, view, tile); });
+        return wayOf<FrameBuffer>("dfb", name, format, [this](FrameBuffer& fb) {
+            const auto world = std::make_shared<dfb::World>(worldOf(1));
+            const auto loop = std::make_shared<dfb::DataParallelLoop<FrameBuffer>>(fb, *world);
+            return [this, world, loop](int view) {
+                return loop->start(camera(view),
+                                   [&](const dfb::Brick& brick, auto& tile) { render(brick.id, view, tile); });
+            };
         });
     }
 
@@ -60,19 +65,19 @@ public:
     {
         using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
         const auto owner = std::make_shared<Owner>();
-        const auto world = std::make_shared<std::unique_ptr<dfb::SharedWorld>>();
-        PaperWay way = wayOf<FrameBuffer>(
-            "dfb", name, format, [this, owner, world, own = worldOf(bricksPerRank)](FrameBuffer& fb, int view) {
-                if (!*world)
-                    *world = std::make_unique<dfb::SharedWorld>(fb, own);
+        PaperWay way = wayOf<FrameBuffer>("dfb", name, format, [this, owner, bricksPerRank](FrameBuffer& fb) {
+            const auto world = std::make_shared<dfb::SharedWorld>(fb, worldOf(bricksPerRank));
+            const auto loop = std::make_shared<dfb::MixedParallelLoop<FrameBuffer, Owner>>(fb, *world, *owner);
+            return [this, owner, world, loop](int view) {
                 // Its cost is CPU time, which says the same where ranks share cores.
                 const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
                     const double before = threadCpuSeconds();
                     render(brick.id, view, tile);
                     return 1e9 * (threadCpuSeconds() - before);
                 };
-                return dfb::startMixedParallel(fb, **world, camera(view), *owner, renderBrick);
-            });
+                return loop->start(camera(view), renderBrick);
+            };
+        });
         if constexpr (std::is_same_v<Owner, dfb::MeasuredCostBricks>)
             way.frame = [frame = way.frame, report = way.report, owner](int view) {
                 const double rendered = frame(view);
@@ -143,9 +148,9 @@ private:
         bricks_.at(id)->render(camera(view), to);
     }
 
-    // `start(framebuffer, view)` begins a frame and renders this rank's part of it.
-    template <class FrameBuffer, class Start>
-    PaperWay wayOf(const std::string& system, const std::string& name, dfb::OutputFormat format, Start start)
+    // `loopOf(framebuffer)` returns what begins a frame of a view and renders this rank's part of it.
+    template <class FrameBuffer, class LoopOf>
+    PaperWay wayOf(const std::string& system, const std::string& name, dfb::OutputFormat format, const LoopOf& loopOf)
     {
         dfb::FrameBufferConfig config = config_;
         config.format = format;
@@ -154,8 +159,8 @@ private:
         PaperWay way;
         way.system = system;
         way.config = name;
-        way.frame = [fb, report, start](int view) {
-            auto frame = start(*fb, view);
+        way.frame = [fb, report, start = loopOf(*fb)](int view) {
+            auto frame = start(view);
             const double rendered = now();
             *report = frame.end();
             return rendered;

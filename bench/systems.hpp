@@ -142,13 +142,16 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
     struct Renderer {
         Renderer(const std::shared_ptr<Connection>& sharedConnection, const dfb::FrameBufferConfig& c,
                  const PartialImage& image)
-            : fb(sharedConnection, c), world(worldOf(image, fb.rank())), shared(fb, world)
+            : fb(sharedConnection, c), world(worldOf(image, fb.rank())), shared(fb, world), loop(fb, world),
+              orderedLoop(fb, shared, owner)
         {
         }
         FrameBuffer fb;
         dfb::World world;
         dfb::SharedWorld shared;
         dfb::RoundRobinBricks owner;
+        dfb::DataParallelLoop<FrameBuffer> loop;
+        dfb::OrderedLoop<FrameBuffer, dfb::RoundRobinBricks> orderedLoop;
         dfb::FrameReport report;
     };
     for (const bool toBytes : {false, true}) {
@@ -190,11 +193,11 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
                         for (std::size_t i = 0; i < r->shared.bricks().size(); ++i)
                             if (r->shared.bricks()[i].brick.id == static_cast<std::uint32_t>(rank))
                                 places.push_back(static_cast<int>(i));
-                    r->report = dfb::renderOrdered(r->fb, r->shared, PixelCamera(), places, r->owner, renderBrick);
+                    r->report = r->orderedLoop.render(PixelCamera(), places, renderBrick);
                 } else {
                     dfb::FrameParams params;
                     params.maxLayers = r->fb.size();
-                    r->report = dfb::renderDataParallel(r->fb, r->world, PixelCamera(), renderBrick, params);
+                    r->report = r->loop.render(PixelCamera(), renderBrick, params);
                 }
             };
             if (toBytes)

@@ -321,6 +321,8 @@ std::string run(MPI_Comm comm, const Options& options)
     const int begin = firstSlab(fb.rank()), end = firstSlab(fb.rank() + 1);
     GrayScott simulation(comm, n, firstLayer(begin), firstLayer(end), holder(begin - 1), holder(end));
 
+    dfb::World world; // what there is to be seen of this rank's slabs
+    dfb::DataParallelLoop loop(fb, world);
     double simulationTime = 0, renderingTime = 0;
     int frames = 0;
     std::string name;
@@ -333,7 +335,7 @@ std::string run(MPI_Comm comm, const Options& options)
             continue;
 
         simulation.prepareRendering();
-        dfb::World world;
+        world = {};
         for (int slab = begin; slab < end; ++slab) {
             const dfb::Box3 box = visibleBox(simulation.v(), firstLayer(slab), firstLayer(slab + 1));
             if (box.lower.z < box.upper.z)
@@ -348,7 +350,7 @@ std::string run(MPI_Comm comm, const Options& options)
         const auto renderBrick = [&](const dfb::Brick& brick, FrameBuffer::Tile& tile) {
             renderSlab(simulation, camera, light, brick.bounds, tile);
         };
-        dfb::renderDataParallel(fb, world, camera, renderBrick, params);
+        loop.render(camera, renderBrick, params);
 
         char number[16];
         std::snprintf(number, sizeof number, "_%04d.ppm", frames++);

@@ -12,7 +12,8 @@ int main(int argc, char** argv)
     const dfb::Vec3 center{rank - 1.5f, 0.3f * rank - 0.6f, -rank}, half{1, 1, 1};
     const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {center - half, center + half}}});
     const dfb::PerspectiveCamera camera({0, 1, 8}, {0, 0, 0}, {0, 1, 0}, 30);
-    dfb::renderDataParallel(fb, world, camera, [&](const dfb::Brick&, auto& tile) {
+    dfb::DataParallelLoop loop(fb, world);
+    loop.render(camera, [&](const dfb::Brick&, auto& tile) {
         tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
             const dfb::Vec3 way = center - camera.eye();
             const float middle = dot(camera.direction(x + 0.5, y + 0.5, 640, 320), way);

@@ -22,10 +22,10 @@ set(level_7 comm/mpi_session.hpp detail/frame_terms.hpp detail/job_share.hpp det
             ops/sort_last.hpp pixel_op.hpp render/image_parallel.hpp render/sampling.hpp render/visibility.hpp
             testing/fault_transport.hpp)
 set(level_8 detail/finished_record.hpp detail/operations.hpp ops/image_parallel.hpp ops/pixel_ops.hpp
-            ops/progressive.hpp render/cameras.hpp render/data_parallel.hpp render/deep_parallel.hpp
-            render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp)
+            ops/progressive.hpp render/cameras.hpp render/data_parallel.hpp render/shared_world.hpp
+            testing/tile_op_test.hpp testing/verified.hpp)
 set(level_9 detail/engine.hpp detail/final_gather.hpp detail/tile_table.hpp detail/verdict.hpp
-            render/mixed_parallel.hpp testing/adversarial.hpp)
+            render/deep_parallel.hpp render/mixed_parallel.hpp testing/adversarial.hpp)
 set(level_10 detail/frame_figures.hpp detail/tile_pipeline.hpp detail/wall.hpp)
 set(level_11 detail/outcome.hpp display_wall.hpp)
 set(level_12 detail/frame_engine.hpp)

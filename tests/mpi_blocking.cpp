@@ -186,20 +186,22 @@ void renderAll(MPI_Comm communicator, dfb::Progress progress)
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>> fb(communicator, smallConfig(), options);
         const auto sum = fb.allReduce({1, fb.rank()}, decltype(fb)::Reduce::Sum);
         check(sum[0] == fb.size() && sum[1] == fb.size() * (fb.size() - 1) / 2, "allReduce() " + name);
+        dfb::ImageParallelLoop loop(fb);
         for (int frame = 0; frame < 3; ++frame) {
             const std::uint8_t red = static_cast<std::uint8_t>(51 * frame);
-            dfb::renderImageParallel(fb, [frame](auto& tile) { tile.fill({frame * 0.2f, 0, 0, 1}); });
-            checkPicture(fb, "renderImageParallel() " + name, {red, 0, 0, 255});
+            loop.render([frame](auto& tile) { tile.fill({frame * 0.2f, 0, 0, 1}); });
+            checkPicture(fb, "ImageParallelLoop " + name, {red, 0, 0, 255});
         }
     }
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>> fb(communicator, smallConfig(), options);
     const float z = static_cast<float>(fb.rank());
     const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {{-100, -100, z}, {100, 100, z + 0.5f}}}});
     const dfb::PerspectiveCamera camera({0, 0, -10}, {0, 0, 0}, {0, 1, 0}, 30);
+    dfb::DataParallelLoop loop(fb, world);
     for (const bool failing : {false, true, false}) {
         bool failed = false;
         try {
-            dfb::renderDataParallel(fb, world, camera, [&](const dfb::Brick&, auto& tile) {
+            loop.render(camera, [&](const dfb::Brick&, auto& tile) {
                 if (failing && fb.rank() == fb.size() - 1)
                     throw std::runtime_error("on purpose");
                 tile.forEachPixel([&](int, int, float* rgba, float& depth) {
@@ -210,9 +212,9 @@ void renderAll(MPI_Comm communicator, dfb::Progress progress)
         } catch (const dfb::FrameError&) {
             failed = true;
         }
-        check(failed == failing, "renderDataParallel() " + name + (failing ? " does not fail" : " fails"));
+        check(failed == failing, "DataParallelLoop " + name + (failing ? " does not fail" : " fails"));
         if (!failing)
-            checkPicture(fb, "renderDataParallel() " + name, {0, 255, 0, 255});
+            checkPicture(fb, "DataParallelLoop " + name, {0, 255, 0, 255});
     }
 }
 

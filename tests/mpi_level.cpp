@@ -71,7 +71,7 @@ std::uint8_t blueOf(int index) { return static_cast<std::uint8_t>(51 * (index % 
 template <class Fb>
 dfb::FrameReport renderTiles(Fb& fb, int frame)
 {
-    return dfb::renderImageParallel(fb, [&](auto& tile) {
+    return dfb::ImageParallelLoop(fb).render([&](auto& tile) {
         tile.fill({0, greenOf(frame) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
     });
 }
@@ -133,7 +133,7 @@ void wallAndSharedWorld()
             if (layout.ranks[static_cast<std::size_t>(d)] == connection->rank())
                 checkImage(wall.image(d), fb.layout(), frame, "display " + std::to_string(d), 40 * d);
 
-        dfb::renderMixedParallel(bricks, world, Flat(), inTurn, [&](const dfb::Brick& brick, auto& tile) {
+        dfb::MixedParallelLoop(bricks, world, inTurn).render(Flat(), [&](const dfb::Brick& brick, auto& tile) {
             const dfb::Region inside = dfb::intersection(tile.region, Flat().project(brick.bounds, 64, 32));
             tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
                 if (x < inside.x0 || x >= inside.x1 || y < inside.y0 || y >= inside.y1)
@@ -176,7 +176,7 @@ void otherThread()
     check(has(begin, owner), "begin() on another thread", begin);
     const std::string reduce = invalidArgumentOf([&] { fb.allReduce({1}, FrameBuffer::Reduce::Sum); });
     check(has(reduce, owner), "allReduce() on another thread", reduce);
-    auto frame = dfb::startImageParallel(fb, dfb::WorkDistribution::Owned, [](auto& tile) {
+    auto frame = dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Owned).start([](auto& tile) {
         tile.fill({0, greenOf(2) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
     });
     const std::string end = invalidArgumentOf([&] { frame.end(); });
@@ -196,8 +196,9 @@ void smallPool()
     std::vector<int> mine;
     for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
         mine.push_back(tile);
+    dfb::ImageParallelLoop loop(fb, mine);
     for (int frame = 0; frame < 3; ++frame) {
-        dfb::renderImageParallel(fb, mine, [&](auto& tile) {
+        loop.render([&](auto& tile) {
             tile.fill({0, greenOf(frame) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
             fb.poll();
         });

@@ -34,7 +34,7 @@ void ranks()
         dfb::FrameBufferConfig config{128, 128};
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator, config);
-        dfb::renderImageParallel(fb, [](auto& tile) {
+        dfb::ImageParallelLoop(fb).render([](auto& tile) {
             write();
             tile.fill({0, 0, 0, 1});
         });

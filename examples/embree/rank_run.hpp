@@ -383,6 +383,13 @@ private:
         return report;
     }
 
+    // The loop, made for the first frame.
+    template <class Loop, class... Arguments>
+    static Loop& once(std::optional<Loop>& loop, Arguments&&... arguments)
+    {
+        return loop ? *loop : loop.emplace(std::forward<Arguments>(arguments)...);
+    }
+
     // Renders what this rank has to.
     typename FrameBuffer::Frame startFrame(int frame, const dfb::World& world, const dfb::FrameParams& params,
                                            ProgressLine& progress)
@@ -406,34 +413,35 @@ private:
             return count(scene_->of(brick.id).front().renderTile(tile, frame));
         };
         if constexpr (is_deep_v<TileOp>) {
-            return dfb::startDeepParallel(
-                *fb_, world, camera, std::max(1, o_.deep),
-                [&](const dfb::Brick& brick, dfb::DeepTile& deep) {
-                    std::int64_t cost = 0;
-                    for (const Renderer& cell : scene_->of(brick.id))
-                        cost += cell.renderDeep(deep, frame);
-                    count(cost);
-                },
-                params, tileData, pixelData);
+            return once(deepLoop_, *fb_, world, std::max(1, o_.deep))
+                .start(
+                    camera,
+                    [&](const dfb::Brick& brick, dfb::DeepTile& deep) {
+                        std::int64_t cost = 0;
+                        for (const Renderer& cell : scene_->of(brick.id))
+                            cost += cell.renderDeep(deep, frame);
+                        count(cost);
+                    },
+                    params, tileData, pixelData);
         } else if constexpr (is_single_v<TileOp>) {
             const auto distribution = o_.distribution == Distribution::Linear       ? dfb::WorkDistribution::Linear
                                       : o_.distribution == Distribution::RoundRobin ? dfb::WorkDistribution::RoundRobin
                                       : o_.distribution == Distribution::Dynamic    ? dfb::WorkDistribution::Dynamic
                                                                                     : dfb::WorkDistribution::Owned;
-            return dfb::startImageParallel(
-                *fb_, distribution,
-                [&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params, tileData,
-                pixelData);
+            return once(imageLoop_, *fb_, distribution)
+                .start([&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params,
+                       tileData, pixelData);
         } else if constexpr (std::is_same_v<TileOp, Ordered>) {
             const Vec3& eye = camera.pose().origin;
             const std::vector<int> order = dfb::visibilityOrder(*shared_, {eye.x, eye.y, eye.z});
-            return dfb::startOrdered(*fb_, *shared_, camera, order, inTurn_, renderBrick, params, tileData, pixelData);
+            return once(orderedLoop_, *fb_, *shared_, inTurn_)
+                .start(camera, order, renderBrick, params, tileData, pixelData);
         } else if (!shared_) {
-            return dfb::startDataParallel(*fb_, world, camera, renderBrick, params, tileData, pixelData);
+            return once(dataLoop_, *fb_, world).start(camera, renderBrick, params, tileData, pixelData);
         } else if (o_.balance == Balance::Cost) {
-            return dfb::startMixedParallel(*fb_, *shared_, camera, byCost_, renderBrick, params, tileData, pixelData);
+            return once(loopByCost_, *fb_, *shared_, byCost_).start(camera, renderBrick, params, tileData, pixelData);
         } else {
-            return dfb::startMixedParallel(*fb_, *shared_, camera, inTurn_, renderBrick, params, tileData, pixelData);
+            return once(loopInTurn_, *fb_, *shared_, inTurn_).start(camera, renderBrick, params, tileData, pixelData);
         }
     }
 
@@ -630,6 +638,12 @@ private:
     std::optional<dfb::SharedWorld> shared_;
     dfb::MeasuredCostBricks byCost_;
     dfb::RoundRobinBricks inTurn_;
+    std::optional<dfb::DataParallelLoop<FrameBuffer>> dataLoop_;
+    std::optional<dfb::DeepParallelLoop<FrameBuffer>> deepLoop_;
+    std::optional<dfb::ImageParallelLoop<FrameBuffer>> imageLoop_;
+    std::optional<dfb::MixedParallelLoop<FrameBuffer, dfb::MeasuredCostBricks>> loopByCost_;
+    std::optional<dfb::MixedParallelLoop<FrameBuffer, dfb::RoundRobinBricks>> loopInTurn_;
+    std::optional<dfb::OrderedLoop<FrameBuffer, dfb::RoundRobinBricks>> orderedLoop_;
     std::optional<dfb::AdaptiveSampler> sampler_;
     std::atomic<std::int64_t> tiles_{0}, work_{0}; // of this rank in this frame
     std::vector<FrameCounts> frames_;

@@ -112,7 +112,7 @@ public:
             info.message += " comes from rank " + std::to_string(std::min(rank, otherRank)) + " and from rank "
                             + std::to_string(std::max(rank, otherRank))
                             + ": a brick may be in the World of one rank only. If several hold it, use SharedWorld and "
-                              "renderMixedParallel()";
+                              "MixedParallelLoop";
         throw Error(std::move(info));
     }
 

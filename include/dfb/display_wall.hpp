@@ -33,7 +33,8 @@ struct ToWall {
 //   auto connection = dfb::connect<dfb::MpiTransport>(communicator);
 //   dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::SRGBA8);
 //   dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::ToWall> fb(connection, wall.frameBufferConfig(), {&wall});
-//   const auto report = dfb::renderDataParallel(fb, ...);
+//   dfb::DataParallelLoop loop(fb, world);
+//   const auto report = loop.render(...);
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //

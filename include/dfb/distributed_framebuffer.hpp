@@ -9,7 +9,6 @@
 #include <dfb/pixel_op.hpp>
 
 #include <algorithm>
-#include <any>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
@@ -101,10 +100,6 @@ public:
         // InvalidArgument, with nothing declared, for a tile outside the image, a second time in a frame, and in a
         // frame that was not begun so; without it, the frame fails in end().
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
-
-        // For a rendering loop to keep memory in that it needs in each frame: what it leaves there, a later frame finds
-        // there, unless another loop has come between.
-        std::any& loopMemory() const noexcept { return engine_->loopMemory(); }
 
         // As FrameParams::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
         void expectLayers(int layers) { engine_->expectLayers(layers); }

@@ -46,30 +46,33 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
     const auto renderFirst = [&](auto& tile) { renderBrick(s.bricks.front(), tile); };
     dfb::RoundRobinBricks inTurn{true};
     switch (loop) {
-    case Loop::ImageOwned: return dfb::renderImageParallel(fb, renderFirst, params);
+    case Loop::ImageOwned: return dfb::ImageParallelLoop(fb).render(renderFirst, params);
     case Loop::ImageRoundRobin:
-        return dfb::renderImageParallel(fb, dfb::WorkDistribution::RoundRobin, renderFirst, params);
-    case Loop::ImageDynamic: return dfb::renderImageParallel(fb, dfb::WorkDistribution::Dynamic, renderFirst, params);
-    case Loop::Mixed: return dfb::renderMixedParallel(fb, shared, scene::FlatCamera(), inTurn, renderBrick, params);
+        return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::RoundRobin).render(renderFirst, params);
+    case Loop::ImageDynamic:
+        return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Dynamic).render(renderFirst, params);
+    case Loop::Mixed:
+        return dfb::MixedParallelLoop(fb, shared, inTurn).render(scene::FlatCamera(), renderBrick, params);
     case Loop::Ordered: {
         std::vector<int> order(shared.bricks().size()); // by id, as they are in the scene
         std::iota(order.begin(), order.end(), 0);
-        return dfb::renderOrdered(fb, shared, scene::FlatCamera(), order, inTurn, renderBrick, params);
+        return dfb::OrderedLoop(fb, shared, inTurn).render(scene::FlatCamera(), order, renderBrick, params);
     }
     case Loop::Deep:
         if constexpr ((Tile::channels & dfb::farChannel) != 0)
-            return dfb::renderDeepParallel(
-                fb, world, scene::FlatCamera(), 1,
-                [&](const dfb::Brick& b, dfb::DeepTile& deep) {
-                    if (fails)
-                        throw std::runtime_error("on purpose");
-                    const dfb::Region& r = deep.header().region;
-                    for (int y = r.y0; y < r.y1; ++y)
-                        for (int x = r.x0; x < r.x1; ++x)
-                            if (const auto sample = sampleOf(s, b, deep.header().sample, x, y))
-                                deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
-                },
-                params);
+            return dfb::DeepParallelLoop(fb, world, 1)
+                .render(
+                    scene::FlatCamera(),
+                    [&](const dfb::Brick& b, dfb::DeepTile& deep) {
+                        if (fails)
+                            throw std::runtime_error("on purpose");
+                        const dfb::Region& r = deep.header().region;
+                        for (int y = r.y0; y < r.y1; ++y)
+                            for (int x = r.x0; x < r.x1; ++x)
+                                if (const auto sample = sampleOf(s, b, deep.header().sample, x, y))
+                                    deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
+                    },
+                    params);
         break;
     case Loop::Declared:
     case Loop::ByHand: {
@@ -105,7 +108,7 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
     }
     case Loop::Data: break;
     }
-    return dfb::renderDataParallel(fb, world, scene::FlatCamera(), renderBrick, params);
+    return dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), renderBrick, params);
 }
 
 // Of a scene of that many bricks, rule and seed; made once.

@@ -269,8 +269,8 @@ struct BlamedTree {
             dfb::ErrorInfo error;
             std::string text;
             try {
-                dfb::renderDataParallel(fb, dfb::World(bricks), scene::FlatCamera(),
-                                        [](const dfb::Brick&, auto& t) { t.pixel(0, 0)[3] = 1; });
+                dfb::DataParallelLoop(fb, dfb::World(bricks))
+                    .render(scene::FlatCamera(), [](const dfb::Brick&, auto& t) { t.pixel(0, 0)[3] = 1; });
             } catch (const dfb::FrameError& e) {
                 text = e.what();
                 error = e.info();
@@ -356,8 +356,8 @@ struct BlamedLoop {
             BrokenCamera camera;
             camera.isBroken = fb.rank() == culprit;
             const dfb::World world(scene::bricksOf(scene::makeScene(fb.size()), fb.rank(), fb.size()));
-            const std::string text =
-                scene::outcomeOf([&] { dfb::renderDataParallel(fb, world, camera, [](const dfb::Brick&, auto&) {}); });
+            const std::string text = scene::outcomeOf(
+                [&] { dfb::DataParallelLoop(fb, world).render(camera, [](const dfb::Brick&, auto&) {}); });
             expectText(result, "a camera", text,
                        {"FrameError: dfb: exception in user code: " + rankText(culprit), ": the lens is gone"});
             expectGoodFrame(result, fb, s, "a broken camera");

@@ -27,9 +27,10 @@ struct AuxChannels {
             config.aux = dfb::imageAuxChannels;
             dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
             const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
+            dfb::DataParallelLoop loop(fb, world);
             for (int frame = 0; frame < 2; ++frame) {
-                const auto report = dfb::renderDataParallel(
-                    fb, world, scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderWithAux(s, b, tile); },
+                const auto report = loop.render(
+                    scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderWithAux(s, b, tile); },
                     paramsOf(s));
                 if (!fb.isDisplayRank())
                     continue;
@@ -66,8 +67,7 @@ struct AuxImageParallel {
         config.aux = dfb::imageAuxChannels;
         std::atomic<std::int64_t> seen{0};
         dfb::DistributedFrameBuffer<Op, SeeAux, Transport> fb(communicator, config, {&seen});
-        dfb::renderImageParallel(
-            fb, [&](auto& tile) { renderWithAux(s, s.bricks[0], tile); }, paramsOf(s));
+        dfb::ImageParallelLoop(fb).render([&](auto& tile) { renderWithAux(s, s.bricks[0], tile); }, paramsOf(s));
         const std::int64_t all = fb.allReduce({seen.load()}, decltype(fb)::Reduce::Sum).front();
         if (fb.isDisplayRank()) {
             const std::size_t wrong = wrongAux(s, fb.image());
@@ -92,9 +92,10 @@ struct Nearest {
         const scene::Scene s = scene::makeScene(8, 9, 97, 61, 2);
         dfb::DistributedFrameBuffer<dfb::BasicDepthComposite<16>, dfb::NoPixelOp, Transport> fb(communicator,
                                                                                                 configOf(s, 2));
-        const auto report = dfb::renderDataParallel(
-            fb, dfb::World(bricksOf(s, fb.rank(), fb.size(), 3)), scene::FlatCamera(),
-            [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOf(s));
+        const auto report = dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size(), 3)))
+                                .render(
+                                    scene::FlatCamera(),
+                                    [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOf(s));
         if (!fb.isDisplayRank())
             return result;
         std::vector<dfb::testing::Pixel> expected;
@@ -211,8 +212,8 @@ struct BlackInFront {
         config.wire = format;
         config.aux = dfb::imageAuxChannels;
         dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(connection, config);
-        dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(), renderBrick,
-                                paramsOf(s));
+        dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+            .render(scene::FlatCamera(), renderBrick, paramsOf(s));
         if (!fb.isDisplayRank())
             return;
         const std::size_t wrong = wrongValues(fb.image(), s.background);

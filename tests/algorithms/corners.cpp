@@ -448,29 +448,20 @@ private:
         const auto renderFirst = [&](auto& tile) { renderOne(s.bricks.front(), tile); };
         const auto started = [&]() -> Frame {
             switch (loop_) {
-            case Loop::Mixed:
-                return dfb::startMixedParallel(fb_, world_, scene::FlatCamera(), inTurn_, renderOne, params, data,
-                                               pixelData);
+            case Loop::Mixed: return mixedLoop_.start(scene::FlatCamera(), renderOne, params, data, pixelData);
             case Loop::Ordered: {
                 std::vector<int> order(s.bricks.size()); // by id, as in the world
                 std::iota(order.begin(), order.end(), 0);
-                return dfb::startOrdered(fb_, world_, scene::FlatCamera(), order, inTurn_, renderOne, params, data,
-                                         pixelData);
+                return orderedLoop_.start(scene::FlatCamera(), order, renderOne, params, data, pixelData);
             }
-            case Loop::ImageOwned:
-                return dfb::startImageParallel(fb_, fb_.ownedTiles(), renderFirst, params, data, pixelData);
-            case Loop::ImageRoundRobin:
-                return dfb::startImageParallel(fb_, dfb::WorkDistribution::RoundRobin, renderFirst, params, data,
-                                               pixelData);
-            case Loop::ImageDynamic:
-                return dfb::startImageParallel(fb_, dfb::WorkDistribution::Dynamic, renderFirst, params, data,
-                                               pixelData);
+            case Loop::ImageOwned: return ownedLoop_.start(renderFirst, params, data, pixelData);
+            case Loop::ImageRoundRobin: return inTurnLoop_.start(renderFirst, params, data, pixelData);
+            case Loop::ImageDynamic: return dynamicLoop_.start(renderFirst, params, data, pixelData);
             case Loop::Deep: return startDeep(s, params, data, pixelData);
             case Loop::ByHand: return byHand(s, params, fault);
             case Loop::Data: break;
             }
-            return dfb::startDataParallel(fb_, dfb::World(mine_), scene::FlatCamera(), renderOne, params, data,
-                                          pixelData);
+            return dataLoop_.start(scene::FlatCamera(), renderOne, params, data, pixelData);
         };
         Frame frame = started();
         if (fault.phase == AtEnd)
@@ -495,8 +486,7 @@ private:
                         }
                 note(deep.header());
             };
-            return dfb::startDeepParallel(fb_, dfb::World(mine_), scene::FlatCamera(), 4, render, params, data,
-                                          pixelData);
+            return deepLoop_.start(scene::FlatCamera(), render, params, data, pixelData);
         } else {
             return begin(params);
         }
@@ -699,8 +689,15 @@ private:
     Result& result_;
     scene::Scene good_, other_; // frames that are to be right, and those that are not
     std::vector<dfb::Brick> mine_;
+    dfb::World own_{mine_};
     dfb::SharedWorld world_;
     dfb::RoundRobinBricks inTurn_;
+    dfb::ImageParallelLoop<FrameBuffer> ownedLoop_{fb_}, inTurnLoop_{fb_, dfb::WorkDistribution::RoundRobin},
+        dynamicLoop_{fb_, dfb::WorkDistribution::Dynamic};
+    dfb::DataParallelLoop<FrameBuffer> dataLoop_{fb_, own_};
+    dfb::DeepParallelLoop<FrameBuffer> deepLoop_{fb_, own_, 4};
+    dfb::MixedParallelLoop<FrameBuffer, dfb::RoundRobinBricks> mixedLoop_{fb_, world_, inTurn_};
+    dfb::OrderedLoop<FrameBuffer, dfb::RoundRobinBricks> orderedLoop_{fb_, world_, inTurn_};
     Trap trap_;
     std::uint64_t accumulation_ = 0;
     std::string name_;

@@ -126,10 +126,11 @@ struct Deep {
         };
 
         // All segments: exact.
+        dfb::DeepParallelLoop exact(fb, world, Interleaved::slots);
         for (const bool backToFront : {false, true}) {
             params.passes = 2;
-            const auto report = dfb::renderDeepParallel(
-                fb, world, scene::FlatCamera(), Interleaved::slots,
+            const auto report = exact.render(
+                scene::FlatCamera(),
                 [&](const dfb::Brick& b, dfb::DeepTile& deep) { scene.render(b, deep, backToFront); }, params);
             result.expect(report.orderUndefinedPixels == 0, "an order is said to be undefined");
             result.expect(report.mergeErrorBound == 0, "something was merged");
@@ -146,9 +147,11 @@ struct Deep {
         double boundBefore = 10;
         params.passes = 1;
         for (const int segments : {1, 2, 3, 5}) {
-            const auto report = dfb::renderDeepParallel(
-                fb, world, scene::FlatCamera(), segments,
-                [&](const dfb::Brick& b, dfb::DeepTile& deep) { scene.render(b, deep, false); }, params);
+            const auto report =
+                dfb::DeepParallelLoop(fb, world, segments)
+                    .render(
+                        scene::FlatCamera(),
+                        [&](const dfb::Brick& b, dfb::DeepTile& deep) { scene.render(b, deep, false); }, params);
             result.expect(report.mergeErrorBound > 0 && report.mergeErrorBound < boundBefore,
                           "a bound of " + std::to_string(report.mergeErrorBound) + " with " + std::to_string(segments));
             boundBefore = report.mergeErrorBound;

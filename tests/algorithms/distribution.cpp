@@ -47,9 +47,10 @@ struct Mixed {
             result.expect(result.hash == 0 || result.hash == picture.hash(), name + ": another image");
             result.hash = picture.hash();
         };
-        check(dfb::renderDataParallel(
-                  fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                  [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOf(s)),
+        check(dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                  .render(
+                      scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); },
+                      paramsOf(s)),
               "data-parallel");
         for (const int copies : {1, 2, fb.size()}) {
             const dfb::SharedWorld world(fb, replicated(s.bricks, fb.rank(), fb.size(), copies));
@@ -75,15 +76,15 @@ struct Mixed {
             for (const bool share : {false, true}) {
                 dfb::RoundRobinBricks owner{share};
                 const auto report =
-                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
+                    dfb::MixedParallelLoop(fb, world, owner).render(scene::FlatCamera(), render, paramsOf(s));
                 result.expect(report.figures.empty(), "costs that nobody wants");
                 check(report, name + ", round robin");
                 renderedOnce(name + ", round robin");
             }
             dfb::MeasuredCostBricks owner;
+            dfb::MixedParallelLoop loop(fb, world, owner);
             for (int frame = 0; frame < 3; ++frame) {
-                const auto report =
-                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
+                const auto report = loop.render(scene::FlatCamera(), render, paramsOf(s));
                 owner.update(report);
                 check(report, name + ", by cost");
                 renderedOnce(name + ", by cost");
@@ -139,17 +140,18 @@ struct Unbalanced {
         const auto slowest = [&] {
             return static_cast<double>(fb.allReduce({samples.exchange(0)}, decltype(fb)::Reduce::Max).front());
         };
-        dfb::renderDataParallel(fb, replicated(s.bricks, fb.rank(), fb.size(), 1), scene::FlatCamera(), render,
-                                paramsOf(s));
+        dfb::DataParallelLoop(fb, replicated(s.bricks, fb.rank(), fb.size(), 1))
+            .render(scene::FlatCamera(), render, paramsOf(s));
         const double dataParallel = slowest();
         const dfb::SharedWorld world(fb, replicated(s.bricks, fb.rank(), fb.size(), 2));
         dfb::RoundRobinBricks inTurn;
-        dfb::renderMixedParallel(fb, world, scene::FlatCamera(), inTurn, render, paramsOf(s));
+        dfb::MixedParallelLoop(fb, world, inTurn).render(scene::FlatCamera(), render, paramsOf(s));
         const double roundRobin = slowest();
         dfb::MeasuredCostBricks byCost;
-        byCost.update(dfb::renderMixedParallel(fb, world, scene::FlatCamera(), byCost, render, paramsOf(s)));
+        dfb::MixedParallelLoop loop(fb, world, byCost);
+        byCost.update(loop.render(scene::FlatCamera(), render, paramsOf(s)));
         slowest();
-        const auto report = dfb::renderMixedParallel(fb, world, scene::FlatCamera(), byCost, render, paramsOf(s));
+        const auto report = loop.render(scene::FlatCamera(), render, paramsOf(s));
         const double measured = slowest();
         if (fb.size() > 1) {
             const std::string text = std::to_string(dataParallel) + " samples on the slowest rank data-parallel, "
@@ -256,10 +258,10 @@ struct Ordered {
         dfb::RoundRobinBricks owner{copies > 1};
         const auto frame = [&](const auto& brickSource) {
             if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
-                return dfb::renderOrdered(fb, world, camera, dfb::visibilityOrder(world, eye), owner, brickSource,
-                                          params);
+                return dfb::OrderedLoop(fb, world, owner)
+                    .render(camera, dfb::visibilityOrder(world, eye), brickSource, params);
             else
-                return dfb::renderMixedParallel(fb, world, camera, owner, brickSource, params);
+                return dfb::MixedParallelLoop(fb, world, owner).render(camera, brickSource, params);
         };
         const dfb::FrameReport report = inPlace ? frame(findBrick) : frame(renderBrick);
         bytes = report.bytesSent;
@@ -318,9 +320,9 @@ struct WrongOwner {
         const auto frame = [&](Owner owner, const std::vector<int>& order, bool isOrdered) {
             return scene::outcomeOf([&] {
                 if (isOrdered)
-                    dfb::renderOrdered(inOrder, world, scene::FlatCamera(), order, owner, render, paramsOf(s));
+                    dfb::OrderedLoop(inOrder, world, owner).render(scene::FlatCamera(), order, render, paramsOf(s));
                 else
-                    dfb::renderMixedParallel(fb, world, scene::FlatCamera(), owner, render, paramsOf(s));
+                    dfb::MixedParallelLoop(fb, world, owner).render(scene::FlatCamera(), render, paramsOf(s));
             });
         };
         for (const bool isOrdered : {false, true}) {

@@ -47,6 +47,7 @@ struct Hidden {
         for (std::size_t place = 0; place < 6; ++place)
             order[world.bricks()[place].brick.id] = static_cast<int>(place);
         dfb::RoundRobinBricks owner;
+        dfb::OrderedLoop loop(fb, world, owner);
         std::atomic<int> rendered{0};
         const auto render = [&](const dfb::Brick& b, auto& tile) {
             ++rendered;
@@ -57,7 +58,7 @@ struct Hidden {
         };
         for (int frame = 0; frame < 5; ++frame) {
             rendered = 0;
-            dfb::renderOrdered(fb, world, scene::FlatCamera(), order, owner, render);
+            loop.render(scene::FlatCamera(), order, render);
             const std::int64_t all = fb.allReduce({rendered}, Fb<Transport>::Reduce::Sum)[0];
             // On a single rank at most one worker is at the tile while the other renders what hides it.
             const int tiles = fb.layout().tileCount();

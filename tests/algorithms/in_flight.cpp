@@ -66,6 +66,8 @@ struct LoopsInFlight {
         const dfb::SharedWorld shared(fb, world);
         dfb::RoundRobinBricks inTurn;
         const auto render = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
+        dfb::DataParallelLoop dataLoop(fb, world);
+        dfb::MixedParallelLoop mixedLoop(fb, shared, inTurn);
         std::deque<decltype(fb.begin())> open;
         for (int round = 0; round < 9; ++round) {
             if (open.size() == 3) {
@@ -78,9 +80,8 @@ struct LoopsInFlight {
                     result.hash = picture.hash();
                 }
             }
-            open.push_back(round % 2 == 0
-                               ? dfb::startDataParallel(fb, world, scene::FlatCamera(), render, paramsOf(s))
-                               : dfb::startMixedParallel(fb, shared, scene::FlatCamera(), inTurn, render, paramsOf(s)));
+            open.push_back(round % 2 == 0 ? dataLoop.start(scene::FlatCamera(), render, paramsOf(s))
+                                          : mixedLoop.start(scene::FlatCamera(), render, paramsOf(s)));
         }
         while (open.size() > 1) {
             open.front().end();
@@ -102,12 +103,11 @@ struct TwoFrameBuffers {
                                                                                                configOf(a, 1));
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::NoPixelOp, Transport> single(connection,
                                                                                                    configOf(b, 1));
+        dfb::ImageParallelLoop loop(single, dfb::WorkDistribution::Dynamic);
         for (int round = 0; round < 3; ++round) {
             auto frame = blend.begin(paramsOf(a));
             sendAll(blend, frame, a, false);
-            const auto other = dfb::renderImageParallel(
-                single, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(b, b.bricks[0], tile); },
-                paramsOf(b));
+            const auto other = loop.render([&](auto& tile) { renderBrick(b, b.bricks[0], tile); }, paramsOf(b));
             sendAll(blend, frame, a, true);
             const auto report = frame.end();
             if (!blend.isDisplayRank())

@@ -184,23 +184,24 @@ struct ChangingDeclarations {
         dfb::FrameParams params = paramsOf(s);
         params.timeoutMs = 20000; // nothing waits for it
         if (loop == Deep)
-            return dfb::startDeepParallel(
-                fb, world, camera, 1,
-                [&](const dfb::Brick& b, dfb::DeepTile& deep) {
-                    const dfb::Region& r = deep.header().region;
-                    for (int y = r.y0; y < r.y1; ++y)
-                        for (int x = r.x0; x < r.x1; ++x)
-                            if (const auto sample = sampleOf(s, find(b), 0, x, y))
-                                deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
-                },
-                params);
+            return dfb::DeepParallelLoop(fb, world, 1)
+                .start(
+                    camera,
+                    [&](const dfb::Brick& b, dfb::DeepTile& deep) {
+                        const dfb::Region& r = deep.header().region;
+                        for (int y = r.y0; y < r.y1; ++y)
+                            for (int x = r.x0; x < r.x1; ++x)
+                                if (const auto sample = sampleOf(s, find(b), 0, x, y))
+                                    deep.add(x, y, {sample->rgba, sample->depth, sample->depth});
+                    },
+                    params);
         if (loop == Mixed) {
             const dfb::SharedWorld shared(fb, world);
             dfb::RoundRobinBricks inTurn;
-            return dfb::startMixedParallel(fb, shared, camera, inTurn, render, params);
+            return dfb::MixedParallelLoop(fb, shared, inTurn).start(camera, render, params);
         }
         if (loop == Data)
-            return dfb::startDataParallel(fb, world, camera, render, params);
+            return dfb::DataParallelLoop(fb, world).start(camera, render, params);
         params.declared = true;
         auto frame = fb.begin(params);
         try {

@@ -85,9 +85,11 @@ struct PartialFrames {
             while (dfb::intersection(box, fb.layout().region(lost)).empty())
                 ++lost;
             constexpr int never = 20000, soon = 2000; // ms; enough for all but what is missing, on a busy machine
+            const dfb::World world(mine);
+            dfb::DataParallelLoop loop(fb, world);
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
                 params.timeoutMs = timeoutMs;
-                return dfb::renderDataParallel(fb, dfb::World(mine), scene::FlatCamera(), render, params, fails);
+                return loop.render(scene::FlatCamera(), render, params, fails);
             };
             const auto renderAll = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
             const std::set<int> one{lost}, none;

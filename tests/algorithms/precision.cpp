@@ -38,15 +38,16 @@ struct Precision {
             dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(connection, config);
             auto params = paramsOf(s);
             params.maxLayers = maxLayers;
-            const auto report = dfb::renderDataParallel(
-                fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                [&](const dfb::Brick& b, auto& tile) {
-                    if (inRange)
-                        renderInRange(s, b, tile);
-                    else
-                        renderBrick(s, b, tile);
-                },
-                params);
+            const auto report = dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                                    .render(
+                                        scene::FlatCamera(),
+                                        [&](const dfb::Brick& b, auto& tile) {
+                                            if (inRange)
+                                                renderInRange(s, b, tile);
+                                            else
+                                                renderBrick(s, b, tile);
+                                        },
+                                        params);
             std::vector<float> values;
             if (!fb.image().empty())
                 values.assign(fb.image().rgba32f(), fb.image().rgba32f() + 4 * fb.image().pixelCount());
@@ -116,24 +117,25 @@ struct OtherChannels {
             config.wire = format;
             config.aux = dfb::imageAuxChannels;
             dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(connection, config);
-            dfb::renderDataParallel(
-                fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                [&](const dfb::Brick& b, auto& tile) {
-                    renderInRange(s, b, tile);
-                    tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                        if (x % 3 == 0) // is rounded to 0, or not
-                            for (int c = 0; c < 4; ++c)
-                                rgba[c] *= x % 2 ? 0x1p-9f : 0x1p-45f;
-                        const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
-                        for (int c = 0; c < 3; ++c) {
-                            tile.normal[3 * i + c] = rgba[3] * normal[static_cast<std::size_t>(c)];
-                            tile.position[3 * i + c] = static_cast<float>(b.id) + static_cast<float>(c * x);
-                        }
-                        tile.primitiveId[i] = b.id % 2 ? b.id : dfb::noId;
-                        tile.instanceId[i] = b.id;
-                    });
-                },
-                paramsOf(s));
+            dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                .render(
+                    scene::FlatCamera(),
+                    [&](const dfb::Brick& b, auto& tile) {
+                        renderInRange(s, b, tile);
+                        tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+                            if (x % 3 == 0) // is rounded to 0, or not
+                                for (int c = 0; c < 4; ++c)
+                                    rgba[c] *= x % 2 ? 0x1p-9f : 0x1p-45f;
+                            const int i = (y - tile.region.y0) * 16 + x - tile.region.x0;
+                            for (int c = 0; c < 3; ++c) {
+                                tile.normal[3 * i + c] = rgba[3] * normal[static_cast<std::size_t>(c)];
+                                tile.position[3 * i + c] = static_cast<float>(b.id) + static_cast<float>(c * x);
+                            }
+                            tile.primitiveId[i] = b.id % 2 ? b.id : dfb::noId;
+                            tile.instanceId[i] = b.id;
+                        });
+                    },
+                    paramsOf(s));
             if (!fb.isDisplayRank())
                 continue;
             const dfb::Image& image = fb.image();

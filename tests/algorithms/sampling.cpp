@@ -46,13 +46,13 @@ struct Distributions {
                                         WorkDistribution::Dynamic, WorkDistribution::Dynamic}) {
             const std::string name = "distribution " + std::to_string(static_cast<int>(distribution));
             std::atomic<std::int64_t> rendered{0};
-            const auto report = dfb::renderImageParallel(
-                fb, distribution,
-                [&](auto& tile) {
-                    ++rendered;
-                    renderBrick(s, s.bricks[0], tile);
-                },
-                paramsOf(s));
+            const auto report = dfb::ImageParallelLoop(fb, distribution)
+                                    .render(
+                                        [&](auto& tile) {
+                                            ++rendered;
+                                            renderBrick(s, s.bricks[0], tile);
+                                        },
+                                        paramsOf(s));
             const std::int64_t all = fb.allReduce({rendered.load()}, decltype(fb)::Reduce::Sum).front();
             const std::int64_t most = fb.allReduce({rendered.load()}, decltype(fb)::Reduce::Max).front();
             result.expect(all == 28 * 3, name + ": " + std::to_string(all) + " tiles rendered");
@@ -86,17 +86,18 @@ struct Dynamic {
         ofOthers = 0;
         fb.allReduce({0}, decltype(fb)::Reduce::Sum); // so that nobody counts before
         std::atomic<std::int64_t> rendered{0};
-        const auto report = dfb::renderImageParallel(
-            fb, dfb::WorkDistribution::Dynamic,
-            [&](auto& tile) {
-                const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
-                while (isStuck && ofOthers <= fairShare && std::chrono::steady_clock::now() < limit)
-                    std::this_thread::yield();
-                ++rendered;
-                ofOthers += fb.rank() != 0;
-                renderBrick(s, s.bricks[0], tile);
-            },
-            paramsOf(s));
+        const auto report =
+            dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Dynamic)
+                .render(
+                    [&](auto& tile) {
+                        const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+                        while (isStuck && ofOthers <= fairShare && std::chrono::steady_clock::now() < limit)
+                            std::this_thread::yield();
+                        ++rendered;
+                        ofOthers += fb.rank() != 0;
+                        renderBrick(s, s.bricks[0], tile);
+                    },
+                    paramsOf(s));
         const auto all = fb.allReduce({rendered.load()}, decltype(fb)::Reduce::Sum).front();
         result.expect(all == jobs, std::to_string(all) + " tiles rendered of " + std::to_string(jobs));
         result.expect(!isStuck || rendered < jobs / fb.size(), std::to_string(rendered) + " tiles on the slow rank");
@@ -124,6 +125,8 @@ struct Accumulation {
             ++id;
             std::vector<int> taken(static_cast<std::size_t>(tiles), 0);
             dfb::FrameReport report;
+            dfb::DataParallelLoop dataLoop(fb, world);
+            dfb::ImageParallelLoop imageLoop(fb, dfb::WorkDistribution::RoundRobin);
             for (const int wanted : {3, 4, 9}) {
                 auto plan = std::make_shared<std::vector<dfb::TileSamples>>();
                 for (int t = 0; t < tiles; ++t) {
@@ -137,13 +140,11 @@ struct Accumulation {
                 params.samples = plan;
                 params.accumulationId = id;
                 if (isData)
-                    report = dfb::renderDataParallel(
-                        fb, world, scene::FlatCamera(),
-                        [&](const dfb::Brick& b, auto& tile) { renderSample(s, b, tile); }, params);
-                else
-                    report = dfb::renderImageParallel(
-                        fb, dfb::WorkDistribution::RoundRobin, [&](auto& tile) { renderSample(s, s.bricks[0], tile); },
+                    report = dataLoop.render(
+                        scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderSample(s, b, tile); },
                         params);
+                else
+                    report = imageLoop.render([&](auto& tile) { renderSample(s, s.bricks[0], tile); }, params);
                 if (wanted == 4)
                     result.expect(report.tilesTouched <= tiles - (tiles + 2) / 3,
                                   std::to_string(report.tilesTouched) + " tiles touched");
@@ -177,10 +178,10 @@ struct Reset {
         dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicImageParallel<16>>, dfb::NoPixelOp, Transport> fb(
             communicator, configOf(s, 1));
         dfb::AdaptiveSampler sampler(fb.layout(), {0, 2, 4, 2});
+        dfb::ImageParallelLoop loop(fb);
         dfb::FrameReport report;
         const auto render = [&] {
-            report = dfb::renderImageParallel(
-                fb, [&](auto& tile) { renderSample(s, s.bricks[0], tile); }, sampler.next(paramsOf(s)));
+            report = loop.render([&](auto& tile) { renderSample(s, s.bricks[0], tile); }, sampler.next(paramsOf(s)));
             sampler.update(report);
         };
         render();
@@ -274,9 +275,9 @@ struct Adaptive {
         NoisyFrameBuffer<Transport> fb(communicator, configOf(s));
         std::atomic<std::int64_t> rendered{0};
         dfb::AdaptiveSampler sampler(fb.layout(), {0.03, 8, 512, 64});
+        dfb::ImageParallelLoop inTurn(fb, dfb::WorkDistribution::RoundRobin);
         while (!sampler.done())
-            sampler.update(dfb::renderImageParallel(
-                fb, dfb::WorkDistribution::RoundRobin,
+            sampler.update(inTurn.render(
                 [&](auto& tile) {
                     ++rendered;
                     s.render(tile);
@@ -292,11 +293,11 @@ struct Adaptive {
         if (fb.isDisplayRank())
             result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
 
+        dfb::ImageParallelLoop owned(fb);
         dfb::AdaptiveSampler uniform(fb.layout(), {0, 8, 256, 8});
         std::int64_t needed = 0;
         while (!uniform.done()) {
-            uniform.update(dfb::renderImageParallel(
-                fb, [&](auto& tile) { s.render(tile); }, uniform.next()));
+            uniform.update(owned.render([&](auto& tile) { s.render(tile); }, uniform.next()));
             const bool enough = fb.isDisplayRank() && s.error(fb.image(), all) <= error;
             if (fb.allReduce({enough}, NoisyFrameBuffer<Transport>::Reduce::Max).front() != 0) {
                 needed = uniform.samplesTaken();
@@ -319,11 +320,11 @@ struct DarkCorners {
         NoisyScene s;
         s.probability = [](int x, int y) { return x % 16 >= 12 && y % 16 >= 12 ? 0.1 : 0.0; };
         NoisyFrameBuffer<Transport> fb(communicator, configOf(s));
+        dfb::ImageParallelLoop loop(fb);
         const double maxError = 0.015;
         dfb::AdaptiveSampler sampler(fb.layout(), {maxError, 8, 4096, 64});
         while (!sampler.done())
-            sampler.update(dfb::renderImageParallel(
-                fb, [&](auto& tile) { s.render(tile); }, sampler.next()));
+            sampler.update(loop.render([&](auto& tile) { s.render(tile); }, sampler.next()));
         if (!fb.isDisplayRank())
             return result;
         result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());

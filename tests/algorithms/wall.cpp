@@ -84,16 +84,16 @@ struct Wall {
         const auto data = [&](auto& fb, int frame) {
             const scene::Scene s =
                 scene::makeScene(3, static_cast<std::uint64_t>(frame + 4), fb.config().width, fb.config().height);
-            return dfb::renderDataParallel(
-                fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, paramsOfFrame(frame));
+            return dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                .render(
+                    scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); },
+                    paramsOfFrame(frame));
         };
         const auto image = [&](auto& fb, int frame) {
             const scene::Scene s =
                 scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().width, fb.config().height);
-            return dfb::renderImageParallel(
-                fb, dfb::WorkDistribution::RoundRobin, [&](auto& tile) { renderBrick(s, s.bricks[0], tile); },
-                paramsOfFrame(frame));
+            return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::RoundRobin)
+                .render([&](auto& tile) { renderBrick(s, s.bricks[0], tile); }, paramsOfFrame(frame));
         };
         check<dfb::BasicAlphaBlend<16>, Transport>(connection, dealt({2, 2, 40, 30, 0, 0, {}}, 0),
                                                    dfb::OutputFormat::RGBA32F, result, "2x2", data);
@@ -126,10 +126,10 @@ struct WallProgressive {
         FrameBufferOf<Op, dfb::PixelOpChain<dfb::ToneMap, dfb::ToWall>, Transport> fb(
             connection, config, {dfb::ToneMap{}, dfb::ToWall{&wall}});
         dfb::AdaptiveSampler sampler(fb.layout(), {0.05, 2, 16, 4});
+        dfb::ImageParallelLoop loop(fb);
         const auto render = [&](bool fails) {
             // Noise on the left, where it takes many samples, none on the right.
-            const auto report = dfb::renderImageParallel(
-                fb,
+            const auto report = loop.render(
                 [&](auto& tile) {
                     tile.forEachPixel([&](int x, int y, float* rgba, float&) {
                         const bool lit =

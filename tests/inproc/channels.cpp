@@ -44,6 +44,10 @@ void render(FrameBuffer<Op>& fb, const scene::Scene& s, bool accumulates,
     std::vector<int> order;
     for (std::size_t i = 0; i < s.bricks.size(); ++i)
         order.push_back(static_cast<int>(i));
+    dfb::RoundRobinBricks owner;
+    dfb::ImageParallelLoop image(fb);
+    dfb::OrderedLoop ordered(fb, shared, owner);
+    dfb::MixedParallelLoop mixed(fb, shared, owner);
     for (int frame = 0; frame < (accumulates ? s.passes : 1); ++frame) {
         dfb::FrameParams params = paramsOf(s);
         if (accumulates) {
@@ -56,14 +60,12 @@ void render(FrameBuffer<Op>& fb, const scene::Scene& s, bool accumulates,
             renderWithAux(s, b, tile);
             tile.pass = pass;
         };
-        dfb::RoundRobinBricks owner;
         if (s.bricks.size() == 1)
-            dfb::renderImageParallel(
-                fb, [&](auto& tile) { renderBrick(s.bricks[0], tile); }, params, data);
+            image.render([&](auto& tile) { renderBrick(s.bricks[0], tile); }, params, data);
         else if (s.rule == dfb::BlendRule::InOrder)
-            dfb::renderOrdered(fb, shared, scene::FlatCamera(), order, owner, renderBrick, params, data);
+            ordered.render(scene::FlatCamera(), order, renderBrick, params, data);
         else
-            dfb::renderMixedParallel(fb, shared, scene::FlatCamera(), owner, renderBrick, params, data);
+            mixed.render(scene::FlatCamera(), renderBrick, params, data);
     }
 }
 
@@ -127,14 +129,14 @@ TEST_CASE("Positions of single passes in order need no depth at all, several pas
                 config.depth = false;
                 config.aux = dfb::positionChannel;
                 FrameBuffer<Single> fb(communicator, config);
-                dfb::renderImageParallel(fb, dfb::inPlace([&](auto& view) {
-                                             const auto at =
-                                                 static_cast<std::size_t>(view.region.y0 * 61 + view.region.x0);
-                                             view.stride = 61;
-                                             view.color = &color[4 * at];
-                                             view.position = &position[3 * at];
-                                         }),
-                                         paramsOf(s));
+                dfb::ImageParallelLoop(fb).render(dfb::inPlace([&](auto& view) {
+                                                      const auto at = static_cast<std::size_t>(view.region.y0 * 61
+                                                                                               + view.region.x0);
+                                                      view.stride = 61;
+                                                      view.color = &color[4 * at];
+                                                      view.position = &position[3 * at];
+                                                  }),
+                                                  paramsOf(s));
                 wrong = 0;
                 for (std::size_t i = 0; i < position.size(); ++i)
                     wrong += fb.image().position()[i] != position[i];

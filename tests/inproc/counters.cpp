@@ -116,8 +116,9 @@ dfb::FrameReport cost(int rows)
             view.color = &rgba[4 * first];
             view.depth = &depths[first];
         });
+        dfb::DataParallelLoop loop(fb, world);
         for (int frame = 0; frame < frames; ++frame) {
-            const dfb::FrameReport report = dfb::renderDataParallel(fb, world, WholeImage(), find);
+            const dfb::FrameReport report = loop.render(WholeImage(), find);
             if (fb.isDisplayRank())
                 result = report;
         }
@@ -183,6 +184,7 @@ TEST_CASE("A tile that has converged is not rendered, and nothing of it travels"
         Fb fb(communicator, config);
         dfb::World world;
         world.add({static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {1, 1, 1}}});
+        dfb::DataParallelLoop loop(fb, world);
         int taken = 0;
         for (const int step : {1, 2, 0}) { // all tiles, every second one, none
             dfb::FrameParams params;
@@ -193,8 +195,8 @@ TEST_CASE("A tile that has converged is not rendered, and nothing of it travels"
                            step > 0 && t % static_cast<std::size_t>(step) == 0 ? 2 : 0};
             taken += 2;
             params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(plan);
-            const dfb::FrameReport report = dfb::renderDataParallel(
-                fb, world, WholeImage(),
+            const dfb::FrameReport report = loop.render(
+                WholeImage(),
                 [&](const dfb::Brick& brick, auto& tile) {
                     ++calls;
                     wrongCalls += plan[static_cast<std::size_t>(tile.tile)].count == 0;
@@ -244,11 +246,13 @@ TEST_CASE("A rank tells owners of its inputs if they have changed, and only thos
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
+        dfb::World world;
+        dfb::DataParallelLoop loop(fb, world);
         const auto frame = [&](std::uint32_t id, bool isThere, const auto& camera) {
-            dfb::World world;
+            world = {};
             if (isThere)
                 world.add({id, {{0, 0, 0}, {1, 1, 1}}});
-            const auto report = dfb::renderDataParallel(fb, world, camera, [](const dfb::Brick&, auto&) {});
+            const auto report = loop.render(camera, [](const dfb::Brick&, auto&) {});
             if (fb.isDisplayRank())
                 messages.push_back(report.messagesSent);
         };
@@ -382,7 +386,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
         const auto depth = static_cast<float>(fb.rank());
         const auto worldOf = [&](std::uint32_t id) { return dfb::World({{id, {{0, 0, depth}, {1, 1, depth + 1}}}}); };
         const auto id = static_cast<std::uint32_t>(rank);
-        const dfb::World worlds[2] = {worldOf(id), worldOf(declaresAnew ? id + 100 : id)};
+        dfb::World worlds[2] = {worldOf(id), worldOf(declaresAnew ? id + 100 : id)};
         const dfb::SharedWorld shared(fb, worlds[0]);
         dfb::RoundRobinBricks owner;
         std::vector<int> order(static_cast<std::size_t>(rankCount));
@@ -396,12 +400,13 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
             view.depth = &depths[first];
         };
         dfb::FrameParams params;
-        int begun = 0;
+        dfb::OrderedLoop orderedLoop(fb, shared, owner);
+        dfb::DataParallelLoop loop(fb, worlds[0]);
         const auto start = [&] {
             if constexpr (isOrdered)
-                return dfb::startOrdered(fb, shared, WholeImage(), order, owner, dfb::inPlace(find), params);
+                return orderedLoop.start(WholeImage(), order, dfb::inPlace(find), params);
             else
-                return dfb::startDataParallel(fb, worlds[begun++ % 2], WholeImage(), dfb::inPlace(find), params);
+                return loop.start(WholeImage(), dfb::inPlace(find), params);
         };
 
         // By the worker.
@@ -447,6 +452,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
             meet();
             const std::int64_t before = allocations;
             meet();
+            std::swap(worlds[0], worlds[1]);
             start().end();
             meet();
             if (fb.isDisplayRank())
@@ -492,10 +498,11 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
                 depth = static_cast<float>(brick.id);
             });
         };
+        dfb::DataParallelLoop loop(fb, world);
         std::vector<std::int64_t> counts(10);
         for (std::int64_t& count : counts) {
             const std::int64_t before = allocations;
-            dfb::renderDataParallel(fb, world, WholeImage(), render);
+            loop.render(WholeImage(), render);
             count = allocations - before;
         }
         CHECK(counts[0] > 0);

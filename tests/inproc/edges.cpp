@@ -138,13 +138,12 @@ TEST_CASE("A frame of 65536 x 32768 pixels, 32 GiB in float, that no rank displa
         config.depth = false;
         FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
         reports[static_cast<std::size_t>(fb.rank())] =
-            dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                                    [&](const dfb::Brick& b, auto& tile) {
-                                        const dfb::Region r =
-                                            dfb::intersection(tile.region, scene::FlatCamera().project(b.bounds, 0, 0));
-                                        pixels += static_cast<std::int64_t>(r.width()) * r.height();
-                                        renderBrick(s, b, tile);
-                                    });
+            dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                .render(scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) {
+                    const dfb::Region r = dfb::intersection(tile.region, scene::FlatCamera().project(b.bounds, 0, 0));
+                    pixels += static_cast<std::int64_t>(r.width()) * r.height();
+                    renderBrick(s, b, tile);
+                });
     });
     for (const dfb::FrameReport& report : reports) {
         CHECK(report.tilesTotal == 256 * 128);

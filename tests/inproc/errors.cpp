@@ -492,9 +492,10 @@ TEST_CASE("A loop that fails before it has declared its inputs fails the frame a
                 dfb::FrameParams params = paramsOf(s);
                 params.timeoutMs = 60000;
                 params.allowPartial = isPartial;
-                const auto report = dfb::renderDataParallel(
-                    fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), NoCamera{fb.rank() == odd},
-                    [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, params);
+                const auto report = dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                                        .render(
+                                            NoCamera{fb.rank() == odd},
+                                            [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, params);
                 if (report.failure)
                     throw dfb::FrameError(*report.failure);
             });
@@ -560,9 +561,9 @@ TEST_CASE("Ranks that were given other passes or samples find out, also where no
             else
                 params.passes = samples.count;
             const dfb::World world(isOdd ? std::vector<dfb::Brick>() : scene::bricksOf(s, fb.rank(), fb.size()));
-            dfb::renderDataParallel(
-                fb, world, scene::FlatCamera(),
-                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, params);
+            dfb::DataParallelLoop(fb, world).render(
+                scene::FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); },
+                params);
         });
     };
     board::eachAtOnce(std::vector<Case>{{false, 0}, {false, 1}, {false, 2}, {true, 0}, {true, 1}, {true, 2}}, run,
@@ -666,11 +667,11 @@ TEST_CASE("An exception in a renderer fails the frame on every rank", "[errors]"
                         throw std::runtime_error("the renderer broke");
                 };
                 if (declared)
-                    dfb::renderDataParallel(
-                        fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {97, 61, 1}}}}),
-                        scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) { render(tile); });
+                    dfb::DataParallelLoop(
+                        fb, dfb::World({{static_cast<std::uint32_t>(fb.rank()), {{0, 0, 0}, {97, 61, 1}}}}))
+                        .render(scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) { render(tile); });
                 else
-                    dfb::renderImageParallel(fb, render);
+                    dfb::ImageParallelLoop(fb).render(render);
             });
             INFO("rank " << culprit << joined(bad.texts));
             CHECK(allSame(bad.texts));
@@ -688,10 +689,10 @@ TEST_CASE("An exception in a tile operation fails the frame on every rank", "[er
         for (int culprit = 0; culprit < 3; ++culprit)
             for (const bool standard : {true, false}) {
                 const BadFrame bad = badFrame<FrameBuffer<Faulty>>(3, s, configOf(s), [&](auto& fb) {
-                    dfb::renderDataParallel(
-                        fb, dfb::World(scene::bricksOf(s, fb.rank(), 3)), scene::FlatCamera(),
-                        [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, {},
-                        {where, culprit, standard});
+                    dfb::DataParallelLoop(fb, dfb::World(scene::bricksOf(s, fb.rank(), 3)))
+                        .render(scene::FlatCamera(),
+                                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, {},
+                                {where, culprit, standard});
                 });
                 INFO("in " << static_cast<int>(where) << " on rank " << culprit << joined(bad.texts));
                 CHECK(allSame(bad.texts));
@@ -716,10 +717,10 @@ BadFrame brokenPixelOp(int culprit, const Scene& s)
         Fb fb(communicator, configOf(s), {communicator.rank(), {}});
         const dfb::World world(scene::bricksOf(s, fb.rank(), 3));
         const auto render = [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); };
-        bad.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-            dfb::renderDataParallel(fb, world, scene::FlatCamera(), render, scene::paramsOf(s), {}, {culprit});
-        });
-        const auto report = dfb::renderDataParallel(fb, world, scene::FlatCamera(), render, scene::paramsOf(s));
+        dfb::DataParallelLoop loop(fb, world);
+        bad.texts[static_cast<std::size_t>(fb.rank())] =
+            outcomeOf([&] { loop.render(scene::FlatCamera(), render, scene::paramsOf(s), {}, {culprit}); });
+        const auto report = loop.render(scene::FlatCamera(), render, scene::paramsOf(s));
         if (fb.isDisplayRank())
             bad.wrongAfter = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
     });

@@ -127,27 +127,26 @@ dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group, int frame)
     if constexpr (op == Op::Sorted) {
         return renderLoop(fb, s, group.loop);
     } else if constexpr (op == Op::Average) {
-        return dfb::renderImageParallel(
-            fb, dfb::WorkDistribution::Dynamic, [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); },
-            paramsOf(s));
+        return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Dynamic)
+            .render([&](auto& tile) { renderBrick(s, s.bricks.front(), tile); }, paramsOf(s));
     } else if constexpr (op == Op::Deep) {
-        return dfb::renderDeepParallel(
-            fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), FlatCamera(), 2,
-            [&](const dfb::Brick& b, dfb::DeepTile& deep) { renderDeep(s, b, deep); }, paramsOf(s));
+        return dfb::DeepParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), 2)
+            .render(
+                FlatCamera(), [&](const dfb::Brick& b, dfb::DeepTile& deep) { renderDeep(s, b, deep); }, paramsOf(s));
     } else if constexpr (op == Op::Accumulated) {
         dfb::FrameParams params = paramsOf(s);
         params.accumulationId = static_cast<std::uint64_t>(frame); // one that fails leaves tiles without samples
-        return dfb::renderDataParallel(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())), FlatCamera(), renderOne,
-                                       params);
+        return dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+            .render(FlatCamera(), renderOne, params);
     } else {
         const dfb::SharedWorld world(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())));
         dfb::RoundRobinBricks inTurn;
         if constexpr (op == Op::Nearest) {
-            return dfb::renderMixedParallel(fb, world, FlatCamera(), inTurn, renderOne, paramsOf(s));
+            return dfb::MixedParallelLoop(fb, world, inTurn).render(FlatCamera(), renderOne, paramsOf(s));
         } else {
             std::vector<int> order(s.bricks.size()); // by id, as in the world
             std::iota(order.begin(), order.end(), 0);
-            return dfb::renderOrdered(fb, world, FlatCamera(), order, inTurn, renderOne, paramsOf(s));
+            return dfb::OrderedLoop(fb, world, inTurn).render(FlatCamera(), order, renderOne, paramsOf(s));
         }
     }
 }

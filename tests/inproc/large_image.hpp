@@ -27,9 +27,10 @@ std::string largeImage(const typename Transport::Communicator& communicator, boo
     options.sharedMemory = sharedMemory;
     dfb::DistributedFrameBuffer<dfb::BasicImageParallel<256>, dfb::NoPixelOp, Transport> fb(communicator, config,
                                                                                             options);
+    dfb::ImageParallelLoop loop(fb);
     dfb::FrameReport report;
     for (int frame = 0; frame < 2; ++frame) // where an image is shared, from the second one on at the latest
-        report = dfb::renderImageParallel(fb, [&](auto& tile) {
+        report = loop.render([&](auto& tile) {
             tile.forEachPixel([&](int x, int y, float* rgba, float&) {
                 for (int c = 0; c < 3; ++c)
                     rgba[c] = value(x, y, c);

@@ -50,13 +50,14 @@ Picture pictureOf(const Scene& s, Loop loop, const PixelOp& op, dfb::OutputForma
         const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
         dfb::FrameReport report;
         if (loop == Loop::Declared)
-            report = dfb::renderDataParallel(
-                fb, dfb::World(mine), scene::FlatCamera(),
-                [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); }, scene::paramsOf(s),
-                {}, data);
+            report = dfb::DataParallelLoop(fb, dfb::World(mine))
+                         .render(
+                             scene::FlatCamera(),
+                             [&](const dfb::Brick& brick, auto& tile) { scene::renderBrick(s, brick, tile); },
+                             scene::paramsOf(s), {}, data);
         else
-            report = dfb::renderImageParallel(
-                fb, [&](auto& tile) { scene::renderBrick(s, s.bricks.front(), tile); }, scene::paramsOf(s), {}, data);
+            report = dfb::ImageParallelLoop(fb).render(
+                [&](auto& tile) { scene::renderBrick(s, s.bricks.front(), tile); }, scene::paramsOf(s), {}, data);
         if (fb.isDisplayRank())
             result = Picture(fb.image(), report);
     });
@@ -422,12 +423,13 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
         FrameBuffer<Blend> fb(communicator, configFor(s));
         const std::vector<dfb::Brick> bricks{{7, {{0, 0, 0}, {97, 61, 1}}}};
         const dfb::World world(fb.rank() == 1 ? bricks : std::vector<dfb::Brick>());
-        const auto report = dfb::renderDataParallel(fb, world, scene::FlatCamera(), [](const dfb::Brick&, auto& tile) {
-            _mm_setcsr(_mm_getcsr() | 0x8040); // as Embree asks for, and never undone
-            const std::uint32_t denormal = 1000;
-            for (int i = 0; i < 16 * 16; ++i)
-                std::memcpy(tile.color + 4 * i, &denormal, sizeof denormal);
-        });
+        const auto report =
+            dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), [](const dfb::Brick&, auto& tile) {
+                _mm_setcsr(_mm_getcsr() | 0x8040); // as Embree asks for, and never undone
+                const std::uint32_t denormal = 1000;
+                for (int i = 0; i < 16 * 16; ++i)
+                    std::memcpy(tile.color + 4 * i, &denormal, sizeof denormal);
+            });
         if (fb.isDisplayRank())
             p = Picture(fb.image(), report);
     });

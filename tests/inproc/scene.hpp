@@ -128,9 +128,9 @@ inline std::vector<dfb::Brick> bricksOf(const Scene& s, int rank, int rankCount,
 
 enum class Loop {
     Listing3,   // by hand, as in the paper: the owner sends a background tile that announces the bricks
-    Declared,   // renderDataParallel
-    ImageOwned, // renderImageParallel of owned tiles; the scene has one brick
-    ImageDealt  // renderImageParallel of tiles dealt out otherwise
+    Declared,   // DataParallelLoop
+    ImageOwned, // ImageParallelLoop of owned tiles; the scene has one brick
+    ImageDealt  // ImageParallelLoop of tiles dealt out otherwise
 };
 
 inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
@@ -172,19 +172,19 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
     const auto render = [&](auto& tile) { renderBrick(s, s.bricks.front(), tile); };
     switch (loop) {
     case Loop::Listing3: return listing3(fb, s, mine);
-    case Loop::ImageOwned: return dfb::renderImageParallel(fb, render, paramsOf(s));
+    case Loop::ImageOwned: return dfb::ImageParallelLoop(fb).render(render, paramsOf(s));
     case Loop::ImageDealt: {
         std::vector<int> tiles;
         for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
             if ((tile + tile / 5 + deal) % fb.size() == fb.rank())
                 tiles.push_back(tile);
-        return dfb::renderImageParallel(fb, tiles, render, paramsOf(s));
+        return dfb::ImageParallelLoop(fb, tiles).render(render, paramsOf(s));
     }
     case Loop::Declared: break;
     }
-    return dfb::renderDataParallel(
-        fb, dfb::World(mine), FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); },
-        paramsOf(s));
+    return dfb::DataParallelLoop(fb, dfb::World(mine))
+        .render(
+            FlatCamera(), [&](const dfb::Brick& brick, auto& tile) { renderBrick(s, brick, tile); }, paramsOf(s));
 }
 
 // What the display rank had after a frame.

@@ -30,7 +30,7 @@ std::vector<std::vector<int>> threadsOf(int ranks, std::shared_ptr<dfb::Executor
         config.width = config.height = 20;
         config.executor = executor;
         FrameBuffer fb(communicator, config);
-        const auto report = dfb::renderImageParallel(fb, [](auto& tile) { tile.fill({0, 0, 0, 1}); });
+        const auto report = dfb::ImageParallelLoop(fb).render([](auto& tile) { tile.fill({0, 0, 0, 1}); });
         const std::lock_guard<std::mutex> lock(mutex);
         threads[static_cast<std::size_t>(fb.rank())] = {fb.executor().concurrency(), report.threads};
     });

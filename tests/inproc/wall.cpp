@@ -28,7 +28,7 @@ TEST_CASE("Rank 0 receives no pixel of the others' displays", "[wall]")
         config.executor = executor;
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<32>, dfb::ToWall, board::BoardTransport> fb(
             connection, config, {&wall});
-        const auto report = dfb::renderImageParallel(fb, [](auto& tile) {
+        const auto report = dfb::ImageParallelLoop(fb).render([](auto& tile) {
             const float rgba[4] = {0.5f, 0, 0, 1};
             tile.fill(rgba);
         });

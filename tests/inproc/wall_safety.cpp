@@ -79,8 +79,9 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
             const auto frame = [&](float shade) {
                 dfb::FrameParams params;
                 params.background = {shade, shade, shade, 1};
-                const auto report = dfb::renderDataParallel(
-                    fb, dfb::World(), scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
+                const auto report = dfb::DataParallelLoop(fb, dfb::World())
+                                        .render(
+                                            scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
                 try {
                     wall.finish(report.frame, timeoutMs);
                 } catch (const dfb::Error& e) {

@@ -71,7 +71,7 @@ TEST_CASE("Ranks whose CPU masks meet divide the processors; those with masks of
         dfb::FrameBufferConfig config;
         config.width = config.height = 20;
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>> fb(MPI_COMM_WORLD, config);
-        const auto report = dfb::renderImageParallel(fb, [](auto& tile) { tile.fill({0, 0, 0, 1}); });
+        const auto report = dfb::ImageParallelLoop(fb).render([](auto& tile) { tile.fill({0, 0, 0, 1}); });
         CHECK(report.threads == std::max(1, processors / size));
         CHECK(fb.executor().concurrency() == report.threads);
     }

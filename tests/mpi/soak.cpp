@@ -114,24 +114,26 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
             const auto at = static_cast<float>(frame), x = static_cast<float>(s.width) / 2,
                        y = static_cast<float>(s.height) / 2;
             const dfb::PerspectiveCamera camera({x - 10 * at, y, -50 - 5 * at}, {x, y, 0}, {0, 1, 0}, 60);
-            dfb::renderDataParallel(
-                fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())), camera,
-                [&](const dfb::Brick&, auto& tile) {
-                    tile.fill({0.25f, 0.25f, 0.25f, 0.5f}, at);
-                },
-                paramsOf(s));
+            dfb::DataParallelLoop(fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())))
+                .render(
+                    camera,
+                    [&](const dfb::Brick&, auto& tile) {
+                        tile.fill({0.25f, 0.25f, 0.25f, 0.5f}, at);
+                    },
+                    paramsOf(s));
             continue;
         }
         if (frame % 9 == 7) {
             const std::string outcome = scene::outcomeOf([&] {
-                dfb::renderDataParallel(
-                    fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())), scene::FlatCamera(),
-                    [&](const dfb::Brick& brick, auto& tile) {
-                        if (brick.id == s.bricks.back().id)
-                            throw std::runtime_error("on purpose");
-                        renderBrick(s, brick, tile);
-                    },
-                    paramsOf(s));
+                dfb::DataParallelLoop(fb, dfb::World(scene::bricksOf(s, fb.rank(), fb.size())))
+                    .render(
+                        scene::FlatCamera(),
+                        [&](const dfb::Brick& brick, auto& tile) {
+                            if (brick.id == s.bricks.back().id)
+                                throw std::runtime_error("on purpose");
+                            renderBrick(s, brick, tile);
+                        },
+                        paramsOf(s));
             });
             if (!scene::has(outcome, "FrameError") || !scene::has(outcome, "on purpose"))
                 wrong += "frame " + std::to_string(frame) + ": " + outcome + "\n";

@@ -126,8 +126,7 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
             dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator,
                                                                                                      config);
             const example::Renderer renderer(loadBrick(scene, 0, scene.bounds), info, settings);
-            keep(fb, dfb::renderImageParallel(
-                         fb, [&](auto& tile) { renderer.renderTile(tile, 0); }, params));
+            keep(fb, dfb::ImageParallelLoop(fb).render([&](auto& tile) { renderer.renderTile(tile, 0); }, params));
             return;
         }
         dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator, config);
@@ -143,9 +142,9 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
             renderers[id] = std::make_unique<example::Renderer>(loadBrick(scene, id, c, ghosts), info, settings);
         }
         const example::FrameCamera camera = frameCamera(info, settings, 0);
-        keep(fb, dfb::renderDataParallel(
-                     fb, world, camera,
-                     [&](const dfb::Brick& brick, auto& tile) { renderers[brick.id]->renderTile(tile, 0); }, params));
+        keep(fb, dfb::DataParallelLoop(fb, world).render(
+                     camera, [&](const dfb::Brick& brick, auto& tile) { renderers[brick.id]->renderTile(tile, 0); },
+                     params));
     });
     return picture;
 }

@@ -494,7 +494,7 @@ TEST_CASE("An input that comes twice: from which ranks, and what to do about a b
     };
     const std::string two = "source 7 (in the library's loops: the id of a brick) part 2 comes from rank 1 and from "
                             "rank 4: a brick may be in the "
-                            "World of one rank only. If several hold it, use SharedWorld and renderMixedParallel()";
+                            "World of one rank only. If several hold it, use SharedWorld and MixedParallelLoop";
     CHECK(textOf(1, 4) == two);
     CHECK(textOf(4, 1) == two); // whichever came first
     CHECK(textOf(4, 4) == "source 7 (in the library's loops: the id of a brick) part 2 comes twice from rank 4");

@@ -10,7 +10,6 @@
 #include <dfb/tile.hpp>
 #include <dfb/tile_layout.hpp>
 
-#include <any>
 #include <cstddef>
 #include <cstdint>
 #include <exception>
@@ -46,7 +45,6 @@ public:
     virtual bool opaqueHides(int tile) const = 0;
     virtual void hide(int tile, int generation, int other) = 0;
     virtual void declare(const std::vector<TileInput>& inputs) = 0;
-    virtual std::any& loopMemory() noexcept = 0;
     virtual void expectLayers(int layers) = 0;
     virtual TileSamples samples(int tile) const = 0;
     virtual JobRange nextJobs(std::int64_t count) = 0;

@@ -16,7 +16,6 @@
 #include <dfb/frame.hpp>
 
 #include <algorithm>
-#include <any>
 #include <atomic>
 #include <chrono>
 #include <cstddef>
@@ -280,8 +279,6 @@ public:
         if (!isWaiting)
             enterAllDeclared();
     }
-
-    std::any& loopMemory() noexcept override { return loopMemory_; }
 
     void abort(const std::exception_ptr& reason, int tile) override
     {
@@ -778,7 +775,6 @@ private:
     std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
     ManifestExchange manifests_;
-    std::any loopMemory_; // see Frame
     JobShare jobs_;
     HiddenTiles hidden_;
 

@@ -24,7 +24,7 @@ namespace dfb {
 //   params.passes = 4;
 //   for (;;) {
 //       params.accumulationId += camera.hasMoved();
-//       dfb::renderImageParallel(fb, renderTile, params); // or any other loop; tile.sample is 0, 1, 2 and so on
+//       loop.render(renderTile, params); // any loop; tile.sample is 0, 1, 2 and so on
 //   }
 //
 // With FrameParams::samples, a tile must get its samples in order, in each frame those that follow; a tile without

@@ -224,7 +224,7 @@ public:
 // Blends inputs in the order of their generation, front to back: for where there is an order of the bricks that is
 // right for all pixels of a tile. Nothing is sorted, and no depth travels unless the image has it. The tree is a list:
 // each input announces 1 child but the last, which announces none; a tile without any has one empty input of generation
-// 0. See renderOrdered().
+// 0. See OrderedLoop.
 //
 // Of a tile of one pass that has no more than a colour, what is behind an opaque input does not count, nor does the
 // tile wait for it.

@@ -1,15 +1,14 @@
-// The data-parallel rendering loop with deep fragments: bricks need not be convex, and may be interleaved (A before B
-// before A along a ray).
+// DeepParallelLoop: data-parallel rendering with deep fragments: bricks need not be convex, and may be interleaved (A
+// before B before A along a ray).
 #pragma once
 
 #include <dfb/deep_tile.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/ops/sort_last.hpp>
-#include <dfb/render/tile_loop.hpp>
-#include <dfb/render/visibility.hpp>
+#include <dfb/render/data_parallel.hpp>
 #include <dfb/render/world.hpp>
 
-#include <cstddef>
+#include <cstdint>
 #include <memory>
 #include <mutex>
 #include <utility>
@@ -23,46 +22,32 @@ template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
-// As startDataParallel(), with the bounds of bricks enclosing what they have; they may overlap.
-// `renderBrick(brick, deep)` adds the segments of the pixels of deep.header().region to the empty DeepTile, of which
-// each pixel keeps `maxSegments` at most. FrameReport::mergeErrorBound is how much that may have changed a pixel. The
-// first segments of a brick's pixels announce the others as children: a pixel with one costs what it costs without.
-template <class FrameBuffer, class Camera, class RenderBrick>
-[[nodiscard]] typename FrameBuffer::Frame startDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera,
-                                                            int maxSegments, const RenderBrick& renderBrick,
-                                                            FrameParams params = {},
-                                                            const typename FrameBuffer::TileFrameData& tileData = {},
-                                                            const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    if (maxSegments < 1 || maxSegments > 65535)
-        throw InvalidArgument("a pixel has 1 to 65535 segments");
-    params.declared = true;
-    auto frame = fb.begin(params, tileData, pixelData);
-    frame.guard([&] {
-        auto& work = detail::workOf<detail::OwnBricks>(frame);
-        work.find(world, camera, fb.layout());
-        frame.declare(work.inputs);
-        const std::vector<BrickInTile>& pairs = work.pairs;
-        const detail::PassJobs jobs(pairs.size(), [&](std::size_t i) { return frame.samples(pairs[i].tile).count; });
-        std::mutex mutex;
-        std::vector<std::unique_ptr<DeepTile>> spare;
-        detail::TileLoop<FrameBuffer, void> loop(fb, frame);
-        loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
-            const auto job = jobs.at(static_cast<std::int64_t>(i));
-            const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs[job.item].brick)];
-            std::unique_ptr<DeepTile> deep;
-            {
-                const std::lock_guard<std::mutex> lock(mutex);
-                if (!spare.empty()) {
-                    deep = std::move(spare.back());
-                    spare.pop_back();
-                }
-            }
-            if (!deep)
-                deep = std::make_unique<DeepTile>(maxSegments);
-            frame.start(tile, pairs[job.item].tile, job.pass);
-            tile.generation = 1;
-            tile.source = brick.id;
+// As DataParallelLoop, with bricks that may overlap: their bounds enclose what they have.
+template <class FrameBuffer>
+class DeepParallelLoop {
+public:
+    // Each pixel of a brick keeps `maxSegments` at most. Throws InvalidArgument if they are not 1 to 65535.
+    DeepParallelLoop(FrameBuffer& fb, const World& world, int maxSegments)
+        : fb_(fb), world_(world), maxSegments_(maxSegments)
+    {
+        if (maxSegments < 1 || maxSegments > 65535)
+            throw InvalidArgument("a pixel has 1 to 65535 segments");
+    }
+
+    // As DataParallelLoop::start(), but `renderBrick(brick, deep)` adds the segments of the pixels of
+    // deep.header().region to the empty DeepTile. FrameReport::mergeErrorBound is how much merging what is too many may
+    // have changed a pixel. The first segments of a brick's pixels announce the others as children: a pixel with one
+    // costs what it costs without.
+    template <class Camera, class RenderBrick>
+    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
+                                                    FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = true;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        bricks_.template forEach<void>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
+            std::unique_ptr<DeepTile> deep = takeSpare();
             deep->reset(tile);
             renderBrick(brick, *deep);
             const TileHeader header = tile;
@@ -78,21 +63,38 @@ template <class FrameBuffer, class Camera, class RenderBrick>
             }
             if (deep->errorBound() > 0)
                 frame.noteMergeError(tile.tile, deep->errorBound());
-            const std::lock_guard<std::mutex> lock(mutex);
-            spare.push_back(std::move(deep));
+            const std::lock_guard<std::mutex> lock(mutex_);
+            spare_.push_back(std::move(deep));
         });
-    });
-    return frame;
-}
+        return frame;
+    }
 
-// Collective. The same, and ends the frame. Throws what Frame::end() throws.
-template <class FrameBuffer, class Camera, class RenderBrick>
-FrameReport renderDeepParallel(FrameBuffer& fb, const World& world, const Camera& camera, int maxSegments,
-                               const RenderBrick& renderBrick, const FrameParams& params = {},
-                               const typename FrameBuffer::TileFrameData& tileData = {},
-                               const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return startDeepParallel(fb, world, camera, maxSegments, renderBrick, params, tileData, pixelData).end();
-}
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class Camera, class RenderBrick>
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+                       const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(camera, renderBrick, params, tileData, pixelData).end();
+    }
+
+private:
+    std::unique_ptr<DeepTile> takeSpare()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        if (spare_.empty())
+            return std::make_unique<DeepTile>(maxSegments_);
+        std::unique_ptr<DeepTile> deep = std::move(spare_.back());
+        spare_.pop_back();
+        return deep;
+    }
+
+    FrameBuffer& fb_;
+    const World& world_;
+    int maxSegments_;
+    detail::OwnBricks bricks_;
+    std::mutex mutex_;
+    std::vector<std::unique_ptr<DeepTile>> spare_;
+};
 
 } // namespace dfb

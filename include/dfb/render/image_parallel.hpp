@@ -1,5 +1,5 @@
-// The image-parallel rendering loop (Listing 2 of the paper): all ranks have the scene, each tile and pass is
-// rendered by one of them.
+// ImageParallelLoop (Listing 2 of the paper): all ranks have the scene, each tile and pass is rendered by one of
+// them.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -9,6 +9,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <numeric>
+#include <utility>
 #include <vector>
 
 namespace dfb {
@@ -36,103 +37,79 @@ inline std::int64_t scatteringStride(std::int64_t count)
 
 } // namespace detail
 
-// Renders the tiles in `assigned` (over all ranks: each tile of the image once) with `renderTile` and returns the
-// frame, which is to be ended. `renderTile(tile)` is called from several threads at once, for each pass with its own
-// tile.pass and tile.sample; it writes the pixels of tile.region into the cleared tile. Throws what
-// FrameBuffer::begin() throws; an exception of renderTile becomes a FrameError of Frame::end() on all ranks.
-template <class FrameBuffer, class RenderTile>
-[[nodiscard]] typename FrameBuffer::Frame startImageParallel(FrameBuffer& fb, const std::vector<int>& assigned,
-                                                             const RenderTile& renderTile, FrameParams params = {},
-                                                             const typename FrameBuffer::TileFrameData& tileData = {},
-                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    params.declared = false;
-    params.maxLayers = 1;
-    auto frame = fb.begin(params, tileData, pixelData);
-    const detail::PassJobs jobs(assigned.size(), [&](std::size_t i) { return frame.samples(assigned[i]).count; });
-    detail::TileLoop<FrameBuffer, RenderTile> loop(fb, frame);
-    loop.run(static_cast<std::size_t>(jobs.count()), [&](std::size_t i, auto& tile) {
-        const auto job = jobs.at(static_cast<std::int64_t>(i));
-        frame.start(tile, assigned[job.item], job.pass);
-        renderTile(tile);
-        frame.setTile(tile);
-    });
-    return frame;
-}
-
-// The same, the tiles and passes distributed in one of these ways, the same on all ranks. Collective with
-// WorkDistribution::Dynamic.
-template <class FrameBuffer, class RenderTile>
-[[nodiscard]] typename FrameBuffer::Frame startImageParallel(FrameBuffer& fb, WorkDistribution distribution,
-                                                             const RenderTile& renderTile, FrameParams params = {},
-                                                             const typename FrameBuffer::TileFrameData& tileData = {},
-                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    if (distribution == WorkDistribution::Owned)
-        return startImageParallel(fb, fb.ownedTiles(), renderTile, params, tileData, pixelData);
-    params.declared = false;
-    params.maxLayers = 1;
-    auto frame = fb.begin(params, tileData, pixelData);
-    const detail::PassJobs jobs(static_cast<std::size_t>(fb.layout().tileCount()),
-                                [&](std::size_t tile) { return frame.samples(static_cast<int>(tile)).count; });
-    detail::TileLoop<FrameBuffer, RenderTile> loop(fb, frame);
-    const auto render = [&](std::int64_t job, auto& tile) {
-        const auto at = jobs.at(job);
-        frame.start(tile, static_cast<int>(at.item), at.pass);
-        renderTile(tile);
-        frame.setTile(tile);
-    };
-    const std::int64_t count = jobs.count(), rank = fb.rank(), size = fb.size();
-    // Jobs begin + i, each times `stride`.
-    const auto renderRange = [&](std::int64_t begin, std::int64_t end, std::int64_t stride = 1) {
-        loop.run(static_cast<std::size_t>(end - begin), [&](std::size_t i, auto& tile) {
-            render((begin + static_cast<std::int64_t>(i)) * stride % count, tile);
-        });
-    };
-    switch (distribution) {
-    case WorkDistribution::Linear: renderRange(count * rank / size, count * (rank + 1) / size); break;
-    case WorkDistribution::RoundRobin:
-        loop.run(static_cast<std::size_t>((count - rank + size - 1) / size),
-                 [&](std::size_t i, auto& tile) { render(rank + static_cast<std::int64_t>(i) * size, tile); });
-        break;
-    case WorkDistribution::Dynamic:
-        frame.guard([&] {
-            for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
-                 range = frame.nextJobs(count))
-                renderRange(range.begin, range.end, detail::scatteringStride(count));
-        });
-        break;
-    case WorkDistribution::Owned: break;
+// One per rank, for any number of frames, which find its memory there; by one thread at a time. The framebuffer must
+// outlive it.
+template <class FrameBuffer>
+class ImageParallelLoop {
+public:
+    // The distribution must be the same on all ranks.
+    explicit ImageParallelLoop(FrameBuffer& fb, WorkDistribution distribution = WorkDistribution::Owned)
+        : fb_(fb), distribution_(distribution), tiles_(fb.ownedTiles())
+    {
     }
-    return frame;
-}
 
-// Collective. Renders the tiles of startImageParallel() and ends the frame. Throws what Frame::end() throws.
-template <class FrameBuffer, class RenderTile>
-FrameReport renderImageParallel(FrameBuffer& fb, const std::vector<int>& assigned, const RenderTile& renderTile,
-                                const FrameParams& params = {},
-                                const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return startImageParallel(fb, assigned, renderTile, params, tileData, pixelData).end();
-}
+    // This rank renders these tiles, in this order; over all ranks each tile of the image is rendered once.
+    ImageParallelLoop(FrameBuffer& fb, std::vector<int> tiles) : fb_(fb), tiles_(std::move(tiles)) {}
 
-template <class FrameBuffer, class RenderTile>
-FrameReport renderImageParallel(FrameBuffer& fb, WorkDistribution distribution, const RenderTile& renderTile,
-                                const FrameParams& params = {},
-                                const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return startImageParallel(fb, distribution, renderTile, params, tileData, pixelData).end();
-}
+    // Renders this rank's share and returns the frame, which is to be ended; collective with WorkDistribution::Dynamic.
+    // `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and tile.sample;
+    // it writes the pixels of tile.region into the cleared tile. Throws what FrameBuffer::begin() throws; an exception
+    // of renderTile becomes a FrameError of Frame::end() on all ranks.
+    template <class RenderTile>
+    [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = false;
+        params.maxLayers = 1;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        frame.guard([&] {
+            const bool hasList = distribution_ == WorkDistribution::Owned;
+            const auto tileOf = [&](std::size_t item) { return hasList ? tiles_[item] : static_cast<int>(item); };
+            jobs_.find(hasList ? tiles_.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
+                       [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
+            const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
+            // `number` jobs: first, first + step and so on, modulo all there are.
+            const auto run = [&](std::int64_t first, std::int64_t number, std::int64_t step = 1) {
+                detail::forEachTile<RenderTile>(fb_, frame, number, [&](std::int64_t i, auto& tile) {
+                    const auto [item, pass] = jobs_.at((first + i * step) % count);
+                    frame.start(tile, tileOf(item), pass);
+                    renderTile(tile);
+                    frame.setTile(tile);
+                });
+            };
+            switch (distribution_) {
+            case WorkDistribution::Owned: run(0, count); break;
+            case WorkDistribution::Linear:
+                run(count * rank / size, count * (rank + 1) / size - count * rank / size);
+                break;
+            case WorkDistribution::RoundRobin: run(rank, (count - rank + size - 1) / size, size); break;
+            case WorkDistribution::Dynamic: {
+                const std::int64_t stride = detail::scatteringStride(count);
+                for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
+                     range = frame.nextJobs(count))
+                    run(range.begin * stride, range.end - range.begin, stride);
+                break;
+            }
+            }
+        });
+        return frame;
+    }
 
-// The same, each rank rendering the tiles that it owns.
-template <class FrameBuffer, class RenderTile>
-FrameReport renderImageParallel(FrameBuffer& fb, const RenderTile& renderTile, const FrameParams& params = {},
-                                const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return renderImageParallel(fb, WorkDistribution::Owned, renderTile, params, tileData, pixelData);
-}
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class RenderTile>
+    FrameReport render(const RenderTile& renderTile, const FrameParams& params = {},
+                       const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(renderTile, params, tileData, pixelData).end();
+    }
+
+private:
+    FrameBuffer& fb_;
+    WorkDistribution distribution_ = WorkDistribution::Owned;
+    std::vector<int> tiles_; // with WorkDistribution::Owned: what this rank renders
+    detail::PassJobs jobs_;
+};
 
 } // namespace dfb

@@ -1,6 +1,6 @@
-// The mixed-parallel rendering loop (Listing 5 of the paper): bricks that several ranks hold are rendered into each
-// tile by one of them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on
-// all ranks image-parallel rendering. And the same with bricks in a known order, without sorting.
+// MixedParallelLoop (Listing 5 of the paper): bricks that several ranks hold are rendered into each tile by one of
+// them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on all ranks
+// image-parallel rendering. OrderedLoop: the same with bricks in a known order, without sorting.
 //
 // A tile-brick owner is any type with
 //   int operator()(const SharedBrick& brick, int tile, int pass);      the rank, one of brick.ranks
@@ -177,10 +177,9 @@ struct MixedJob {
 // What there is to do in a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs;
-    std::vector<int> passes;       // of each pair
-    std::vector<MixedJob> jobs;    // of this rank
-    std::vector<int> perTile;      // pairs
-    std::vector<TileInput> inputs; // that this rank declares
+    std::vector<int> passes;    // of each pair
+    std::vector<MixedJob> jobs; // of this rank
+    std::vector<int> perTile;   // pairs
 
     // The most bricks that meet in a tile.
     int mostPerTile(int tileCount)
@@ -223,6 +222,34 @@ struct OrderedWork : MixedWork {
     std::vector<int> empty;             // tiles of this rank
     std::vector<MixedJob> ordered;      // only renderFrontsFirst() uses it
     std::atomic<bool> anyHidden{false}; // in the last frame: of this rank's inputs, or by one
+
+    // Throws InvalidArgument.
+    void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
+    {
+        place.assign(world.bricks().size(), -1);
+        for (std::size_t i = 0; i < order.size(); ++i)
+            if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
+                place[brick] = static_cast<int>(i);
+        if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
+            throw InvalidArgument("the order does not have each brick once");
+        std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
+            return a.tile != b.tile
+                       ? a.tile < b.tile
+                       : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
+        });
+    }
+
+    // Which of this rank's tiles no brick projects to; and where the pairs of the others begin.
+    void findEmpty(int tileCount, const std::vector<int>& ownedTiles)
+    {
+        firstPair.assign(static_cast<std::size_t>(tileCount), -1);
+        for (std::size_t p = pairs.size(); p-- > 0;)
+            firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
+        empty.clear();
+        for (const int tile : ownedTiles)
+            if (firstPair[static_cast<std::size_t>(tile)] < 0)
+                empty.push_back(tile);
+    }
 
     int generationOf(const MixedJob& job) const
     {
@@ -293,136 +320,153 @@ void hideBehind(const Frame& frame, const SharedWorld& world, const std::vector<
 
 } // namespace detail
 
-// As startDataParallel(), with bricks that several ranks may hold: for each tile and pass `owner` says which of them
-// renders it. `renderBrick(brick, tile)` may return what it has cost, a number in any unit. The image is that of data-
-// parallel rendering bit for bit, whoever renders what.
-template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-[[nodiscard]] typename FrameBuffer::Frame startMixedParallel(FrameBuffer& fb, const SharedWorld& world,
-                                                             const Camera& camera, TileBrickOwner& owner,
-                                                             const RenderBrick& renderBrick, FrameParams params = {},
-                                                             const typename FrameBuffer::TileFrameData& tileData = {},
-                                                             const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    params.declared = true;
-    auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    frame.guard([&] {
-        auto& work = detail::workOf<detail::MixedWork>(frame);
-        detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
-        const std::vector<BrickInTile>& pairs = work.pairs;
-        const std::vector<detail::MixedJob>& jobs = work.jobs;
-        frame.expectLayers(work.mostPerTile(fb.layout().tileCount()));
-        work.findJobs(frame, world, owner);
-        // The tile, whoever renders it, is declared by the first of those that hold the brick.
-        work.inputs.clear();
-        for (const BrickInTile& pair : pairs)
-            if (const SharedBrick& b = world.bricks()[static_cast<std::size_t>(pair.brick)];
-                b.ranks.front() == fb.rank())
-                work.inputs.push_back({pair.tile, b.brick.id, 0});
-        frame.declare(work.inputs);
-        loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
-            const BrickInTile& pair = pairs[jobs[i].pair];
-            const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
-            frame.start(tile, pair.tile, jobs[i].pass);
-            tile.generation = 1;
-            tile.source = brick.id;
-            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
-            frame.setTile(tile);
+// As DataParallelLoop, with bricks that several ranks may hold: for each tile and pass `owner` says which of them
+// renders it. The image is that of data-parallel rendering bit for bit, whoever renders what. Framebuffer, world and
+// owner must outlive it.
+template <class FrameBuffer, class TileBrickOwner>
+class MixedParallelLoop {
+public:
+    MixedParallelLoop(FrameBuffer& fb, const SharedWorld& world, TileBrickOwner& owner)
+        : fb_(fb), world_(world), owner_(owner)
+    {
+    }
+
+    // As DataParallelLoop::start(); `renderBrick(brick, tile)` may return what it has cost, a number in any unit.
+    template <class Camera, class RenderBrick>
+    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
+                                                    FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = true;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        frame.guard([&] {
+            detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
+            frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
+            work_.findJobs(frame, world_, owner_);
+            // The tile, whoever renders it, is declared by the first of those that hold the brick.
+            inputs_.clear();
+            for (const BrickInTile& pair : work_.pairs)
+                if (const SharedBrick& b = world_.bricks()[static_cast<std::size_t>(pair.brick)];
+                    b.ranks.front() == fb_.rank())
+                    inputs_.push_back({pair.tile, b.brick.id, 0});
+            frame.declare(inputs_);
+            const auto count = static_cast<std::int64_t>(work_.jobs.size());
+            detail::forEachTile<RenderBrick>(fb_, frame, count, [&](std::int64_t i, auto& tile) {
+                const detail::MixedJob& job = work_.jobs[static_cast<std::size_t>(i)];
+                const BrickInTile& pair = work_.pairs[job.pair];
+                const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+                frame.start(tile, pair.tile, job.pass);
+                tile.generation = 1;
+                tile.source = brick.id;
+                detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+                frame.setTile(tile);
+            });
         });
-    });
-    return frame;
-}
+        return frame;
+    }
 
-// Collective. The same, and ends the frame. Throws what Frame::end() throws.
-template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-FrameReport renderMixedParallel(FrameBuffer& fb, const SharedWorld& world, const Camera& camera, TileBrickOwner& owner,
-                                const RenderBrick& renderBrick, const FrameParams& params = {},
-                                const typename FrameBuffer::TileFrameData& tileData = {},
-                                const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return startMixedParallel(fb, world, camera, owner, renderBrick, params, tileData, pixelData).end();
-}
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class Camera, class RenderBrick>
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+                       const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(camera, renderBrick, params, tileData, pixelData).end();
+    }
 
-// The same for OrderedBlend: `order` is the bricks front to back, by their place in world.bricks(), as from
-// visibilityOrder(). Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
+private:
+    FrameBuffer& fb_;
+    const SharedWorld& world_;
+    TileBrickOwner& owner_;
+    detail::MixedWork work_;
+    std::vector<TileInput> inputs_; // that this rank declares
+};
+
+// The same for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
 // manifest. What an opaque tile hides is not sent, nor rendered by those who have heard of it in time: ranks that had
 // to do with that in the last frame begin with the tiles of which they have the front. Only where one order is right
 // for all rays of a frame: not with an extended lens or several eyes.
-template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-[[nodiscard]] typename FrameBuffer::Frame startOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                                                       const std::vector<int>& order, TileBrickOwner& owner,
-                                                       const RenderBrick& renderBrick, FrameParams params = {},
-                                                       const typename FrameBuffer::TileFrameData& tileData = {},
-                                                       const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    params.declared = false;
-    auto frame = fb.begin(params, tileData, pixelData);
-    detail::TileLoop<FrameBuffer, RenderBrick> loop(fb, frame);
-    frame.guard([&] {
-        auto& work = detail::workOf<detail::OrderedWork>(frame);
-        detail::findVisibleTiles(world, camera, fb.layout(), work.pairs);
-        std::vector<BrickInTile>& pairs = work.pairs;
-        const std::vector<detail::MixedJob>& jobs = work.jobs;
-        std::vector<int>&place = work.place, &firstPair = work.firstPair, &empty = work.empty;
-        place.assign(world.bricks().size(), -1);
-        for (std::size_t i = 0; i < order.size(); ++i)
-            if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
-                place[brick] = static_cast<int>(i);
-        if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
-            throw InvalidArgument("the order does not have each brick once");
-        std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
-            return a.tile != b.tile
-                       ? a.tile < b.tile
-                       : place[static_cast<std::size_t>(a.brick)] < place[static_cast<std::size_t>(b.brick)];
-        });
-        work.findJobs(frame, world, owner);
-        frame.expectLayers(work.mostPerTile(fb.layout().tileCount()));
-        firstPair.assign(static_cast<std::size_t>(fb.layout().tileCount()), -1);
-        for (std::size_t p = pairs.size(); p-- > 0;)
-            firstPair[static_cast<std::size_t>(pairs[p].tile)] = static_cast<int>(p);
-        empty.clear();
-        for (const int tile : fb.ownedTiles())
-            if (firstPair[static_cast<std::size_t>(tile)] < 0)
-                empty.push_back(tile);
-        loop.run(empty.size(), [&](std::size_t i, auto& tile) {
-            for (int pass = 0; pass < frame.samples(empty[i]).count; ++pass) {
-                frame.start(tile, empty[i], pass);
-                frame.setTile(tile);
-            }
-        });
-        if (work.anyHidden.exchange(false))
-            work.renderFrontsFirst();
-        loop.run(jobs.size(), [&](std::size_t i, auto& tile) {
-            const BrickInTile& pair = pairs[jobs[i].pair];
-            const Brick& brick = world.bricks()[static_cast<std::size_t>(pair.brick)].brick;
-            const int generation = work.generationOf(jobs[i]);
-            if (frame.isHidden(pair.tile, generation)) {
-                work.anyHidden = true;
-                return;
-            }
-            frame.start(tile, pair.tile, jobs[i].pass);
-            tile.generation = generation;
-            tile.children = jobs[i].pair + 1 < pairs.size() && pairs[jobs[i].pair + 1].tile == pair.tile;
-            tile.source = brick.id;
-            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
-            frame.setTile(tile);
-            if (tile.children > 0 && frame.hidesRest(tile)) {
-                work.anyHidden = true;
-                detail::hideBehind(frame, world, pairs, jobs[i].pair, generation, owner);
-            }
-        });
-    });
-    return frame;
-}
+template <class FrameBuffer, class TileBrickOwner>
+class OrderedLoop {
+public:
+    OrderedLoop(FrameBuffer& fb, const SharedWorld& world, TileBrickOwner& owner)
+        : fb_(fb), world_(world), owner_(owner)
+    {
+    }
 
-// Collective. The same, and ends the frame. Throws what Frame::end() throws.
-template <class FrameBuffer, class Camera, class TileBrickOwner, class RenderBrick>
-FrameReport renderOrdered(FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
-                          const std::vector<int>& order, TileBrickOwner& owner, const RenderBrick& renderBrick,
-                          const FrameParams& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
-                          const typename FrameBuffer::PixelFrameData& pixelData = {})
-{
-    return startOrdered(fb, world, camera, order, owner, renderBrick, params, tileData, pixelData).end();
-}
+    // As MixedParallelLoop::start(); `order` is the bricks front to back, by their place in world.bricks(), as from
+    // visibilityOrder().
+    template <class Camera, class RenderBrick>
+    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
+                                                    const RenderBrick& renderBrick, FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = false;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        frame.guard([&] {
+            detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
+            work_.sortFrontToBack(world_, order);
+            work_.findJobs(frame, world_, owner_);
+            frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
+            work_.findEmpty(fb_.layout().tileCount(), fb_.ownedTiles());
+            const auto emptyCount = static_cast<std::int64_t>(work_.empty.size());
+            detail::forEachTile<RenderBrick>(fb_, frame, emptyCount, [&](std::int64_t i, auto& tile) {
+                const int index = work_.empty[static_cast<std::size_t>(i)];
+                for (int pass = 0; pass < frame.samples(index).count; ++pass) {
+                    frame.start(tile, index, pass);
+                    frame.setTile(tile);
+                }
+            });
+            if (work_.anyHidden.exchange(false))
+                work_.renderFrontsFirst();
+            const auto count = static_cast<std::int64_t>(work_.jobs.size());
+            detail::forEachTile<RenderBrick>(fb_, frame, count, [&](std::int64_t i, auto& tile) {
+                renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile);
+            });
+        });
+        return frame;
+    }
+
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class Camera, class RenderBrick>
+    FrameReport render(const Camera& camera, const std::vector<int>& order, const RenderBrick& renderBrick,
+                       const FrameParams& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(camera, order, renderBrick, params, tileData, pixelData).end();
+    }
+
+private:
+    template <class RenderBrick, class Tile>
+    void renderJob(typename FrameBuffer::Frame& frame, const detail::MixedJob& job, const RenderBrick& renderBrick,
+                   Tile& tile)
+    {
+        const std::vector<BrickInTile>& pairs = work_.pairs;
+        const BrickInTile& pair = pairs[job.pair];
+        const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+        const int generation = work_.generationOf(job);
+        if (frame.isHidden(pair.tile, generation)) {
+            work_.anyHidden = true;
+            return;
+        }
+        frame.start(tile, pair.tile, job.pass);
+        tile.generation = generation;
+        tile.children = job.pair + 1 < pairs.size() && pairs[job.pair + 1].tile == pair.tile;
+        tile.source = brick.id;
+        detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+        frame.setTile(tile);
+        if (tile.children > 0 && frame.hidesRest(tile)) {
+            work_.anyHidden = true;
+            detail::hideBehind(frame, world_, pairs, job.pair, generation, owner_);
+        }
+    }
+
+    FrameBuffer& fb_;
+    const SharedWorld& world_;
+    TileBrickOwner& owner_;
+    detail::OrderedWork work_;
+};
 
 } // namespace dfb

@@ -26,9 +26,10 @@ struct SamplingSettings {
 // Used alike on all ranks: what it decides is a function of the frames' reports, which are the same everywhere; a rank
 // that decides otherwise is found by the frame's verdict. The operation is a Progressive one:
 //
+//   dfb::ImageParallelLoop loop(fb);
 //   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
 //   while (!sampler.done())
-//       sampler.update(dfb::renderImageParallel(fb, renderTile, sampler.next()));
+//       sampler.update(loop.render(renderTile, sampler.next()));
 //
 // A frame that throws FrameError must be followed by reset(): what was accumulated is lost.
 class AdaptiveSampler {

@@ -1,9 +1,8 @@
-// TileLoop: what the rendering loops have in common: tiles to render into, a job per tile and pass on all
-// workers, and a frame in which a renderer may throw. inPlace(): for renderers that have their pixels already.
+// What the rendering loops have in common: tiles to render into, a job per tile and pass on all workers, and a
+// frame in which a renderer may throw. inPlace(): for renderers that have their pixels already.
 #pragma once
 
 #include <algorithm>
-#include <any>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -45,23 +44,16 @@ struct TileOf<FrameBuffer, InPlace<Find>> {
     using Type = typename FrameBuffer::TileView;
 };
 
-// What a loop has to do: a `Work`, a type of that loop alone, that it has again in the next frame, with its memory.
-template <class Work, class Frame>
-Work& workOf(const Frame& frame)
-{
-    auto* work = std::any_cast<std::shared_ptr<Work>>(&frame.loopMemory());
-    if (!work)
-        work = &frame.loopMemory().template emplace<std::shared_ptr<Work>>(std::make_shared<Work>());
-    return **work;
-}
-
 // A job for each pass of each of some items, numbered item by item.
 class PassJobs {
 public:
     // `passesOf(item)`: how many passes an item has.
     template <class PassesOf>
-    PassJobs(std::size_t itemCount, const PassesOf& passesOf) : passes_(itemCount > 0 ? passesOf(0) : 1)
+    void find(std::size_t itemCount, const PassesOf& passesOf)
     {
+        count_ = 0;
+        passes_ = itemCount > 0 ? passesOf(0) : 1;
+        firstJob_.clear();
         bool alike = true;
         for (std::size_t i = 0; i < itemCount; ++i) {
             const int passes = passesOf(i);
@@ -91,45 +83,33 @@ public:
     }
 
 private:
-    int passes_; // of the first item
+    int passes_ = 1; // of the first item
     std::int64_t count_ = 0;
     std::vector<std::int64_t> firstJob_; // of each item, unless all have equally many passes
 };
 
-// An exception of a job makes the frame fail on all ranks; then no further job is begun. Lives as long as the frame is
-// rendered, on the thread that began it.
-template <class FrameBuffer, class Render>
-class TileLoop {
+// Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own, of the kind that
+// `Render` wants. An exception of a job makes the frame fail on all ranks; then no further job is begun.
+template <class Render, class FrameBuffer, class Job>
+void forEachTile(FrameBuffer& fb, typename FrameBuffer::Frame& frame, std::int64_t count, const Job& job)
+{
     using Tile = typename TileOf<FrameBuffer, Render>::Type;
-
-public:
-    TileLoop(FrameBuffer& fb, typename FrameBuffer::Frame& frame) : fb_(fb), frame_(frame) {}
-
-    // Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own.
-    template <class Job>
-    void run(std::size_t count, const Job& job)
-    {
-        frame_.guard([&] {
-            fb_.executor().parallelFor(count, [&](std::size_t i) {
-                if (frame_.failed())
-                    return;
-                // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be given
-                // another job on the same thread.
-                static thread_local std::unique_ptr<Tile> spare;
-                std::unique_ptr<Tile> tile = std::move(spare);
-                if (!tile)
-                    tile.reset(new Tile); // start() clears it
-                tile->tile = -1;
-                frame_.guard([&] { job(i, *tile); }, *tile); // the frame may do without that one
-                spare = std::move(tile);
-            });
+    frame.guard([&] {
+        fb.executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
+            if (frame.failed())
+                return;
+            // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be given
+            // another job on the same thread.
+            static thread_local std::unique_ptr<Tile> spare;
+            std::unique_ptr<Tile> tile = std::move(spare);
+            if (!tile)
+                tile.reset(new Tile); // start() clears it
+            tile->tile = -1;
+            frame.guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile); // the frame may do without that one
+            spare = std::move(tile);
         });
-    }
-
-private:
-    FrameBuffer& fb_;
-    typename FrameBuffer::Frame& frame_;
-};
+    });
+}
 
 } // namespace detail
 

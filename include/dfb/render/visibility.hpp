@@ -232,19 +232,6 @@ inline void findInputs(const World& world, const std::vector<BrickInTile>& pairs
         result.push_back({pair.tile, world.bricks()[static_cast<std::size_t>(pair.brick)].id, 0});
 }
 
-// What there is to do for a rank that renders its own bricks, and what it declares.
-struct OwnBricks {
-    std::vector<BrickInTile> pairs;
-    std::vector<TileInput> inputs;
-
-    template <class Camera>
-    void find(const World& world, const Camera& camera, const TileLayout& layout)
-    {
-        findVisibleTiles(world, camera, layout, pairs);
-        findInputs(world, pairs, inputs);
-    }
-};
-
 } // namespace detail
 
 // What a rank declares that renders these pairs: the source is the brick's id.

@@ -4,7 +4,8 @@
 //
 //   dfb::testing::Verification verification;      // one per rank
 //   DistributedFrameBuffer<dfb::testing::Verified<dfb::AlphaBlend>> fb(...);
-//   renderDataParallel(fb, world, camera, renderBrick, params, &verification);
+//   dfb::DataParallelLoop loop(fb, world);
+//   loop.render(camera, renderBrick, params, &verification);
 //   verification.report()                         // of colour: wrongBytes, ulps; of all else: wrongOthers
 #pragma once
 
