@@ -7,8 +7,8 @@
 // all alike.
 #include "figures.hpp"
 
-#include <dfb/detail/wire.hpp>
 #include <dfb/ops/sort_last.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <benchmark/benchmark.h>
 

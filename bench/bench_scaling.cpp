@@ -12,10 +12,10 @@
 #include "results.hpp"
 #include "scenes.hpp"
 
-#include <dfb/detail/wire.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/data_parallel.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>

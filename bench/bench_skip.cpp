@@ -8,13 +8,13 @@
 #include "plot.hpp"
 #include "results.hpp"
 
-#include <dfb/detail/wire.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/data_parallel.hpp>
 #include <dfb/render/mixed_parallel.hpp>
 #include <dfb/render/sampling.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>

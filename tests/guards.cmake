@@ -20,7 +20,9 @@ set_tests_properties(guard.layers PROPERTIES LABELS guard)
 
 add_test(NAME guard.readme
   COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/readme.cmake)
-set_tests_properties(guard.readme PROPERTIES LABELS guard)
+add_test(NAME guard.architecture
+  COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/architecture.cmake)
+set_tests_properties(guard.readme guard.architecture PROPERTIES LABELS guard)
 
 # Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
 # with that component, the umbrella with each set of components, all others with nothing but our include folder.

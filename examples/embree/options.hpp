@@ -5,7 +5,7 @@
 #include "frame_pattern.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
-#include <dfb/wire_format.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <CLI/CLI.hpp>
 
@@ -276,9 +276,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
           "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on "
           "demand; default owned")
         ->group(how);
-    app.add_option(
-           "--interleave", options.interleave,
-           "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1")
+    app.add_option("--interleave", options.interleave,
+                   "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1")
         ->check(detail::number(1, 4096))
         ->option_text("C")
         ->group(how);
@@ -296,8 +295,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, most))
         ->option_text("N")
         ->group(how);
-    app.add_option("--threads", options.threads,
-                   "Threads per rank; default 0: the processors that it may run on, divided among the ranks that may, too")
+    app.add_option(
+           "--threads", options.threads,
+           "Threads per rank; default 0: the processors that it may run on, divided among the ranks that may, too")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(how);
@@ -320,9 +320,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
           "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
           "tiles stay float32, as do depth and what --aux writes; default float32")
         ->group(how);
-    app.add_option("--error-budget", options.errorBudget,
-                   "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
-                   "this, before it is converted for output; default 0: --wire says")
+    app.add_option(
+           "--error-budget", options.errorBudget,
+           "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
+           "this, before it is converted for output; default 0: --wire says")
         ->check(detail::number(0, 1))
         ->option_text("E")
         ->group(how);
@@ -331,9 +332,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 0.99))
         ->option_text("T")
         ->group(how);
-    app.add_flag("--verify", options.verify,
-                 "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
-                 "was made of; slow")
+    app.add_flag(
+           "--verify", options.verify,
+           "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
+           "was made of; slow")
         ->group(how);
     words("--owner-map", options.ownerMap, {"lattice", "linear", "hash"}, "Which rank owns which tile; default lattice")
         ->group(how);

@@ -2,7 +2,7 @@
 // mark of all it ever held.
 #pragma once
 
-#include <dfb/detail/fifo.hpp>
+#include <dfb/base/fifo.hpp>
 #include <dfb/version.hpp>
 
 #include <algorithm>

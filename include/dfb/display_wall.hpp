@@ -16,7 +16,7 @@
 namespace dfb {
 
 namespace detail {
-class Wall; // detail/wall.hpp
+class Wall; // gather/wall.hpp
 }
 
 class DisplayWall;
@@ -95,7 +95,7 @@ static_assert(is_pixel_op_v<ToWall>);
 } // namespace dfb
 
 #if DFB_HAS_BODIES
-#include <dfb/detail/wall.hpp>
+#include <dfb/gather/wall.hpp>
 
 #include <utility>
 

@@ -3,8 +3,8 @@
 // post-processes it, and it goes to the display rank (section 3 of the paper).
 #pragma once
 
-#include <dfb/detail/engine.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/engine.hpp>
 #include <dfb/fwd.hpp>
 #include <dfb/pixel_op.hpp>
 
@@ -302,5 +302,5 @@ private:
 } // namespace dfb
 
 #if DFB_HAS_BODIES
-#include <dfb/detail/frame_engine.hpp>
+#include <dfb/frame/frame_engine.hpp>
 #endif

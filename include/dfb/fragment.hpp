@@ -3,7 +3,7 @@
 #pragma once
 
 #include <dfb/tile.hpp>
-#include <dfb/wire_format.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <cstddef>
 #include <cstdint>

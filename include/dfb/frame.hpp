@@ -7,7 +7,7 @@
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/tile_layout.hpp>
-#include <dfb/wire_format.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <array>
 #include <cstddef>
@@ -148,12 +148,12 @@ struct FrameReport {
     // All: message bytes to other ranks, without the transport's own, and what owners have put into the image of the
     // display rank themselves.
     std::int64_t bytesSent = 0;
-    std::int64_t messagesSent = 0;              // all
-    std::int64_t tilesTotal = 0;                // in the image
-    std::int64_t tilesTouched = 0;              // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinity or NaN (see detail/wire.hpp)
-    std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
-    std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
+    std::int64_t messagesSent = 0;         // all
+    std::int64_t tilesTotal = 0;           // in the image
+    std::int64_t tilesTouched = 0;         // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (see wire/fragment_message.hpp)
+    std::int64_t alphaOutsidePixels = 0;   // all: finite input pixels whose alpha is not within [0, 1]
+    std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained

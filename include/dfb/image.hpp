@@ -2,9 +2,9 @@
 // to those formats.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
 #include <dfb/buffer.hpp>
 #include <dfb/channels.hpp>
-#include <dfb/cpu.hpp>
 #include <dfb/error.hpp>
 #include <dfb/levels.hpp>
 

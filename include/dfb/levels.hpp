@@ -2,8 +2,8 @@
 // exactly; and how far the farthest value was from where its level ends, so that more digits can be asked for.
 #pragma once
 
-#include <dfb/cpu.hpp>
-#include <dfb/double_double.hpp>
+#include <dfb/base/cpu.hpp>
+#include <dfb/base/double_double.hpp>
 
 #include <algorithm>
 #include <array>

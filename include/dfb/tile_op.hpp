@@ -32,7 +32,7 @@
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
-#include <dfb/detail/background_pixels.hpp>
+#include <dfb/blend/background_pixels.hpp>
 #include <dfb/dither.hpp>
 #include <dfb/fragment.hpp>
 

@@ -8,9 +8,9 @@
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
 #include <dfb/comm/reduction.hpp>
-#include <dfb/detail/job_share.hpp>
-#include <dfb/detail/manifest.hpp>
-#include <dfb/detail/verdict.hpp>
+#include <dfb/frame/declarations.hpp>
+#include <dfb/frame/job_share.hpp>
+#include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
 #include <array>
@@ -90,7 +90,7 @@ bool agreements(const fuzz::Input& in)
 
 void manifests(const std::string& bytes)
 {
-    d::ManifestExchange exchange;
+    d::Declarations exchange;
     const auto isMine = [](int tile) { return tile >= 0 && tile < 6 && tile % 2 == 0; };
     const bool good = !refused([&] { exchange.receive(1, d::ByteReader(fuzz::bytesOf(bytes), bytes.size()), isMine); });
     int sent = 0;

@@ -4,7 +4,7 @@
 // An input: format, channels and flags; a batch by its length; what is behind it is a count of tiles.
 #include "fuzz.hpp"
 
-#include <dfb/detail/final_gather.hpp>
+#include <dfb/gather/final_gather.hpp>
 #if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
 #endif

@@ -4,7 +4,7 @@
 // An input: flags, then a FragmentHeader and the payload.
 #include "fuzz.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 #if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
 #endif

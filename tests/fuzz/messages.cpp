@@ -5,9 +5,9 @@
 // body. The other rank is played: when the input has nothing more it gives the frame up, as a rank does that works.
 #include "fuzz.hpp"
 
-#include <dfb/detail/tile_pipeline.hpp>
-#include <dfb/detail/verdict.hpp>
 #include <dfb/dfb.hpp>
+#include <dfb/frame/tile_pipeline.hpp>
+#include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
 #include <array>

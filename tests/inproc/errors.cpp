@@ -5,7 +5,7 @@
 #include "forward.hpp"
 #include "scene.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <atomic>

@@ -4,7 +4,7 @@
 #include "board.hpp"
 #include "catch.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>

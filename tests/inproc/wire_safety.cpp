@@ -4,7 +4,7 @@
 #include "catch.hpp"
 #include "scene.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <atomic>

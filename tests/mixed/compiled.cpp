@@ -1,7 +1,7 @@
 // As compiled with dfb::compiled; see headers.cpp.
 #define DFB_COMPILED
 #include <dfb/comm/inproc_transport.hpp>
-#include <dfb/detail/engine.hpp>
+#include <dfb/frame/engine.hpp>
 
 int compiled();
 

@@ -6,7 +6,7 @@
 #include "catch.hpp"
 #include "ranks.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <atomic>

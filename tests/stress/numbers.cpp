@@ -2,8 +2,8 @@
 // reference. The long form: test_stress "[long]".
 #include "catch.hpp"
 
-#include <dfb/moments.hpp>
 #include <dfb/ops/image_parallel.hpp>
+#include <dfb/ops/moments.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 

@@ -2,7 +2,7 @@
 // ones.
 #include "catch.hpp"
 
-#include <dfb/detail/active_pixels.hpp>
+#include <dfb/wire/active_pixels.hpp>
 
 #include <algorithm>
 #include <cmath>

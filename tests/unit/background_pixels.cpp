@@ -1,7 +1,7 @@
 // BackgroundPixels: what a tile has in the image is written again where it must be, and nowhere else.
 #include "catch.hpp"
 
-#include <dfb/detail/background_pixels.hpp>
+#include <dfb/blend/background_pixels.hpp>
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>

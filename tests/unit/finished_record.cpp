@@ -2,7 +2,7 @@
 // through.
 #include "catch.hpp"
 
-#include <dfb/detail/finished_record.hpp>
+#include <dfb/wire/finished_record.hpp>
 
 #include <algorithm>
 #include <cstddef>

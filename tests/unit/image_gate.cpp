@@ -1,7 +1,7 @@
 // ImageGate: writers get in while their frame is open, and who closes the gate knows that none is left.
 #include "catch.hpp"
 
-#include <dfb/detail/image_gate.hpp>
+#include <dfb/gather/image_gate.hpp>
 
 #include <atomic>
 #include <chrono>

@@ -2,8 +2,8 @@
 // inside.
 #include "catch.hpp"
 
-#include <dfb/detail/open_frame.hpp>
 #include <dfb/error.hpp>
+#include <dfb/frame/open_frame.hpp>
 
 #include <atomic>
 #include <cstddef>

@@ -2,7 +2,7 @@
 // something is under way is wrong, however unlikely; and of one in which nothing is, it is said at some time.
 #include "catch.hpp"
 
-#include <dfb/detail/quiescence.hpp>
+#include <dfb/comm/quiescence.hpp>
 
 #include <chrono>
 #include <cstddef>

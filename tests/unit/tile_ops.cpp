@@ -1,10 +1,10 @@
 // The tile operations against the serial reference: adversarial fragments, through the wire, in every arrival order.
 #include "catch.hpp"
 
-#include <dfb/detail/wire.hpp>
 #include <dfb/ops/image_parallel.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>

@@ -1,7 +1,7 @@
 // The wire format: tiles there and back, encodings, compression, and bytes that are no message.
 #include "catch.hpp"
 
-#include <dfb/detail/wire.hpp>
+#include <dfb/wire/fragment_message.hpp>
 #if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
 #endif

@@ -1,7 +1,7 @@
 // WireCodes: rows have the codes and values, bit for bit, that numbers alone have.
 #include "catch.hpp"
 
-#include <dfb/wire_format.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <algorithm>
 #include <cmath>

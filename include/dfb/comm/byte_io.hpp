@@ -2,7 +2,7 @@
 // reads beyond its end.
 #pragma once
 
-#include <dfb/detail/small_bytes.hpp>
+#include <dfb/base/small_bytes.hpp>
 #include <dfb/error.hpp>
 
 #include <cstddef>

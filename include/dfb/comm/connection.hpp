@@ -2,6 +2,7 @@
 // comes once and whole, and progress of the transport (section 3.2 of the paper).
 #pragma once
 
+#include <dfb/base/processors.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/checksum.hpp>
 #include <dfb/comm/heartbeat.hpp>
@@ -9,7 +10,6 @@
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
 #include <dfb/fwd.hpp>
-#include <dfb/processors.hpp>
 
 #include <algorithm>
 #include <atomic>

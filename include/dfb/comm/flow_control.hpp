@@ -8,8 +8,8 @@
 // frame): a Credit that overtakes another does no harm, and nothing that got lost outlives its epoch.
 #pragma once
 
+#include <dfb/base/fifo.hpp>
 #include <dfb/comm/message.hpp>
-#include <dfb/detail/fifo.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -2,12 +2,12 @@
 // credit, reductions, and waiting without spinning.
 #pragma once
 
+#include <dfb/base/fifo.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
+#include <dfb/comm/quiescence.hpp>
 #include <dfb/comm/reduction.hpp>
-#include <dfb/detail/fifo.hpp>
-#include <dfb/detail/quiescence.hpp>
 #include <dfb/exec.hpp>
 
 #include <algorithm>

@@ -19,8 +19,8 @@
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/detail/fifo.hpp>
-#include <dfb/processors.hpp>
+#include <dfb/base/fifo.hpp>
+#include <dfb/base/processors.hpp>
 
 #include <mpi.h>
 

@@ -5,9 +5,9 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
+#include <dfb/base/small_bytes.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/message.hpp>
-#include <dfb/detail/small_bytes.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -2,7 +2,7 @@
 // mean may be off (section 4.1.1 of the paper).
 #pragma once
 
-#include <dfb/moments.hpp>
+#include <dfb/ops/moments.hpp>
 #include <dfb/ops/sort_last.hpp>
 
 #include <algorithm>

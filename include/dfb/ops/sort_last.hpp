@@ -2,8 +2,8 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
+#include <dfb/blend/fragment_compositor.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/fragment_compositor.hpp>
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>

@@ -7,9 +7,9 @@
 //   assert(report.ulpsBelow() <= 2 && report.wrongBytes == 0);
 #pragma once
 
-#include <dfb/detail/wire.hpp>
 #include <dfb/testing/error_report.hpp>
 #include <dfb/tile_op.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <cstddef>

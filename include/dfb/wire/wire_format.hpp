@@ -23,7 +23,7 @@
 // looks for pixels that are worse, also at the edges.
 #pragma once
 
-#include <dfb/wire_codes.hpp>
+#include <dfb/wire/wire_codes.hpp>
 
 #include <algorithm>
 #include <cmath>

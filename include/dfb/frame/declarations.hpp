@@ -1,4 +1,4 @@
-// ManifestExchange: every rank tells the owners which inputs it will send, and all learn when all owners
+// Declarations: every rank tells the owners which inputs it will send, and all learn when all owners
 // know. Counts come from the senders only, so owner and contributor can not disagree about visibility.
 //
 // What a rank has declared holds until it declares something else. In each frame a rank sends a manifest to those
@@ -69,7 +69,7 @@ private:
     std::vector<ExpectedInput> inputs_;
 };
 
-class ManifestExchange {
+class Declarations {
 public:
     // `lastHolds`: what was declared up to the last frame has arrived at all owners. It must be the same on all ranks.
     // False: all of it is forgotten.

@@ -5,9 +5,9 @@
 
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/frame_terms.hpp>
-#include <dfb/detail/operations.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/frame_terms.hpp>
+#include <dfb/frame/operations.hpp>
 
 #include <algorithm>
 #include <array>

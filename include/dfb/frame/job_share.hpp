@@ -2,8 +2,8 @@
 // demand (guided self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with what is left.
 #pragma once
 
+#include <dfb/base/fifo.hpp>
 #include <dfb/comm/message.hpp>
-#include <dfb/detail/fifo.hpp>
 #include <dfb/frame.hpp>
 
 #include <algorithm>

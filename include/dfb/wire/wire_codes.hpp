@@ -2,7 +2,7 @@
 // Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -2,8 +2,8 @@
 #pragma once
 
 #include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/verdict.hpp>
 #include <dfb/exec.hpp>
+#include <dfb/frame/verdict.hpp>
 #include <dfb/fwd.hpp>
 #include <dfb/image.hpp>
 #include <dfb/pixel_op.hpp>

@@ -2,11 +2,11 @@
 // Nothing is made for a tile before its first input.
 #pragma once
 
+#include <dfb/blend/background_pixels.hpp>
 #include <dfb/dependency_tracker.hpp>
-#include <dfb/detail/background_pixels.hpp>
-#include <dfb/detail/manifest.hpp>
-#include <dfb/detail/operations.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/declarations.hpp>
+#include <dfb/frame/operations.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
 

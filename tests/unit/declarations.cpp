@@ -1,8 +1,8 @@
 // What ranks tell owners of their inputs, and what owners make of it.
 #include "catch.hpp"
 
-#include <dfb/detail/manifest.hpp>
 #include <dfb/error.hpp>
+#include <dfb/frame/declarations.hpp>
 
 #include <cstddef>
 #include <cstdint>
@@ -12,7 +12,7 @@
 #include <utility>
 #include <vector>
 
-namespace manifest_cases {
+namespace declarations_cases {
 
 namespace {
 
@@ -25,7 +25,7 @@ bool isMine(int rank, int tile) { return ownerOf(tile) == rank; }
 
 // All ranks at once; messages arrive as they are sent.
 struct Ranks {
-    dfb::detail::ManifestExchange of[ranks];
+    dfb::detail::Declarations of[ranks];
     std::vector<std::pair<int, int>> sent; // from, to
 
     // Returns what each owner knows in the end. The ranks from `declaring` on declare nothing: the frame fails.
@@ -75,7 +75,7 @@ using Sent = std::vector<std::pair<int, int>>;
 
 } // namespace
 
-TEST_CASE("Owners know what was declared, and only what they do not know yet is sent", "[manifest]")
+TEST_CASE("Owners know what was declared, and only what they do not know yet is sent", "[declarations]")
 {
     Ranks all;
     std::vector<Inputs> inputs{{{0, 7, 0}, {1, 7, 0}, {5, 7, 1}}, {{1, 8, 0}}, {}};
@@ -101,7 +101,7 @@ TEST_CASE("Owners know what was declared, and only what they do not know yet is 
     CHECK(all.sent == Sent{{0, 1}, {2, 0}, {2, 1}});
 }
 
-TEST_CASE("After a frame that failed everything is declared anew", "[manifest]")
+TEST_CASE("After a frame that failed everything is declared anew", "[declarations]")
 {
     Ranks all;
     std::vector<Inputs> inputs{{{1, 7, 0}}, {{2, 8, 0}}, {{0, 9, 0}}};
@@ -114,9 +114,9 @@ TEST_CASE("After a frame that failed everything is declared anew", "[manifest]")
     CHECK(all.sent.empty());
 }
 
-TEST_CASE("Manifests and answers that cannot be are refused", "[manifest]")
+TEST_CASE("Manifests and answers that cannot be are refused", "[declarations]")
 {
-    dfb::detail::ManifestExchange owner;
+    dfb::detail::Declarations owner;
     owner.newFrame(true);
     const auto outcome = [](const auto& call) -> std::string {
         try {
@@ -141,4 +141,4 @@ TEST_CASE("Manifests and answers that cannot be are refused", "[manifest]")
     CHECK(receive(3).find("after all ranks have declared") != std::string::npos);
 }
 
-} // namespace manifest_cases
+} // namespace declarations_cases

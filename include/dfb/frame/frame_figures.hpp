@@ -1,7 +1,7 @@
 // FrameFigures: numbers of one rank that all ranks get to know with the frame's verdict.
 #pragma once
 
-#include <dfb/detail/verdict.hpp>
+#include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
 #include <cstdint>

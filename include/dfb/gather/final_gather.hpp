@@ -3,12 +3,12 @@
 #pragma once
 
 #include <dfb/comm/compression.hpp>
-#include <dfb/detail/finished_record.hpp>
-#include <dfb/detail/image_gate.hpp>
-#include <dfb/detail/wire.hpp>
+#include <dfb/gather/image_gate.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/tile_op.hpp>
+#include <dfb/wire/finished_record.hpp>
+#include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>

@@ -9,14 +9,14 @@
 // from a multiple of 4 on. A payload that is compressed has its planes split into bytes before that, see PlaneFilter.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/message.hpp>
-#include <dfb/cpu.hpp>
-#include <dfb/detail/active_pixels.hpp>
-#include <dfb/detail/plane_filter.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/tile_layout.hpp>
-#include <dfb/wire_format.hpp>
+#include <dfb/wire/active_pixels.hpp>
+#include <dfb/wire/plane_filter.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <algorithm>
 #include <cmath>

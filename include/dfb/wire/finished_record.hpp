@@ -7,10 +7,10 @@
 // PlaneFilter leaves them. A record has a multiple of 16 bytes.
 #pragma once
 
-#include <dfb/detail/plane_filter.hpp>
-#include <dfb/detail/wire.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
+#include <dfb/wire/fragment_message.hpp>
+#include <dfb/wire/plane_filter.hpp>
 
 #include <algorithm>
 #include <array>

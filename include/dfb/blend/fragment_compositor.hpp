@@ -1,8 +1,8 @@
 // FragmentCompositor: walks the rows of a tile's fragments, and composites each run of pixels that the same ones cover.
 #pragma once
 
-#include <dfb/compositing.hpp>
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
+#include <dfb/blend/compositing.hpp>
 #include <dfb/fragment.hpp>
 
 #include <algorithm>

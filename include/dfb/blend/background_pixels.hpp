@@ -2,7 +2,7 @@
 // not be written again.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
 
 #include <algorithm>
 #include <cstddef>

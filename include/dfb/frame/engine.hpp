@@ -1,11 +1,11 @@
 // Engine: what is behind the door of a framebuffer: frames of one set of tiles, with operations of any type. What it
-// is made of is in detail/frame_engine.hpp, which a program that links dfb::compiled does not compile.
+// is made of is in frame/frame_engine.hpp, which a program that links dfb::compiled does not compile.
 #pragma once
 
 #include <dfb/comm/connection.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/detail/operations.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/operations.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile.hpp>
 #include <dfb/tile_layout.hpp>

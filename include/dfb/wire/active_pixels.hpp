@@ -2,9 +2,9 @@
 // spans.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
 #include <dfb/fragment.hpp>
-#include <dfb/wire_codes.hpp>
+#include <dfb/wire/wire_codes.hpp>
 
 #include <algorithm>
 #include <array>

@@ -2,7 +2,7 @@
 // four pixels at once. Each is there in plain C++ and, for processors that have it, by hand for AVX2.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
 
 #include <algorithm>
 #include <array>

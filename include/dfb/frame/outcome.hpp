@@ -3,10 +3,10 @@
 #pragma once
 
 #include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/open_frame.hpp>
-#include <dfb/detail/quiescence.hpp>
-#include <dfb/detail/tile_pipeline.hpp>
-#include <dfb/detail/verdict.hpp>
+#include <dfb/comm/quiescence.hpp>
+#include <dfb/frame/open_frame.hpp>
+#include <dfb/frame/tile_pipeline.hpp>
+#include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
 #include <atomic>

@@ -5,15 +5,15 @@
 #include <dfb/comm/compression_gains.hpp>
 #include <dfb/comm/compression_trial.hpp>
 #include <dfb/comm/mailbox.hpp>
-#include <dfb/detail/engine.hpp>
-#include <dfb/detail/frame_figures.hpp>
-#include <dfb/detail/hidden_tiles.hpp>
-#include <dfb/detail/job_share.hpp>
-#include <dfb/detail/manifest.hpp>
-#include <dfb/detail/open_frame.hpp>
-#include <dfb/detail/outcome.hpp>
-#include <dfb/detail/tile_pipeline.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/declarations.hpp>
+#include <dfb/frame/engine.hpp>
+#include <dfb/frame/frame_figures.hpp>
+#include <dfb/frame/hidden_tiles.hpp>
+#include <dfb/frame/job_share.hpp>
+#include <dfb/frame/open_frame.hpp>
+#include <dfb/frame/outcome.hpp>
+#include <dfb/frame/tile_pipeline.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -126,7 +126,7 @@ public:
         mailbox_->connection().throwIfFailed();
         params_ = params;
         terms_ = FrameTerms::of(params, rank());
-        manifests_.newFrame(
+        declarations_.newFrame(
             !outcome_->lastFailed()); // if it did, some owners may have what was declared in it, and others not
 
         TileInfo info;
@@ -263,7 +263,7 @@ public:
     {
         if (!params_.declared)
             throw InvalidArgument("declare() in a frame that was not begun with declared inputs");
-        if (manifests_.declared())
+        if (declarations_.declared())
             throw InvalidArgument("declare() a second time in a frame");
         for (const TileInput& input : inputs)
             if (input.tile < 0 || input.tile >= layout().tileCount())
@@ -271,7 +271,7 @@ public:
                                       + std::to_string(layout().tileCount()) + " tiles");
         if (outcome_->failed())
             return;
-        const bool isWaiting = manifests_.declare(
+        const bool isWaiting = declarations_.declare(
             inputs, rank(), [this](int tile) { return tileOwner(tile); },
             [this](int owner, const Bytes& manifest) {
                 mailbox_->send(owner, MessageKind::Manifest, open_.number(), manifest);
@@ -312,7 +312,7 @@ public:
 
     FrameReport end() override
     {
-        if (params_.declared && !manifests_.declared() && !outcome_->failed()) {
+        if (params_.declared && !declarations_.declared() && !outcome_->failed()) {
             const auto reason = open_.reason(); // why declare() was not called, in a frame that may be partial
             outcome_->failWhole(reason ? std::make_exception_ptr(Error(*reason))
                                        : std::make_exception_ptr(
@@ -581,7 +581,7 @@ private:
     void receiveDeclaration(int source, const MessageHeader& header, const Buffer& message)
     {
         if (header.kind == MessageKind::ManifestAck) {
-            if (manifests_.acknowledged(source))
+            if (declarations_.acknowledged(source))
                 enterAllDeclared();
             return;
         }
@@ -591,8 +591,8 @@ private:
             info.message = "the sender declares its inputs, this rank expects no declaration";
             throw Error(std::move(info));
         }
-        manifests_.receive(source, ByteReader(message.data() + sizeof header, message.size() - sizeof header),
-                           [this](int tile) { return pipeline_->table().isMine(tile); });
+        declarations_.receive(source, ByteReader(message.data() + sizeof header, message.size() - sizeof header),
+                              [this](int tile) { return pipeline_->table().isMine(tile); });
         mailbox_->send(source, MessageKind::ManifestAck, open_.number());
     }
 
@@ -658,7 +658,7 @@ private:
     // Every manifest is here: now it is known what each owned tile waits for.
     void applyDeclarations()
     {
-        manifests_.complete();
+        declarations_.complete();
         if (outcome_->failed())
             return;
         // A pixel operation that is not pointwise sees background tiles too.
@@ -667,7 +667,7 @@ private:
         const bool declared = outcome_->guarded(
             [&] {
                 pipeline_->table().declare(
-                    manifests_.expected(), all, where, [this](int) { open_.expectTiles(1); },
+                    declarations_.expected(), all, where, [this](int) { open_.expectTiles(1); },
                     [this](int tile) { submitFinish(tile); });
             },
             where);
@@ -774,7 +774,7 @@ private:
     Operations& operations_;
     std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
-    ManifestExchange manifests_;
+    Declarations declarations_;
     JobShare jobs_;
     HiddenTiles hidden_;
 

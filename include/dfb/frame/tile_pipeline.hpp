@@ -2,13 +2,13 @@
 // conversion, display rank.
 #pragma once
 
-#include <dfb/detail/final_gather.hpp>
-#include <dfb/detail/float_environment.hpp>
-#include <dfb/detail/operations.hpp>
-#include <dfb/detail/tile_table.hpp>
-#include <dfb/detail/wire.hpp>
-#include <dfb/detail/wire_losses.hpp>
+#include <dfb/base/float_environment.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/operations.hpp>
+#include <dfb/frame/tile_table.hpp>
+#include <dfb/gather/final_gather.hpp>
+#include <dfb/wire/fragment_message.hpp>
+#include <dfb/wire/wire_losses.hpp>
 
 #include <algorithm>
 #include <array>

@@ -6,7 +6,7 @@
 // an infinity or a NaN can therefore show in an opaque pixel, or not; nothing that is finite can.
 #pragma once
 
-#include <dfb/cpu.hpp>
+#include <dfb/base/cpu.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -9,10 +9,10 @@
 // again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
 #pragma once
 
+#include <dfb/base/double_double.hpp>
+#include <dfb/blend/blend_kernels.hpp>
+#include <dfb/blend/sort_kernels.hpp>
 #include <dfb/channels.hpp>
-#include <dfb/detail/blend_kernels.hpp>
-#include <dfb/detail/sort_kernels.hpp>
-#include <dfb/double_double.hpp>
 
 #include <algorithm>
 #include <cstddef>
