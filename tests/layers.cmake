@@ -7,16 +7,16 @@ set(level_0 channels.hpp comm/checksum.hpp comm/compression_gains.hpp comm/compr
             detail/hidden_tiles.hpp detail/quiescence.hpp detail/small_bytes.hpp fwd.hpp moments.hpp
             render/tile_loop.hpp testing/reference.hpp version.hpp)
 set(level_1 buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp cpu.hpp detail/float_environment.hpp
-            detail/plane_filter.hpp double_double.hpp error.hpp processors.hpp testing/error_report.hpp)
+            double_double.hpp error.hpp processors.hpp testing/error_report.hpp)
 set(level_2 comm/byte_io.hpp comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
             comm/transport.hpp detail/background_pixels.hpp detail/blend_kernels.hpp detail/image_gate.hpp
             detail/sort_kernels.hpp exec.hpp levels.hpp render/world.hpp wire_codes.hpp)
 set(level_3 comm/flow_control.hpp comm/link.hpp comm/reduction.hpp compositing.hpp detail/frame_gate.hpp image.hpp
-            tbb_executor.hpp testing/detail/conformance_tools.hpp wire_format.hpp)
+            detail/active_pixels.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp wire_format.hpp)
 set(level_4 comm/progress.hpp dither.hpp render/footprint.hpp testing/transport_conformance.hpp tile.hpp
             wall_layout.hpp)
 set(level_5 comm/connection.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
-set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp detail/active_pixels.hpp
+set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp detail/sparse_planes.hpp
             detail/wire_losses.hpp fragment_compositor.hpp frame.hpp tile_op.hpp)
 set(level_7 comm/mpi_session.hpp detail/frame_terms.hpp detail/job_share.hpp detail/manifest.hpp detail/wire.hpp
             ops/sort_last.hpp pixel_op.hpp render/image_parallel.hpp render/sampling.hpp render/visibility.hpp
