@@ -83,8 +83,6 @@ std::unique_ptr<bench::Scene> sceneOf(const std::string& name, int ranks, int wi
 
 // ---- the formulas, see bench/README.md
 
-std::int64_t alignedTo16(std::int64_t bytes) { return (bytes + 15) / 16 * 16; }
-
 // What a rank has for one tile.
 struct Input {
     int tile = 0;
@@ -118,7 +116,7 @@ std::vector<Input> inputsOf(const bench::PartialImage& image, const dfb::TileLay
             const std::int64_t pixels = static_cast<std::int64_t>(whole.width()) * whole.height();
             input.bytes = 64 + bytesPerInput * input.activePixels;
             if (input.activePixels > 0 && input.activePixels < pixels)
-                input.bytes += alignedTo16(2 * (last - first + 1) + 4 * spans);
+                input.bytes += 2 * (last - first + 1) + 4 * spans;
             inputs.push_back(input);
         }
     return inputs;

@@ -7,26 +7,26 @@ set(level_0 base/fifo.hpp base/small_bytes.hpp channels.hpp comm/checksum.hpp co
             comm/compression_trial.hpp comm/quiescence.hpp frame/hidden_tiles.hpp fwd.hpp ops/moments.hpp
             render/tile_loop.hpp testing/reference.hpp version.hpp)
 set(level_1 base/cpu.hpp base/double_double.hpp base/float_environment.hpp base/processors.hpp buffer.hpp
-            comm/compression.hpp comm/heartbeat.hpp compiled.hpp error.hpp testing/error_report.hpp
-            wire/plane_filter.hpp)
+            comm/compression.hpp comm/heartbeat.hpp compiled.hpp error.hpp testing/error_report.hpp)
 set(level_2 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
             comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
             gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_codes.hpp)
 set(level_3 blend/compositing.hpp comm/flow_control.hpp comm/link.hpp comm/reduction.hpp frame/open_frame.hpp
-            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp wire/wire_format.hpp)
+            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp wire/active_pixels.hpp
+            wire/wire_format.hpp)
 set(level_4 comm/progress.hpp dither.hpp render/footprint.hpp testing/transport_conformance.hpp tile.hpp
             wall_layout.hpp)
 set(level_5 comm/connection.hpp deep_tile.hpp dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_6 blend/fragment_compositor.hpp comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp frame.hpp
-            tile_op.hpp wire/active_pixels.hpp wire/wire_losses.hpp)
+            tile_op.hpp wire/sparse_planes.hpp wire/wire_losses.hpp)
 set(level_7 comm/mpi_session.hpp frame/declarations.hpp frame/frame_terms.hpp frame/job_share.hpp ops/sort_last.hpp
             pixel_op.hpp render/image_parallel.hpp render/sampling.hpp render/visibility.hpp
-            testing/fault_transport.hpp wire/fragment_message.hpp)
-set(level_8 frame/operations.hpp ops/image_parallel.hpp ops/pixel_ops.hpp ops/progressive.hpp render/cameras.hpp
-            render/data_parallel.hpp render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp
-            wire/finished_record.hpp)
-set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp gather/final_gather.hpp render/deep_parallel.hpp
-            render/mixed_parallel.hpp testing/adversarial.hpp)
+            testing/fault_transport.hpp wire/finished_record.hpp wire/fragment_message.hpp)
+set(level_8 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/pixel_ops.hpp ops/progressive.hpp
+            render/cameras.hpp render/data_parallel.hpp render/shared_world.hpp testing/tile_op_test.hpp
+            testing/verified.hpp)
+set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/mixed_parallel.hpp
+            testing/adversarial.hpp)
 set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp)
 set(level_11 display_wall.hpp frame/outcome.hpp)
 set(level_12 frame/frame_engine.hpp)

@@ -150,6 +150,7 @@ bool take(fuzz::Input in)
             with->compress(fuzz::bytesOf(payload), payload.size(), reinterpret_cast<std::byte*>(packed.data())));
         payload = packed;
         h.codec = with->id();
+        h.shape.isSplit = 1;
     }
     const std::string message = fuzz::Output().put(m).put(h).text(payload).bytes();
 

@@ -231,8 +231,8 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
          [](dfb::Buffer& m) {
              auto h = dfb::detail::loadAs<FragmentHeader>(m.data() + body);
              h.channels = dfb::colorChannel;
-             h.encoding = dfb::FragmentEncoding::Empty;
-             h.activePixels = h.rawPayloadBytes = 0;
+             h.shape = {};
+             h.rawPayloadBytes = 0;
              put(m, body, h);
              m.shrink(dfb::detail::fragmentPrefix);
          },

@@ -319,21 +319,6 @@ TEST_CASE("What is behind opaque layers is left out, and changes pixels by no mo
     }
 }
 
-TEST_CASE("Planes that were split come back", "[wire_format]")
-{
-    Random random(9);
-    for (const std::size_t wordBytes : {1u, 2u, 4u})
-        for (const std::size_t words : {1u, 3u, 4u})
-            for (const std::size_t byteCount : {0u, 4u, 12u, 48u, 100u, 4096u}) {
-                std::vector<std::byte> in(byteCount), split(byteCount), out(byteCount);
-                for (std::byte& byte : in)
-                    byte = static_cast<std::byte>(random() % (random() % 2 ? 256 : 3));
-                dfb::detail::PlaneFilter::split(in.data(), byteCount, wordBytes, words, split.data());
-                dfb::detail::PlaneFilter::join(split.data(), byteCount, wordBytes, words, out.data());
-                CHECK(out == in);
-            }
-}
-
 #if defined(DFB_HAS_SNAPPY)
 TEST_CASE("Compression changes nothing, in any format", "[wire_format]")
 {

@@ -1,18 +1,15 @@
-// ActivePixels: what of a tile travels: the pixels with any colour channel that is not 0, or those with a depth, as
-// spans.
+// Active pixels: which of a row travel, those with any colour channel that is not 0 or those with a depth; and copying
+// them, with a check.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
-#include <dfb/fragment.hpp>
+#include <dfb/channels.hpp>
 #include <dfb/wire/wire_codes.hpp>
 
-#include <algorithm>
-#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <vector>
 
 namespace dfb::detail {
 
@@ -179,139 +176,5 @@ inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::si
     std::memcpy(out, planes.at[channel] + bytes * first, bytes * static_cast<std::size_t>(count));
     return true;
 }
-
-// One per thread, to be used again and again. A pixel of colour 0 and alpha 0 contributes nothing, whatever its depth;
-// one with colour and alpha 0 is emission and does. By depth, what has one below +infinity does, and nothing else.
-struct ActivePixels {
-    std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
-    std::vector<Span> spans;
-    int rowBegin = 0, rowEnd = 0;
-    std::uint32_t pixels = 0;
-
-    // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
-    // `colors`, which has room for all pixels of the tile, and the rest to where plane() says. Each row is copied as
-    // soon as its spans are found: rows of a large image are far apart in memory, and so are read there once.
-    void gather(const InputPixels& tile, ChannelMask channels, bool byDepth, float* colors)
-    {
-        const ConstPlanes& planes = tile.planes();
-        const auto most =
-            static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
-        struct Target {
-            std::size_t channel;
-            std::byte* to;
-        };
-        std::array<Target, channelCount> targets{{{Color, reinterpret_cast<std::byte*>(colors)}}};
-        std::size_t targetCount = 1;
-        for (std::size_t c = Depth; c < channelCount; ++c)
-            if (hasChannel(channels, c)) {
-                planes_[c].resize(std::max(planes_[c].size(), most * static_cast<std::size_t>(channelWords[c])));
-                targets[targetCount++] = {c, reinterpret_cast<std::byte*>(planes_[c].data())};
-            }
-        bool isClean = true;
-        find(tile, byDepth, [&](std::size_t first, int count) {
-            for (std::size_t i = 0; i < targetCount; ++i) {
-                const auto [channel, to] = targets[i];
-                isClean &= copyAndCheck(planes, channel, first, count, to);
-                targets[i].to += 4 * static_cast<std::size_t>(channelWords[channel]) * static_cast<std::size_t>(count);
-            }
-        });
-        isClean_ = isClean;
-    }
-    const std::byte* plane(std::size_t channel) const noexcept
-    {
-        return reinterpret_cast<const std::byte*>(planes_[channel].data());
-    }
-    // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
-    bool mayBeFaulty() const noexcept { return !isClean_; }
-    // Pixels that are not active because their depth is NaN.
-    std::uint64_t nanDepths() const noexcept { return nanDepths_; }
-
-    // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
-    template <class F>
-    void find(const InputPixels& tile, bool byDepth, const F& f)
-    {
-        rowCounts.clear();
-        spans.clear();
-        rowBegin = rowEnd = 0;
-        pixels = 0;
-        nanDepths_ = 0;
-        const float* depths = byDepth ? floatsOf(tile.planes().at[Depth]) : nullptr;
-        const Region valid = tile.valid;
-        const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
-        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
-        const int ahead = width < 64 ? 1 : std::max(1, 384 / width); // rows: 6 KiB were best where it was measured
-        for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const std::size_t before = spans.size(), begin = static_cast<std::size_t>(y) * tile.stride;
-            if (y + ahead < yEnd)
-                prefetch(tile.pixel(x0, y + ahead), width);
-            if (depths)
-                findSpans(x0, x0 + width, [&](int x, int count) {
-                    const DepthBits bits = depthBits(depths + begin + static_cast<std::size_t>(x), count);
-                    for (std::uint64_t nan = bits.nan; nan != 0; nan &= nan - 1)
-                        ++nanDepths_;
-                    return bits.active;
-                });
-            else
-                findSpans(x0, x0 + width, [&](int x, int count) { return activePixelBits(tile.pixel(x, y), count); });
-            for (std::size_t i = before; i < spans.size(); ++i) {
-                f(begin + spans[i].x, static_cast<int>(spans[i].count));
-                pixels += spans[i].count;
-            }
-            const auto count = static_cast<std::uint16_t>(spans.size() - before);
-            if (count > 0 && rowEnd == 0)
-                rowBegin = y;
-            if (count > 0)
-                rowEnd = y + 1;
-            if (rowEnd > 0)
-                rowCounts.push_back(count);
-        }
-        rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin));
-    }
-
-    // The same for those that were found in `tile`.
-    template <class F>
-    void forEachSpan(const InputPixels& tile, const F& f) const
-    {
-        const Span* span = spans.data();
-        for (std::size_t row = 0; row < rowCounts.size(); ++row) {
-            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * tile.stride;
-            for (int i = 0; i < rowCounts[row]; ++i, ++span)
-                f(begin + span->x, static_cast<int>(span->count));
-        }
-    }
-
-private:
-    // No processor knows by itself where the next row of an image begins.
-    static void prefetch(const float* row, int width)
-    {
-#if defined(__GNUC__)
-        for (int x = 0; x < width; x += 4)
-            __builtin_prefetch(row + 4 * x);
-#else
-        (void)row, (void)width;
-#endif
-    }
-
-    // Of pixels [begin, end) of a row; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active.
-    template <class BitsOfSome>
-    void findSpans(int begin, int end, const BitsOfSome& bitsOfSome)
-    {
-        const std::size_t before = spans.size();
-        for (int x0 = begin; x0 < end; x0 += 64) {
-            const int count = std::min(64, end - x0);
-            forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
-                const int x = x0 + at;
-                if (spans.size() > before && spans.back().x + spans.back().count == x)
-                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
-                else
-                    spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
-            });
-        }
-    }
-
-    std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such
-    bool isClean_ = true;
-    std::uint64_t nanDepths_ = 0;
-};
 
 } // namespace dfb::detail

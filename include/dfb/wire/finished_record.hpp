@@ -1,16 +1,13 @@
 // FinishedRecord: a finished tile in a message to the display rank, without the pixels that are all alike, as those of
 // the background are.
 //
-// After the header come, with Form::Runs, one pixel, which fills what has no other, and then in both forms the planes,
-// in the order of their channels, each from a multiple of 4 bytes on. Form::Runs goes on with the runs of pixels that
-// the planes have, Span by Span, and how many of them each row has, as uint16. What is `split` has its planes as
-// PlaneFilter leaves them. A record has a multiple of 16 bytes.
+// After the header come one pixel, which fills what has no other, unless all travel (Dense), and a body as in
+// sparse_planes.hpp: Empty, Sparse or Dense. A record has a multiple of 16 bytes.
 #pragma once
 
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
-#include <dfb/wire/fragment_message.hpp>
-#include <dfb/wire/plane_filter.hpp>
+#include <dfb/wire/sparse_planes.hpp>
 
 #include <algorithm>
 #include <array>
@@ -30,121 +27,91 @@ struct FinishedPlanes {
 // What it makes and reads records of: the format and the channels of an image.
 class FinishedRecord {
 public:
-    enum class Form : std::uint8_t { Dense, Runs };
-
     struct Header {
         std::int32_t tile = 0;
-        std::uint32_t pixels = 0; // in the planes
-        std::uint16_t spans = 0;
-        Form form = Form::Dense;
-        std::uint8_t isSplit = 0;
-        std::uint32_t bytes = 0; // of the record
+        SparseShape shape;
     };
     static_assert(sizeof(Header) == 16);
 
     // `channels`: beside the colour.
     FinishedRecord(OutputFormat format, ChannelMask channels)
+        : format_(static_cast<ChannelMask>(channels | colorChannel), bytesPerPixel(format) / 4)
     {
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (c == Color || hasChannel(channels, c)) {
-                const std::size_t words = static_cast<std::size_t>(channelWords[c]);
-                pixelBytes_[c] = c == Color ? bytesPerPixel(format) : 4 * words;
-                wordBytes_[c] = pixelBytes_[c] / words;
-            }
     }
 
     // Of a pixel in a channel; 0 if the image does not have it.
-    std::size_t pixelBytes(std::size_t channel) const noexcept { return pixelBytes_[channel]; }
-    // In all channels; a multiple of 4, as all are.
-    std::size_t pixelBytes() const noexcept
-    {
-        std::size_t bytes = 0;
-        for (const std::size_t each : pixelBytes_)
-            bytes += each;
-        return bytes;
-    }
+    std::size_t pixelBytes(std::size_t channel) const noexcept { return format_.pixelBytes(channel); }
+    std::size_t pixelBytes() const noexcept { return format_.pixelBytes(); } // in all channels
     // Of a record with so many pixels, the most.
-    std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + planesBytes(pixels)); }
+    std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
     // What is to be written of a tile, found by one pass over it; kept from tile to tile, as it has memory.
     class Plan {
     public:
-        std::size_t bytes() const noexcept { return header_.bytes; }
+        std::size_t bytes() const noexcept { return bytes_; }
 
     private:
         friend class FinishedRecord;
         Header header_;
         FinishedPlanes from_;
-        Region region_;
         std::size_t filler_ = 0; // place of the pixel
-        std::vector<Span> spans_;
-        std::vector<std::uint16_t> rowCounts_;
-        std::vector<std::byte> packed_;
+        std::size_t bytes_ = 0;
+        ActiveSpans active_; // what is not like it
+        std::vector<std::byte> body_;
     };
 
     void plan(int tile, const Region& region, const FinishedPlanes& from, bool splits, Plan& plan) const
     {
         plan.from_ = from;
-        plan.region_ = region;
         plan.filler_ = fillerOf(region, from);
-        plan.spans_.clear();
-        plan.rowCounts_.clear();
-        const auto pixels = static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
-        Header& h = plan.header_;
-        h = Header();
-        h.tile = tile;
-        h.isSplit = splits;
-        h.bytes = static_cast<std::uint32_t>(mostBytes(pixels));
-        std::size_t stored = 0;
+        ActiveSpans& active = plan.active_;
+        active.clear();
         for (int y = 0; y < region.height(); ++y) {
-            const std::size_t before = plan.spans_.size();
-            stored += findRuns(plan, y);
-            plan.rowCounts_.push_back(static_cast<std::uint16_t>(plan.spans_.size() - before));
+            const std::size_t first = static_cast<std::size_t>(y) * from.stride;
+            active.findRow(
+                y, 0, region.width(),
+                [&](int x, int count) {
+                    return findDifferent(from, first + static_cast<std::size_t>(x), plan.filler_, count);
+                },
+                [](Span) {});
         }
-        const std::size_t bytes = alignedTo16(sizeof(Header) + pixelBytes() + planesBytes(stored)
-                                              + tableBytes(plan.spans_.size(), plan.rowCounts_.size()));
-        if (bytes < h.bytes && plan.spans_.size() <= 0xffff) {
-            h.form = Form::Runs;
-            h.bytes = static_cast<std::uint32_t>(bytes);
-            h.pixels = static_cast<std::uint32_t>(stored);
-            h.spans = static_cast<std::uint16_t>(plan.spans_.size());
-        } else {
-            h.pixels = static_cast<std::uint32_t>(pixels);
-            plan.spans_.assign(plan.rowCounts_.size(), {0, static_cast<std::uint16_t>(region.width())});
-            plan.rowCounts_.assign(plan.rowCounts_.size(), 1);
+        active.endRows();
+        SparseShape& shape = plan.header_.shape;
+        shape = active.shapeIn(region);
+        if (const std::size_t dense = mostBytes(static_cast<std::size_t>(region.width() * region.height()));
+            shape.encoding != FragmentEncoding::Dense && bytesOf(shape) >= dense) {
+            active.setAll(region);
+            shape = active.shapeIn(region);
         }
+        shape.isSplit = splits;
+        plan.header_.tile = tile;
+        plan.bytes_ = bytesOf(shape);
     }
 
     // Writes plan.bytes() bytes.
     void write(Plan& plan, std::byte* out) const
     {
-        std::byte* const end = out + plan.bytes();
-        std::memset(end - 16, 0, 16); // what fills it up
+        std::memset(out + plan.bytes() - 16, 0, 16); // what fills it up
         const Header& h = plan.header_;
         std::memcpy(out, &h, sizeof h);
         out += sizeof h;
-        for (std::size_t c = 0; c < channelCount && h.form == Form::Runs; ++c)
-            if (pixelBytes_[c] > 0) {
-                std::memcpy(out, plan.from_.planes.at[c] + pixelBytes_[c] * plan.filler_, pixelBytes_[c]);
-                out += pixelBytes_[c];
-            }
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (pixelBytes_[c] > 0) {
-                const std::size_t bytes = pixelBytes_[c] * h.pixels;
-                if (h.isSplit) {
-                    plan.packed_.resize(std::max(plan.packed_.size(), bytes));
-                    pack(plan, c, plan.packed_.data());
-                    PlaneFilter::split(plan.packed_.data(), bytes, wordBytes_[c], wordsOf(c), out);
-                } else {
-                    pack(plan, c, out);
-                }
-                out += bytes;
-            }
-        if (h.form == Form::Runs) {
-            auto* spans = reinterpret_cast<Span*>(out);
-            auto* counts = reinterpret_cast<std::uint16_t*>(std::copy(plan.spans_.begin(), plan.spans_.end(), spans));
-            std::copy(plan.rowCounts_.begin(), plan.rowCounts_.end(), counts);
-        }
+        if (fillerBytes(h.shape) > 0)
+            out += format_.forEachPlane(1, [&](std::size_t c, std::size_t at, std::size_t bytes) {
+                std::memcpy(out + at, plan.from_.planes.at[c] + bytes * plan.filler_, bytes);
+            });
+        if (h.shape.isSplit)
+            plan.body_.resize(std::max(plan.body_.size(), format_.bodyBytes(h.shape)));
+        std::byte* const body = h.shape.isSplit ? plan.body_.data() : out;
+        encodeSparse(format_, h.shape, plan.active_, body, [&](std::size_t c, std::byte* to, std::size_t) {
+            const std::size_t each = pixelBytes(c);
+            plan.active_.forEachSpan(plan.from_.stride, [&](std::size_t first, int count) {
+                const std::size_t bytes = each * static_cast<std::size_t>(count);
+                std::memcpy(to, plan.from_.planes.at[c] + each * first, bytes);
+                to += bytes;
+            });
+        });
+        if (h.shape.isSplit)
+            format_.split(h.shape, body, out);
     }
 
     // Checks the record that begins at `in`, of which there are `left` bytes at most, calls `place(tile, region)` for
@@ -156,60 +123,47 @@ public:
         if (left < sizeof(Header))
             failMalformed("a finished tile is too short");
         const auto h = loadAs<Header>(in);
+        const SparseShape& shape = h.shape;
         if (h.tile < 0 || h.tile >= layout.tileCount())
             failMalformed("a finished tile outside the image", layout.tileCount() - 1, h.tile);
         const Region region = layout.region(h.tile);
-        const auto rows = static_cast<std::size_t>(region.height());
-        const std::size_t pixels = static_cast<std::size_t>(region.width()) * rows;
-        const bool hasRuns = h.form == Form::Runs;
-        if (h.form > Form::Runs || h.pixels > pixels || (!hasRuns && h.pixels != pixels))
-            failMalformed("a finished tile with more or fewer pixels than it has", static_cast<std::int64_t>(pixels),
-                          h.pixels);
-        const std::size_t bytes =
-            alignedTo16(sizeof h + planesBytes(h.pixels) + (hasRuns ? pixelBytes() + tableBytes(h.spans, rows) : 0));
-        if (h.bytes != bytes || left < bytes)
+        shape.check(region);
+        if (shape.encoding == FragmentEncoding::Constant)
+            failMalformed("unknown encoding of a finished tile", -1, static_cast<std::int64_t>(shape.encoding));
+        const std::size_t bytes = bytesOf(shape);
+        if (left < bytes)
             failMalformed("a finished tile is too short", static_cast<std::int64_t>(bytes),
-                          static_cast<std::int64_t>(std::min<std::size_t>(h.bytes, left)));
-        const std::byte* filler = in + sizeof h;
-        const std::byte* plane = filler + (hasRuns ? pixelBytes() : 0);
-        const auto* spans = reinterpret_cast<const Span*>(plane + planesBytes(h.pixels));
-        const auto* counts = reinterpret_cast<const std::uint16_t*>(spans + h.spans);
-        if (hasRuns)
-            checkRuns(h, region, spans, counts);
-        const FinishedPlanes to = place(h.tile, region);
+                          static_cast<std::int64_t>(left));
+        const ConstPlanes filler = format_.planesAt(in + sizeof h, 1);
+        const std::byte* from = in + sizeof h + fillerBytes(shape);
         static thread_local std::vector<std::byte> joined;
-        for (std::size_t c = 0; c < channelCount; ++c) {
-            if (pixelBytes_[c] == 0)
-                continue;
-            const std::size_t planeBytes = pixelBytes_[c] * h.pixels;
-            const std::byte* from = plane;
-            if (h.isSplit) {
-                joined.resize(std::max(joined.size(), planeBytes));
-                PlaneFilter::join(plane, planeBytes, wordBytes_[c], wordsOf(c), joined.data());
-                from = joined.data();
-            }
-            if (hasRuns)
-                unpackRuns(c, region, spans, counts, filler, from, to);
-            else
-                unpackRows(c, region, from, to);
-            filler += hasRuns ? pixelBytes_[c] : 0;
-            plane += planeBytes;
+        if (shape.isSplit) {
+            joined.resize(std::max(joined.size(), format_.bodyBytes(shape)));
+            format_.join(shape, from, joined.data());
+            from = joined.data();
         }
+        const SparseBody body = decodeSparse(format_, shape, region.width(), from);
+        const FinishedPlanes to = place(h.tile, region);
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (pixelBytes(c) > 0)
+                unpack(c, region, shape, body, filler.at[c], to);
         return bytes;
     }
 
 private:
-    static std::size_t wordsOf(std::size_t channel) { return static_cast<std::size_t>(channelWords[channel]); }
-    std::size_t planesBytes(std::size_t pixels) const { return pixelBytes() * pixels; }
-    static std::size_t tableBytes(std::size_t spans, std::size_t rows)
+    std::size_t fillerBytes(const SparseShape& shape) const
     {
-        return sizeof(Span) * spans + sizeof(std::uint16_t) * rows;
+        return shape.encoding == FragmentEncoding::Dense ? 0 : pixelBytes();
+    }
+    std::size_t bytesOf(const SparseShape& shape) const
+    {
+        return alignedTo16(sizeof(Header) + fillerBytes(shape) + format_.bodyBytes(shape));
     }
 
     bool areAlike(const FinishedPlanes& planes, std::size_t a, std::size_t b) const
     {
         for (std::size_t c = 0; c < channelCount; ++c)
-            if (const std::size_t bytes = pixelBytes_[c];
+            if (const std::size_t bytes = pixelBytes(c);
                 bytes > 0 && std::memcmp(planes.planes.at[c] + bytes * a, planes.planes.at[c] + bytes * b, bytes) != 0)
                 return false;
         return true;
@@ -229,47 +183,33 @@ private:
                                  [&](std::size_t a, std::size_t b) { return likes(a) < likes(b); });
     }
 
-    // The runs of a row that are not like the filler. Returns how many pixels they have.
-    std::size_t findRuns(Plan& plan, int y) const
+    // Which of up to 64 pixels are not like the filler, bit by bit.
+    std::uint64_t findDifferent(const FinishedPlanes& from, std::size_t first, std::size_t filler, int count) const
     {
-        const std::size_t first = static_cast<std::size_t>(y) * plan.from_.stride;
-        const auto width = static_cast<std::size_t>(plan.region_.width());
-        static thread_local std::vector<std::uint8_t> scratch;
-        scratch.assign(width, 0);
-        std::uint8_t* differs = scratch.data();
+        std::uint8_t differs[64] = {};
         for (std::size_t c = 0; c < channelCount; ++c) {
-            const std::byte* plane = plan.from_.planes.at[c];
-            if (pixelBytes_[c] == 16)
-                findDifferent<16>(plane, first, plan.filler_, width, differs);
-            else if (pixelBytes_[c] == 12)
-                findDifferent<12>(plane, first, plan.filler_, width, differs);
-            else if (pixelBytes_[c] == 4)
-                findDifferent<4>(plane, first, plan.filler_, width, differs);
+            const std::byte* plane = from.planes.at[c];
+            if (pixelBytes(c) == 16)
+                findDifferent<16>(plane, first, filler, count, differs);
+            else if (pixelBytes(c) == 12)
+                findDifferent<12>(plane, first, filler, count, differs);
+            else if (pixelBytes(c) == 4)
+                findDifferent<4>(plane, first, filler, count, differs);
         }
-        std::size_t count = 0;
-        for (std::size_t x = 0; x < width;) {
-            if (!differs[x]) {
-                ++x;
-                continue;
-            }
-            std::size_t end = x + 1;
-            while (end < width && differs[end])
-                ++end;
-            plan.spans_.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(end - x)});
-            count += end - x;
-            x = end;
-        }
-        return count;
+        std::uint64_t bits = 0;
+        for (int i = 0; i < count; ++i)
+            bits |= std::uint64_t{differs[i]} << i;
+        return bits;
     }
 
     template <std::size_t Bytes>
-    static void findDifferent(const std::byte* plane, std::size_t first, std::size_t filler, std::size_t width,
+    static void findDifferent(const std::byte* plane, std::size_t first, std::size_t filler, int count,
                               std::uint8_t* differs)
     {
         constexpr std::size_t words = Bytes / 4;
         std::uint32_t wanted[words], word[words];
         std::memcpy(wanted, plane + Bytes * filler, Bytes);
-        for (std::size_t x = 0; x < width; ++x) {
+        for (std::size_t x = 0; x < static_cast<std::size_t>(count); ++x) {
             std::memcpy(word, plane + Bytes * (first + x), Bytes);
             std::uint32_t different = 0;
             for (std::size_t w = 0; w < words; ++w)
@@ -278,66 +218,42 @@ private:
         }
     }
 
-    void pack(const Plan& plan, std::size_t channel, std::byte* out) const
+    void unpack(std::size_t channel, const Region& region, const SparseShape& shape, const SparseBody& body,
+                const std::byte* filler, const FinishedPlanes& to) const
     {
-        const std::size_t bytes = pixelBytes_[channel];
-        const Span* span = plan.spans_.data();
-        for (std::size_t y = 0; y < plan.rowCounts_.size(); ++y) {
-            const std::byte* row = plan.from_.planes.at[channel] + bytes * plan.from_.stride * y;
-            for (int i = 0; i < plan.rowCounts_[y]; ++i, ++span) {
-                std::memcpy(out, row + bytes * span->x, bytes * span->count);
-                out += bytes * span->count;
-            }
-        }
-    }
-
-    static void checkRuns(const Header& h, const Region& region, const Span* span, const std::uint16_t* counts)
-    {
-        std::uint32_t spans = 0, pixels = 0;
-        for (int y = 0; y < region.height(); ++y) {
-            int x = 0;
-            if ((spans += counts[y]) > h.spans)
-                failMalformed("more runs in the rows of a finished tile than in all", h.spans, spans);
-            for (int i = 0; i < counts[y]; ++i, ++span) {
-                if (span->x < x || span->count == 0 || span->x + span->count > region.width())
-                    failMalformed("a run of a finished tile outside its row", region.width(), span->x + span->count);
-                x = span->x + span->count;
-                pixels += span->count;
-            }
-        }
-        if (spans != h.spans || pixels != h.pixels)
-            failMalformed("the runs of a finished tile do not add up to its pixels", h.pixels, pixels);
-    }
-
-    void unpackRows(std::size_t channel, const Region& region, const std::byte* from, const FinishedPlanes& to) const
-    {
-        const std::size_t row = pixelBytes_[channel] * static_cast<std::size_t>(region.width());
-        for (std::size_t y = 0; y < static_cast<std::size_t>(region.height()); ++y)
-            std::memcpy(to.planes.at[channel] + pixelBytes_[channel] * to.stride * y, from + row * y, row);
-    }
-
-    void unpackRuns(std::size_t channel, const Region& region, const Span* span, const std::uint16_t* counts,
-                    const std::byte* filler, const std::byte* from, const FinishedPlanes& to) const
-    {
-        const std::size_t bytes = pixelBytes_[channel];
+        const std::size_t bytes = pixelBytes(channel);
+        const std::byte* from = body.planes.at[channel];
+        const Span* span = body.spans;
+        const Span whole{0, static_cast<std::uint16_t>(region.width())};
         const auto fill = [&](std::byte* row, int begin, int end) {
-            for (int x = begin; x < end; ++x)
-                std::memcpy(row + bytes * static_cast<std::size_t>(x), filler, bytes);
+            std::byte* const first = row + bytes * static_cast<std::size_t>(begin);
+            const std::size_t all = end > begin ? bytes * static_cast<std::size_t>(end - begin) : 0;
+            for (std::size_t done = 0; done < all; done = std::max(bytes, 2 * done)) // twice as many each time
+                std::memcpy(first + done, done > 0 ? first : filler, std::min(std::max(done, bytes), all - done));
+        };
+        const auto copy = [&](std::byte* row, Span its) {
+            std::memcpy(row + bytes * its.x, from, bytes * its.count);
+            from += bytes * its.count;
         };
         for (int y = 0; y < region.height(); ++y) {
             std::byte* row = to.planes.at[channel] + bytes * to.stride * static_cast<std::size_t>(y);
+            if (shape.encoding == FragmentEncoding::Dense) {
+                copy(row, whole);
+                continue;
+            }
+            const bool hasSpans = body.rowCounts && y >= shape.rowBegin && y < shape.rowEnd;
             int x = 0;
-            for (int i = 0; i < counts[y]; ++i, ++span) {
+            for (int i = hasSpans ? body.rowCounts[y - shape.rowBegin] : 0; i > 0; --i) {
                 fill(row, x, span->x);
-                std::memcpy(row + bytes * span->x, from, bytes * span->count);
-                from += bytes * span->count;
+                copy(row, *span);
                 x = span->x + span->count;
+                ++span;
             }
             fill(row, x, region.width());
         }
     }
 
-    std::array<std::size_t, channelCount> pixelBytes_{}, wordBytes_{};
+    PlaneFormat format_;
 };
 
 } // namespace dfb::detail

@@ -1,0 +1,430 @@
+// Sparse planes: which pixels of a region are active, as spans, and what these have, as planes. All pixels travel so,
+// those of inputs and those of finished tiles; what differs is which are active, and the bytes that they have.
+//
+// A SparseShape is in the header of the message, the body goes on with
+//   Sparse:    planes | spans | uint16 span counts of the rows [rowBegin, rowEnd)
+//   Dense:     planes: all pixels of the region row by row
+//   Constant:  planes: one pixel
+//   Empty:     nothing
+// The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ..., each
+// from a multiple of 4 on. A body that is split has its planes as PlaneFilter leaves them.
+#pragma once
+
+#include <dfb/comm/message.hpp>
+#include <dfb/fragment.hpp>
+#include <dfb/wire/active_pixels.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <vector>
+
+namespace dfb::detail {
+
+inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
+
+struct SparseShape {
+    std::uint32_t pixels = 0;                          // that are active
+    std::uint16_t spans = 0, rowBegin = 0, rowEnd = 0; // Sparse
+    FragmentEncoding encoding = FragmentEncoding::Empty;
+    std::uint8_t isSplit = 0;
+
+    std::size_t stored() const noexcept { return encoding == FragmentEncoding::Constant ? 1 : pixels; }
+    std::size_t tableBytes() const noexcept
+    {
+        return encoding == FragmentEncoding::Sparse
+                   ? sizeof(Span) * spans + sizeof(std::uint16_t) * static_cast<std::size_t>(rowEnd - rowBegin)
+                   : 0;
+    }
+    // Throws Error (MalformedMessage) unless a region of this size may have it.
+    void check(const Region& region) const
+    {
+        const auto all = static_cast<std::uint32_t>(region.width() * region.height());
+        if (encoding > FragmentEncoding::Constant)
+            failMalformed("unknown encoding", -1, static_cast<std::int64_t>(encoding));
+        const std::uint32_t wanted = encoding == FragmentEncoding::Empty ? 0 : all;
+        const bool isSparse = encoding == FragmentEncoding::Sparse;
+        if (isSparse ? pixels > all : pixels != wanted)
+            failMalformed("wrong number of pixels", wanted, pixels);
+        if (isSparse && (rowBegin >= rowEnd || rowEnd > region.height()))
+            failMalformed("rows outside the tile", region.height(), rowEnd);
+        if (isSparse && spans > pixels)
+            failMalformed("more spans than pixels", pixels, spans);
+    }
+};
+static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
+
+// What makes a plane of pixels easier to compress. Neighbouring pixels are alike in the upper bits of each
+// word and rarely in the lower ones: so each word becomes its difference to that of the pixel before, small ones of
+// either sign with zeros at the top, and the planes of equal bytes are stored one after the other. (The bytes of floats
+// as they stand hide from a codec that looks for repetitions what they have in common.)
+class PlaneFilter {
+public:
+    // `byteCount` bytes of pixels that have `words` words of `wordBytes` (1, 2 or 4) each; a rest that is no whole
+    // pixel is copied.
+    static void split(const std::byte* in, std::size_t byteCount, std::size_t wordBytes, std::size_t words,
+                      std::byte* out)
+    {
+        byWord(wordBytes, [&](auto zero) { splitWords(zero, in, byteCount, words, out); });
+    }
+    // The inverse.
+    static void join(const std::byte* in, std::size_t byteCount, std::size_t wordBytes, std::size_t words,
+                     std::byte* out)
+    {
+        byWord(wordBytes, [&](auto zero) { joinWords(zero, in, byteCount, words, out); });
+    }
+
+private:
+    template <class Call>
+    static void byWord(std::size_t wordBytes, const Call& call)
+    {
+        if (wordBytes == 4)
+            call(std::uint32_t{0});
+        else if (wordBytes == 2)
+            call(std::uint16_t{0});
+        else
+            call(std::uint8_t{0});
+    }
+
+    template <class Word>
+    static void splitWords(Word, const std::byte* in, std::size_t byteCount, std::size_t words, std::byte* out)
+    {
+        constexpr std::size_t size = sizeof(Word);
+        constexpr int top = 8 * static_cast<int>(size) - 1;
+        const std::size_t pixels = byteCount / (size * words), count = pixels * words;
+        for (std::size_t w = 0; w < words; ++w) {
+            Word before = 0;
+            std::byte* to = out + w * pixels;
+            for (std::size_t i = 0; i < pixels; ++i) {
+                Word word = 0;
+                std::memcpy(&word, in + (i * words + w) * size, size);
+                const auto difference = static_cast<Word>(word - before);
+                const auto folded =
+                    static_cast<Word>(static_cast<Word>(difference << 1)
+                                      ^ static_cast<Word>(difference >> top ? Word(~Word{0}) : Word{0}));
+                for (std::size_t b = 0; b < size; ++b)
+                    to[b * count + i] = static_cast<std::byte>(folded >> (8 * b));
+                before = word;
+            }
+        }
+        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
+    }
+
+    template <class Word>
+    static void joinWords(Word, const std::byte* in, std::size_t byteCount, std::size_t words, std::byte* out)
+    {
+        constexpr std::size_t size = sizeof(Word);
+        const std::size_t pixels = byteCount / (size * words), count = pixels * words;
+        for (std::size_t w = 0; w < words; ++w) {
+            Word before = 0;
+            const std::byte* from = in + w * pixels;
+            for (std::size_t i = 0; i < pixels; ++i) {
+                Word folded = 0;
+                for (std::size_t b = 0; b < size; ++b)
+                    folded = static_cast<Word>(folded
+                                               | static_cast<Word>(static_cast<Word>(from[b * count + i]) << (8 * b)));
+                const auto difference = static_cast<Word>(static_cast<Word>(folded >> 1)
+                                                          ^ static_cast<Word>(folded & 1 ? Word(~Word{0}) : Word{0}));
+                before = static_cast<Word>(before + difference);
+                std::memcpy(out + (i * words + w) * size, &before, size);
+            }
+        }
+        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
+    }
+};
+
+// The bytes of a pixel in each channel; none in those that do not travel.
+class PlaneFormat {
+public:
+    PlaneFormat(ChannelMask channels, std::size_t colorWordBytes)
+    {
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (hasChannel(channels, c)) {
+                wordBytes_[c] = c == Color ? colorWordBytes : 4;
+                pixelBytes_ += pixelBytes(c);
+            }
+    }
+    std::size_t pixelBytes() const noexcept { return pixelBytes_; } // a multiple of 4, as all are
+    std::size_t pixelBytes(std::size_t channel) const noexcept { return wordBytes_[channel] * wordsOf(channel); }
+    std::size_t bodyBytes(const SparseShape& shape) const noexcept
+    {
+        return pixelBytes_ * shape.stored() + shape.tableBytes();
+    }
+
+    // Calls f(channel, its place, its bytes) for each plane of so many pixels. Returns where the last ends.
+    template <class F>
+    std::size_t forEachPlane(std::size_t pixels, const F& f) const
+    {
+        std::size_t at = 0;
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (const std::size_t bytes = pixelBytes(c) * pixels; wordBytes_[c] > 0) {
+                f(c, at, bytes);
+                at += bytes;
+            }
+        return at;
+    }
+    // `Byte` may be const.
+    template <class Byte>
+    BasicPlanes<Byte> planesAt(Byte* body, std::size_t pixels) const
+    {
+        BasicPlanes<Byte> planes;
+        forEachPlane(pixels, [&](std::size_t c, std::size_t at, std::size_t) { planes.at[c] = body + at; });
+        return planes;
+    }
+
+    void split(const SparseShape& shape, const std::byte* in, std::byte* out) const
+    {
+        transform(shape, in, out, PlaneFilter::split);
+    }
+    void join(const SparseShape& shape, const std::byte* in, std::byte* out) const
+    {
+        transform(shape, in, out, PlaneFilter::join);
+    }
+
+private:
+    static std::size_t wordsOf(std::size_t channel) { return static_cast<std::size_t>(channelWords[channel]); }
+    template <class Transform>
+    void transform(const SparseShape& shape, const std::byte* in, std::byte* out, const Transform& call) const
+    {
+        const std::size_t end = forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t bytes) {
+            call(in + at, bytes, wordBytes_[c], wordsOf(c), out + at);
+        });
+        std::memcpy(out + end, in + end, shape.tableBytes());
+    }
+
+    std::array<std::size_t, channelCount> wordBytes_{};
+    std::size_t pixelBytes_ = 0;
+};
+
+// Where the active pixels of a region are. Kept from tile to tile, as it has memory.
+struct ActiveSpans {
+    std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
+    std::vector<Span> spans;
+    int rowBegin = 0, rowEnd = 0;
+    std::uint32_t pixels = 0;
+
+    void clear()
+    {
+        rowCounts.clear();
+        spans.clear();
+        rowBegin = rowEnd = 0;
+        pixels = 0;
+    }
+
+    // Of pixels [begin, end) of row y; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active. Calls
+    // f(span) for each that it has found. Rows come from top to bottom, then endRows().
+    template <class BitsOfSome, class F>
+    void findRow(int y, int begin, int end, const BitsOfSome& bitsOfSome, const F& f)
+    {
+        const std::size_t before = spans.size();
+        for (int x0 = begin; x0 < end; x0 += 64) {
+            const int count = std::min(64, end - x0);
+            forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
+                const int x = x0 + at;
+                if (spans.size() > before && spans.back().x + spans.back().count == x)
+                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
+                else
+                    spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
+            });
+        }
+        for (std::size_t i = before; i < spans.size(); ++i) {
+            f(spans[i]);
+            pixels += spans[i].count;
+        }
+        const auto count = static_cast<std::uint16_t>(spans.size() - before);
+        if (count > 0 && rowEnd == 0)
+            rowBegin = y;
+        if (count > 0)
+            rowEnd = y + 1;
+        if (rowEnd > 0)
+            rowCounts.push_back(count);
+    }
+    void endRows() { rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin)); }
+
+    void setAll(const Region& region)
+    {
+        rowBegin = 0;
+        rowEnd = region.height();
+        rowCounts.assign(static_cast<std::size_t>(rowEnd), 1);
+        spans.assign(rowCounts.size(), {0, static_cast<std::uint16_t>(region.width())});
+        pixels = static_cast<std::uint32_t>(region.width() * region.height());
+    }
+
+    SparseShape shapeIn(const Region& region) const
+    {
+        SparseShape shape;
+        shape.pixels = pixels;
+        if (pixels == static_cast<std::uint32_t>(region.width() * region.height())) {
+            shape.encoding = FragmentEncoding::Dense;
+        } else if (pixels > 0) {
+            shape.encoding = FragmentEncoding::Sparse;
+            shape.spans = static_cast<std::uint16_t>(spans.size()); // at most 128 a row, 256 rows
+            shape.rowBegin = static_cast<std::uint16_t>(rowBegin);
+            shape.rowEnd = static_cast<std::uint16_t>(rowEnd);
+        }
+        return shape;
+    }
+
+    // Calls f(first, count) for each span, with its first pixel's place in planes of this stride.
+    template <class F>
+    void forEachSpan(std::size_t stride, const F& f) const
+    {
+        const Span* span = spans.data();
+        for (std::size_t row = 0; row < rowCounts.size(); ++row) {
+            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * stride;
+            for (int i = 0; i < rowCounts[row]; ++i, ++span)
+                f(begin + span->x, static_cast<int>(span->count));
+        }
+    }
+};
+
+// Writes a body, not split: `write(channel, out, bytes)` writes a plane.
+template <class Write>
+void encodeSparse(const PlaneFormat& format, const SparseShape& shape, const ActiveSpans& active, std::byte* out,
+                  const Write& write)
+{
+    out += format.forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t bytes) {
+        if (bytes > 0)
+            write(c, out + at, bytes);
+    });
+    if (shape.encoding != FragmentEncoding::Sparse)
+        return;
+    auto* counts = std::copy(active.spans.begin(), active.spans.end(), reinterpret_cast<Span*>(out));
+    std::copy(active.rowCounts.begin(), active.rowCounts.end(), reinterpret_cast<std::uint16_t*>(counts));
+}
+
+// What is in a body.
+struct SparseBody {
+    ConstPlanes planes;
+    const Span* spans = nullptr;              // Sparse
+    const std::uint16_t* rowCounts = nullptr; // the same
+};
+
+// Reads a body that is not split, of a shape that has been checked and that has all its bytes, in place. Throws Error
+// (MalformedMessage).
+inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& shape, int width, const std::byte* in)
+{
+    SparseBody body;
+    body.planes = format.planesAt(in, shape.stored());
+    if (shape.encoding != FragmentEncoding::Sparse)
+        return body;
+    body.spans = reinterpret_cast<const Span*>(in + format.pixelBytes() * shape.stored());
+    body.rowCounts = reinterpret_cast<const std::uint16_t*>(body.spans + shape.spans);
+    const Span* span = body.spans;
+    std::uint32_t spans = 0, pixels = 0;
+    for (int row = 0; row < shape.rowEnd - shape.rowBegin; ++row) {
+        int x = 0;
+        if ((spans += body.rowCounts[row]) > shape.spans)
+            failMalformed("more spans in the rows than in all", shape.spans, spans);
+        for (int i = 0; i < body.rowCounts[row]; ++i, ++span) {
+            if (span->x < x || span->count == 0 || span->x + span->count > width)
+                failMalformed("a span outside its row", width, span->x + span->count);
+            x = span->x + span->count;
+            pixels += span->count;
+        }
+    }
+    if (spans != shape.spans || pixels != shape.pixels)
+        failMalformed("the spans do not add up to the active pixels", shape.pixels, pixels);
+    return body;
+}
+
+// The active pixels of an input. One per thread, to be used again and again. A pixel of colour 0 and alpha 0
+// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does. By depth, what has one
+// below +infinity does, and nothing else.
+class ActivePixels : public ActiveSpans {
+public:
+    // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
+    // `colors`, which has room for all pixels of the tile, and the rest to memory of its own; returns where they are.
+    // Each row is copied as soon as its spans are found: rows of a large image are far apart in memory, and so are read
+    // there once.
+    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, float* colors)
+    {
+        const ConstPlanes& planes = tile.planes();
+        const auto most =
+            static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
+        struct Target {
+            std::size_t channel;
+            std::byte* to;
+        };
+        ConstPlanes result;
+        result.at[Color] = reinterpret_cast<const std::byte*>(colors);
+        std::array<Target, channelCount> targets{{{Color, reinterpret_cast<std::byte*>(colors)}}};
+        std::size_t targetCount = 1;
+        for (std::size_t c = Depth; c < channelCount; ++c)
+            if (hasChannel(channels, c)) {
+                planes_[c].resize(std::max(planes_[c].size(), most * static_cast<std::size_t>(channelWords[c])));
+                auto* to = reinterpret_cast<std::byte*>(planes_[c].data());
+                targets[targetCount++] = {c, to};
+                result.at[c] = to;
+            }
+        bool isClean = true;
+        find(tile, byDepth, [&](std::size_t first, int count) {
+            for (std::size_t i = 0; i < targetCount; ++i) {
+                const auto [channel, to] = targets[i];
+                isClean &= copyAndCheck(planes, channel, first, count, to);
+                targets[i].to += 4 * static_cast<std::size_t>(channelWords[channel]) * static_cast<std::size_t>(count);
+            }
+        });
+        isClean_ = isClean;
+        return result;
+    }
+    // False if all colours are finite, all alphas within [0, 1], and no depth is NaN.
+    bool mayBeFaulty() const noexcept { return !isClean_; }
+    // Pixels that are not active because their depth is NaN.
+    std::uint64_t nanDepths() const noexcept { return nanDepths_; }
+
+private:
+    // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
+    template <class F>
+    void find(const InputPixels& tile, bool byDepth, const F& f)
+    {
+        clear();
+        nanDepths_ = 0;
+        const float* depths = byDepth ? floatsOf(tile.planes().at[Depth]) : nullptr;
+        const Region valid = tile.valid;
+        const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
+        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
+        const int ahead = width < 64 ? 1 : std::max(1, 384 / width); // rows: 6 KiB were best where it was measured
+        for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
+            const std::size_t begin = static_cast<std::size_t>(y) * tile.stride;
+            const auto found = [&](Span span) { f(begin + span.x, static_cast<int>(span.count)); };
+            if (y + ahead < yEnd)
+                prefetch(tile.pixel(x0, y + ahead), width);
+            if (depths)
+                findRow(
+                    y, x0, x0 + width,
+                    [&](int x, int count) {
+                        const DepthBits bits = depthBits(depths + begin + static_cast<std::size_t>(x), count);
+                        for (std::uint64_t nan = bits.nan; nan != 0; nan &= nan - 1)
+                            ++nanDepths_;
+                        return bits.active;
+                    },
+                    found);
+            else
+                findRow(
+                    y, x0, x0 + width, [&](int x, int count) { return activePixelBits(tile.pixel(x, y), count); },
+                    found);
+        }
+        endRows();
+    }
+
+    // No processor knows by itself where the next row of an image begins.
+    static void prefetch(const float* row, int width)
+    {
+#if defined(__GNUC__)
+        for (int x = 0; x < width; x += 4)
+            __builtin_prefetch(row + 4 * x);
+#else
+        (void)row, (void)width;
+#endif
+    }
+
+    std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such
+    bool isClean_ = true;
+    std::uint64_t nanDepths_ = 0;
+};
+
+} // namespace dfb::detail
