@@ -233,8 +233,8 @@ inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const Fragment
     if (!coder.decodeColor(h.colorFormat, in, stored, floatsOf(floats.data())))
         failMalformed("a colour that is out of its format's range");
     const std::size_t colors = format.pixelBytes(Color) * stored;
-    std::memcpy(floats.data() + wide.pixelBytes(Color) * stored, in + colors,
-                payload - colors); // all else is as it was
+    // All else is as it was.
+    std::copy_n(in + colors, payload - colors, floats.data() + wide.pixelBytes(Color) * stored);
     message = std::move(floats);
     return message.data();
 }

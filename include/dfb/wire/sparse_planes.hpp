@@ -192,7 +192,7 @@ private:
         const std::size_t end = forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t bytes) {
             call(in + at, bytes, wordBytes_[c], wordsOf(c), out + at);
         });
-        std::memcpy(out + end, in + end, shape.tableBytes());
+        std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
     }
 
     std::array<std::size_t, channelCount> wordBytes_{};
