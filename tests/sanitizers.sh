@@ -31,7 +31,7 @@ run() {
         grep -Ev "$without") || return
     # shellcheck disable=SC2086 # one word per target
     cmake --build --preset "$1" --parallel "$jobs" --target $targets || return
-    ctest --preset "$test_preset" --parallel $((2 * jobs)) -E "$tests" # two slots a core, see tests/CMakeLists.txt
+    ctest --preset "$test_preset" --parallel $((4 * jobs + 3)) -E "$tests" # slots, see tests/CMakeLists.txt
 }
 
 results=""
