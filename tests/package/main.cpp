@@ -1,5 +1,5 @@
-// One use of each component that should be there; with WITH_FRAME all of dfb is included and a frame made over two ranks
-// that are threads, which takes most of the time to compile.
+// One use of each component that should be there; with WITH_FRAME all of dfb is included and a frame made over two
+// ranks that are threads, which takes most of the time to compile.
 #if WITH_FRAME
 #include <dfb/dfb.hpp>
 #else
