@@ -11,4 +11,4 @@ sh cmake/install_packages.sh
 jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 cmake --preset dev
 cmake --build --preset dev --parallel "$jobs"
-exec ctest --preset dev --parallel $((2 * jobs)) "$@" # two slots a core, see tests/CMakeLists.txt
+exec ctest --preset dev --parallel $((4 * jobs + 3)) "$@" # slots, see tests/CMakeLists.txt

@@ -3,7 +3,8 @@
 # Installs what is missing, then builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
 # tests of what the library does in each. With --brief, for CI, "asan" does without those that run in one process with
 # ranks as threads, which "tsan" has, those of instruction sets, and those over MPI with 7 ranks, and does not look for
-# uses of a function's variables after its end, which takes most of the time.
+# uses of a function's variables after its end, which takes most of the time; and "tsan" without those of instruction
+# sets and the fuzz targets that have one thread, which "asan" has.
 set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -26,12 +27,16 @@ run() {
     if [ "$1" = asan ] && [ $brief = yes ]; then
         without='^test_(odr|inproc|isa_[a-z_]+)$'
         tests='^(inproc[.]|stress[.]isa|(mpi|conformance_mpi)[.][a-z_]+[.]np7$)' test_preset=asan-brief
+    elif [ "$1" = tsan ] && [ $brief = yes ]; then
+        fuzz='control|finished|fragment|packet|readers|tracker'
+        without="^test_(odr|isa_[a-z_]+|fuzz_($fuzz))\$"
+        tests="^(stress[.]isa|fuzz[.]($fuzz)\$)"
     fi
     targets=$(cmake --build --preset "$1" --target help | sed -nE 's/^((test|mpi)_[a-z_]+): phony$/\1/p' |
         grep -Ev "$without") || return
     # shellcheck disable=SC2086 # one word per target
     cmake --build --preset "$1" --parallel "$jobs" --target $targets || return
-    ctest --preset "$test_preset" --parallel $((2 * jobs)) -E "$tests" # two slots a core, see tests/CMakeLists.txt
+    ctest --preset "$test_preset" --parallel $((4 * jobs + 3)) -E "$tests" # slots, see tests/CMakeLists.txt
 }
 
 results=""

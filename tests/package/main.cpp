@@ -1,6 +1,20 @@
-// One use of each component that should be there; with WITH_FRAME also a frame over two ranks that are threads, which
-// takes most of the time to compile.
+// One use of each component that should be there; with WITH_FRAME all of dfb is included and a frame made over two
+// ranks that are threads, which takes most of the time to compile.
+#if WITH_FRAME
 #include <dfb/dfb.hpp>
+#else
+#include <dfb/comm/compression.hpp>
+#include <dfb/exec.hpp>
+#if defined(DFB_HAS_MPI)
+#include <dfb/comm/mpi_session.hpp>
+#endif
+#if defined(DFB_HAS_TBB)
+#include <dfb/tbb_executor.hpp>
+#endif
+#if defined(DFB_HAS_SNAPPY)
+#include <dfb/comm/snappy_codec.hpp>
+#endif
+#endif
 
 #include <atomic>
 #include <cstddef>

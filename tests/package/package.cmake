@@ -69,8 +69,9 @@ foreach(_how add_subdirectory FetchContent)
   dfb_add_package_test(${_how} HOW ${_how} EXPECT ${_others} OPTIONS ${_options})
 endforeach()
 
-# Core alone, and each component alone, on a machine that has nothing else.
-dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy OPTIONS -DFRAME=ON)
+# Core alone, and each component alone, on a machine that has nothing else. Core has its frame below, where the library is
+# compiled once; header.dfb compiles it as headers.
+dfb_add_package_test(find_package_core HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy)
 dfb_add_package_test(add_subdirectory_core HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF)
 foreach(_component IN LISTS _others)

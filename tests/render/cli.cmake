@@ -16,7 +16,7 @@ target_link_libraries(dfb_check_stats PRIVATE dfb_developer nlohmann_json::nlohm
 if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> render/tools/stop_rank.cpp)
   target_link_libraries(dfb_render_stopped PRIVATE dfb_developer dfb_embree_example)
-  dfb_add_mpi_run(render.peer_timeout RANKS 2 TIMEOUT 20 LABELS example
+  dfb_add_mpi_run(render.peer_timeout RANKS 2 TIMEOUT 20 LABELS example WAITS
     COMMAND $<TARGET_FILE:dfb_render_stopped> demo --size 64x64 --frames 1000000 --peer-timeout 1)
   set_tests_properties(render.peer_timeout.np2 PROPERTIES
     PASS_REGULAR_EXPRESSION "dfb: transport failure: rank 1: this rank is lost")
@@ -52,11 +52,7 @@ function(_add_cli_case case)
     add_test(NAME render.cli.${case}.${start}
       COMMAND ${CMAKE_COMMAND} -DSETTINGS=${_settings} -DCASE=${case} -DSTART=${start}
         -P ${CMAKE_CURRENT_SOURCE_DIR}/render/cli_cases.cmake)
-    set(slots ${_busy_ranks})
-    if(start STREQUAL "one" OR start STREQUAL "np1")
-      set(slots ${_busy})
-    endif()
-    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180 PROCESSORS ${slots})
+    set_tests_properties(render.cli.${case}.${start} PROPERTIES LABELS example TIMEOUT 180)
   endforeach()
 endfunction()
 
