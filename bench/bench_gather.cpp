@@ -6,7 +6,7 @@
 #include <dfb/comm/mpi_transport.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/image_parallel.hpp>
-#include <dfb/render/image_parallel.hpp>
+#include <dfb/render/loops.hpp>
 
 #include <array>
 #include <atomic>

@@ -14,7 +14,7 @@
 
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/sort_last.hpp>
-#include <dfb/render/data_parallel.hpp>
+#include <dfb/render/loops.hpp>
 #include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>

@@ -11,7 +11,7 @@
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
-#include <dfb/render/data_parallel.hpp>
+#include <dfb/render/loops.hpp>
 #include <dfb/render/mixed_parallel.hpp>
 #include <dfb/render/sampling.hpp>
 #include <dfb/wire/fragment_message.hpp>

@@ -1,7 +1,7 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
-#include <dfb/dither.hpp>
+#include <dfb/image.hpp>
 
 #include <nlohmann/json.hpp>
 #include <png.h>

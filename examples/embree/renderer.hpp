@@ -9,7 +9,7 @@
 #include "surfaces.hpp"
 #include "volume_sampler.hpp"
 
-#include <dfb/deep_tile.hpp>
+#include <dfb/render/deep_parallel.hpp>
 
 #include <array>
 #include <cstdint>

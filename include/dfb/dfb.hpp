@@ -6,13 +6,12 @@
 #include <dfb/display_wall.hpp>
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/image_parallel.hpp>
-#include <dfb/ops/pixel_ops.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
+#include <dfb/pixel_op.hpp>
 #include <dfb/render/cameras.hpp>
-#include <dfb/render/data_parallel.hpp>
 #include <dfb/render/deep_parallel.hpp>
-#include <dfb/render/image_parallel.hpp>
+#include <dfb/render/loops.hpp>
 #include <dfb/render/mixed_parallel.hpp>
 #include <dfb/render/sampling.hpp>
 

@@ -7,7 +7,7 @@
 #include <dfb/frame.hpp>
 #include <dfb/image.hpp>
 #include <dfb/pixel_op.hpp>
-#include <dfb/wall_layout.hpp>
+#include <dfb/tile_layout.hpp>
 
 #include <cstddef>
 #include <cstdint>

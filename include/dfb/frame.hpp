@@ -34,7 +34,7 @@ struct FrameBufferConfig {
     OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
     bool depth = false;                        // the image has depth as well
     ChannelMask aux = 0;                       // and these of imageAuxChannels, which the tile operation must have
-    bool dither = false;                       // colour of 8 bits is dithered, not rounded: see dither.hpp
+    bool dither = false;                       // colour of 8 bits is dithered, not rounded: see ditherPixels()
     int displayRank = 0;
     int framesInFlight = 1;               // the most that may be open at once; memory grows with it
     OwnerMap ownerMap = latticeOwner;     // null: latticeOwner

@@ -33,8 +33,8 @@
 #pragma once
 
 #include <dfb/blend/background_pixels.hpp>
-#include <dfb/dither.hpp>
 #include <dfb/fragment.hpp>
+#include <dfb/image.hpp>
 
 #include <algorithm>
 #include <array>

@@ -3,7 +3,7 @@
 #include "catch.hpp"
 
 #include <dfb/ops/image_parallel.hpp>
-#include <dfb/ops/moments.hpp>
+#include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/testing/adversarial.hpp>
 

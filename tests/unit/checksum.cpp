@@ -1,7 +1,7 @@
 // CRC-32C: the vectors of RFC 3720, both ways of computing it, pieces, and what it must find.
 #include "catch.hpp"
 
-#include <dfb/comm/checksum.hpp>
+#include <dfb/comm/message.hpp>
 
 #include <algorithm>
 #include <cstddef>

@@ -1,7 +1,7 @@
 // CompressionGains: who does not gain is left alone, and asked again more and more seldom.
 #include "catch.hpp"
 
-#include <dfb/comm/compression_gains.hpp>
+#include <dfb/comm/compression.hpp>
 
 #include <vector>
 

@@ -1,7 +1,7 @@
 // CompressionTrial: the better of two ways is found and kept, whatever the noise, and again when things change.
 #include "catch.hpp"
 
-#include <dfb/comm/compression_trial.hpp>
+#include <dfb/comm/compression.hpp>
 
 #include <algorithm>
 #include <random>

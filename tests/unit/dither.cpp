@@ -1,7 +1,7 @@
 // Dither: levels stay, no value is off by a level, means are right, colour does not exceed alpha.
 #include "catch.hpp"
 
-#include <dfb/dither.hpp>
+#include <dfb/image.hpp>
 
 #include <algorithm>
 #include <array>

@@ -1,7 +1,7 @@
 // Moments: merged in any tree they are the same as added one by one, and do not drift.
 #include "catch.hpp"
 
-#include <dfb/ops/moments.hpp>
+#include <dfb/ops/progressive.hpp>
 
 #include <array>
 #include <cmath>

@@ -1,11 +1,17 @@
-// Codec: the contract of a lossless compressor for message payloads. A flag in each message tells whether it
-// was used: a payload that does not get smaller travels as it is.
+// Codec: the contract of a lossless compressor for message payloads; and whether compressing pays, found out by trying.
 #pragma once
 
 #include <dfb/version.hpp>
 
+#include <algorithm>
+#include <array>
+#include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <vector>
+
+// Codec: the contract of a lossless compressor for message payloads. A flag in each message tells whether it
+// was used: a payload that does not get smaller travels as it is.
 
 namespace dfb {
 
@@ -26,3 +32,168 @@ public:
 };
 
 } // namespace dfb
+
+// CompressionGains: for which ranks the messages of this one become smaller by being compressed. What goes to one can
+// be noise, and to another all alike.
+
+namespace dfb::detail {
+
+// A rank for which nearly nothing was gained is left alone for some frames and then tried again, more and more seldom.
+// add() may be called from any thread, the others between frames, as is isWorthwhile() during one.
+class CompressionGains {
+public:
+    explicit CompressionGains(int rankCount) : peers_(static_cast<std::size_t>(rankCount)) {}
+
+    bool isWorthwhile(int rank) const { return peers_[static_cast<std::size_t>(rank)].pause == 0; }
+
+    // A message to that rank had `raw` bytes, and has `sent` after the codec had a go at it.
+    void add(int rank, std::size_t raw, std::size_t sent)
+    {
+        Peer& peer = peers_[static_cast<std::size_t>(rank)];
+        peer.raw += static_cast<std::int64_t>(raw);
+        peer.sent += static_cast<std::int64_t>(sent);
+    }
+
+    // For how many ranks something was compressed since the last endFrame().
+    std::int64_t links() const
+    {
+        return std::count_if(peers_.begin(), peers_.end(), [](const Peer& peer) { return peer.sent < peer.raw; });
+    }
+
+    void endFrame()
+    {
+        for (Peer& peer : peers_) {
+            const auto raw = static_cast<double>(peer.raw.exchange(0)),
+                       sent = static_cast<double>(peer.sent.exchange(0));
+            if (peer.pause > 0) {
+                --peer.pause;
+            } else if (raw > 0 && sent > (peer.interval > firstInterval ? better : worse) * raw) {
+                peer.pause = peer.interval;
+                peer.interval = std::min(2 * peer.interval, longestInterval);
+            } else if (raw > 0) {
+                peer.interval = firstInterval;
+            }
+        }
+    }
+
+private:
+    // What must be left over to give up, and what to come back.
+    static constexpr double worse = 0.95, better = 0.9;
+    static constexpr int firstInterval = 16, longestInterval = 512;
+
+    struct Peer {
+        std::atomic<std::int64_t> raw{0}, sent{0};
+        int pause = 0, interval = firstInterval; // in frames
+        Peer() = default;
+        Peer(const Peer&) {} // for the vector, which never copies a used one
+    };
+    std::vector<Peer> peers_;
+};
+
+} // namespace dfb::detail
+
+// CompressionTrial: whether a framebuffer's messages are worth compressing, found out by trying: what a network, a
+// codec and the cores beside them do together no formula knows.
+
+namespace dfb::detail {
+
+// Ranks that are told the same times choose the same. To begin with, frames with and without take turns. Then those of
+// the better kind are made, and of the other one a few now and then, more and more seldom, and when frames have become
+// much slower or faster. Only who was better by a tenth replaces the other.
+class CompressionTrial {
+public:
+    // Whether the next frame is to be compressed.
+    bool compresses() const noexcept { return mode_; }
+
+    // Whether that is more than a trial.
+    bool isChosen() const noexcept { return phase_ == Phase::Settled; }
+
+    // The frame with compresses() has taken so long, in any unit. Not to be told of frames that have failed.
+    void took(double time)
+    {
+        switch (phase_) {
+        case Phase::WarmUp:
+            mode_ = !mode_;
+            if (++frames_ == 2)
+                begin(Phase::Turns);
+            break;
+        case Phase::Turns:
+            times_[mode_].push_back(time);
+            mode_ = !mode_;
+            if (++frames_ == 2 * turns)
+                settle(median(times_[1]) < 0.95 * median(times_[0]));
+            break;
+        case Phase::Settled: settled(time); break;
+        case Phase::Probe:
+            times_[mode_].push_back(time);
+            if (++frames_ == probes)
+                probed();
+            break;
+        }
+    }
+
+private:
+    enum class Phase { WarmUp, Turns, Settled, Probe };
+    static constexpr std::size_t turns = 4, probes = 2, remembered = 7, surprise = 3;
+    static constexpr std::size_t firstInterval = 32, longestInterval = 512;
+
+    static double median(std::vector<double> times)
+    {
+        const auto middle = times.begin() + static_cast<std::ptrdiff_t>(times.size() / 2);
+        std::nth_element(times.begin(), middle, times.end());
+        return *middle;
+    }
+
+    void begin(Phase phase)
+    {
+        phase_ = phase;
+        frames_ = 0;
+    }
+
+    void settle(bool mode)
+    {
+        mode_ = mode;
+        usual_ = median(times_[mode]);
+        interval_ = firstInterval;
+        strange_ = 0;
+        begin(Phase::Settled);
+    }
+
+    void settled(double time)
+    {
+        std::vector<double>& mine = times_[mode_];
+        mine.push_back(time);
+        if (mine.size() > remembered)
+            mine.erase(mine.begin());
+        strange_ = time > 1.5 * usual_ || time < usual_ / 1.5 ? strange_ + 1 : 0;
+        if (++frames_ < interval_ && strange_ < surprise)
+            return;
+        mine.erase(mine.begin(), mine.end() - static_cast<std::ptrdiff_t>(std::min(mine.size(), surprise)));
+        strange_ = 0;
+        mode_ = !mode_;
+        times_[mode_].clear();
+        begin(Phase::Probe);
+    }
+
+    void probed()
+    {
+        const double other = median(times_[mode_]), mine = median(times_[!mode_]);
+        if (other < 0.9 * mine) { // or so it seems
+            times_ = {};
+            begin(Phase::Turns);
+            return;
+        }
+        mode_ = !mode_;
+        usual_ = mine;
+        interval_ = std::min(2 * interval_, longestInterval);
+        begin(Phase::Settled);
+    }
+
+    Phase phase_ = Phase::WarmUp;
+    bool mode_ = false;
+    std::size_t frames_ = 0, interval_ = firstInterval, strange_ = 0; // frames in this phase
+    double usual_ = 0;                                                // when it was last looked at
+    std::array<std::vector<double>, 2> times_;                        // without, with
+};
+
+} // namespace dfb::detail

@@ -2,13 +2,12 @@
 // comes once and whole, and progress of the transport (section 3.2 of the paper).
 #pragma once
 
-#include <dfb/base/processors.hpp>
+#include <dfb/base/cpu.hpp>
 #include <dfb/comm/byte_io.hpp>
-#include <dfb/comm/checksum.hpp>
 #include <dfb/comm/heartbeat.hpp>
-#include <dfb/comm/link.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
+#include <dfb/comm/transport.hpp>
 #include <dfb/fwd.hpp>
 
 #include <algorithm>

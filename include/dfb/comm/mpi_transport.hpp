@@ -14,13 +14,13 @@
 // packetFormat. That must stay as it is.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
+#include <dfb/base/fifo.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/base/fifo.hpp>
-#include <dfb/base/processors.hpp>
 
 #include <mpi.h>
 

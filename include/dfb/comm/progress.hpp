@@ -3,7 +3,7 @@
 // In between it calls who wants to look at the clock.
 #pragma once
 
-#include <dfb/comm/link.hpp>
+#include <dfb/comm/transport.hpp>
 
 #include <algorithm>
 #include <atomic>

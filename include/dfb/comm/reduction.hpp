@@ -5,7 +5,6 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
-#include <dfb/base/small_bytes.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/message.hpp>
 

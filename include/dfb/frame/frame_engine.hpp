@@ -2,8 +2,7 @@
 // layer, the declarations and the verdict into frames.
 #pragma once
 
-#include <dfb/comm/compression_gains.hpp>
-#include <dfb/comm/compression_trial.hpp>
+#include <dfb/comm/compression.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/declarations.hpp>

@@ -2,7 +2,7 @@
 // conversion, display rank.
 #pragma once
 
-#include <dfb/base/float_environment.hpp>
+#include <dfb/base/cpu.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>

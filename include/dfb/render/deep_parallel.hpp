@@ -1,18 +1,165 @@
-// DeepParallelLoop: data-parallel rendering with deep fragments: bricks need not be convex, and may be interleaved (A
-// before B before A along a ray).
+// DeepParallelLoop: data-parallel rendering with several segments per pixel, so that bricks need not be convex and may
+// be interleaved (A before B before A along a ray).
 #pragma once
 
-#include <dfb/deep_tile.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/ops/sort_last.hpp>
-#include <dfb/render/data_parallel.hpp>
+#include <dfb/render/loops.hpp>
 #include <dfb/render/world.hpp>
+#include <dfb/tile.hpp>
 
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <memory>
 #include <mutex>
 #include <utility>
 #include <vector>
+
+// DeepTile: a tile of a renderer that has several segments per pixel: what one brick contributes in one piece of a
+// ray, with a gap before the next in which other bricks may have theirs.
+
+namespace dfb {
+
+// What is between two depths of a ray, composited.
+struct Segment {
+    std::array<float, 4> rgba{}; // premultiplied
+    float depth = 0, farDepth = 0;
+};
+
+// At most `maxSegments` are kept per pixel, so memory and messages are bounded: of one more, the two neighbours are
+// merged that change the pixel least. To merge two is exact unless another brick has something between them; then what
+// lies between, (c', a'), is blended behind both, and the pixel is off by T |c' a2 - c2 a'|, where (c2, a2) is the
+// farther of the two and T gets through all that the brick has before it. That is at most T max(a2, |c2|) for colours
+// with c' <= a' <= 1, and the sum of it over all merges bounds the error of a pixel: errorBound(). Where c' is more
+// than a', multiply by the largest c' / a'.
+class DeepTile {
+public:
+    explicit DeepTile(int maxSegments) : maxSegments_(std::max(1, maxSegments)) {}
+
+    int maxSegments() const noexcept { return maxSegments_; }
+
+    // Makes it empty, for the tile and pass of this header.
+    void reset(const TileHeader& header)
+    {
+        header_ = header;
+        const std::size_t pixels =
+            static_cast<std::size_t>(header.region.width()) * static_cast<std::size_t>(header.region.height());
+        counts_.assign(pixels, 0);
+        errors_.assign(pixels, 0.0);
+        segments_.resize(pixels * static_cast<std::size_t>(maxSegments_));
+        layers_ = 0;
+        errorBound_ = 0;
+    }
+
+    const TileHeader& header() const noexcept { return header_; }
+
+    // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any
+    // order and should not overlap. One that has no colour and no alpha is left out.
+    void add(int x, int y, const Segment& segment)
+    {
+        if (segment.rgba == std::array<float, 4>{})
+            return;
+        const std::size_t pixel = pixelAt(x, y);
+        Segment* first = segments_.data() + pixel * static_cast<std::size_t>(maxSegments_);
+        std::uint16_t& count = counts_[pixel];
+        if (count == maxSegments_) {
+            std::vector<Segment>& all = scratch_;
+            all.assign(first, first + count);
+            insert(all, segment);
+            errors_[pixel] += mergeCheapest(all);
+            errorBound_ = std::max(errorBound_, errors_[pixel]);
+            std::copy(all.begin(), all.end(), first);
+            return;
+        }
+        Segment* place = std::upper_bound(first, first + count, segment, nearer);
+        std::copy_backward(place, first + count, first + count + 1);
+        *place = segment;
+        layers_ = std::max<int>(layers_, ++count);
+    }
+
+    // The most that a pixel has, at most maxSegments().
+    int layers() const noexcept { return layers_; }
+
+    // How much merging may have changed a pixel, at most; see above.
+    double errorBound() const noexcept { return errorBound_; }
+
+    // Writes the segments of that number, front to back, into a cleared tile of the same region.
+    template <class TileType>
+    void writeLayer(int layer, TileType& tile) const
+    {
+        static_assert((TileType::channels & (depthChannel | farChannel)) == (depthChannel | farChannel),
+                      "dfb: segments need a tile with depth and farChannel");
+        for (int y = 0; y < header_.region.height(); ++y)
+            for (int x = 0; x < header_.region.width(); ++x) {
+                const std::size_t pixel = static_cast<std::size_t>(y) * static_cast<std::size_t>(header_.region.width())
+                                          + static_cast<std::size_t>(x);
+                if (layer >= counts_[pixel])
+                    continue;
+                const Segment& s =
+                    segments_[pixel * static_cast<std::size_t>(maxSegments_) + static_cast<std::size_t>(layer)];
+                std::copy(s.rgba.begin(), s.rgba.end(), tile.pixel(x, y));
+                tile.depth[y * TileType::size + x] = s.depth;
+                tile.farDepth[y * TileType::size + x] = s.farDepth;
+            }
+    }
+
+private:
+    static bool nearer(const Segment& a, const Segment& b) { return a.depth < b.depth; }
+
+    static void insert(std::vector<Segment>& all, const Segment& segment)
+    {
+        all.insert(std::upper_bound(all.begin(), all.end(), segment, nearer), segment);
+    }
+
+    // Merges two neighbours; returns by how much that may change the pixel.
+    static double mergeCheapest(std::vector<Segment>& all)
+    {
+        std::size_t best = 0;
+        double bestCost = 0, through = 1;
+        for (std::size_t i = 0; i + 1 < all.size(); ++i) {
+            const std::array<float, 4>& behind = all[i + 1].rgba;
+            float largest = 0;
+            for (const float v : behind)
+                largest = std::max(largest, std::fabs(v));
+            through *= 1 - static_cast<double>(all[i].rgba[3]);
+            const double cost = through * static_cast<double>(largest);
+            if (i == 0 || cost < bestCost) {
+                best = i;
+                bestCost = cost;
+            }
+        }
+        Segment &a = all[best], &b = all[best + 1];
+        const double rest = 1 - static_cast<double>(a.rgba[3]);
+        for (std::size_t c = 0; c < 4; ++c)
+            a.rgba[c] = static_cast<float>(static_cast<double>(a.rgba[c]) + rest * static_cast<double>(b.rgba[c]));
+        a.farDepth = std::max(a.farDepth, b.farDepth);
+        all.erase(all.begin() + static_cast<std::ptrdiff_t>(best) + 1);
+        return bestCost;
+    }
+
+    std::size_t pixelAt(int x, int y) const
+    {
+        return static_cast<std::size_t>(y - header_.region.y0) * static_cast<std::size_t>(header_.region.width())
+               + static_cast<std::size_t>(x - header_.region.x0);
+    }
+
+    int maxSegments_;
+    TileHeader header_;
+    std::vector<std::uint16_t> counts_; // per pixel
+    std::vector<double> errors_;        // per pixel
+    std::vector<Segment> segments_;     // maxSegments_ per pixel, the first counts_ of which are used, front to back
+    std::vector<Segment> scratch_;
+    int layers_ = 0;
+    double errorBound_ = 0;
+};
+
+} // namespace dfb
+
+// DeepParallelLoop: data-parallel rendering with deep fragments: bricks need not be convex, and may be interleaved (A
+// before B before A along a ray).
 
 namespace dfb {
 

@@ -12,8 +12,8 @@
 #pragma once
 
 #include <dfb/frame.hpp>
+#include <dfb/render/loops.hpp>
 #include <dfb/render/shared_world.hpp>
-#include <dfb/render/tile_loop.hpp>
 
 #include <algorithm>
 #include <atomic>

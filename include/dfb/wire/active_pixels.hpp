@@ -4,7 +4,7 @@
 
 #include <dfb/base/cpu.hpp>
 #include <dfb/channels.hpp>
-#include <dfb/wire/wire_codes.hpp>
+#include <dfb/wire/wire_format.hpp>
 
 #include <cstddef>
 #include <cstdint>

@@ -1,3 +1,231 @@
+// How colour travels: as float32, or as codes of 16 or 8 bits; what that costs in accuracy, and the choice of the
+// cheapest format that keeps an error budget.
+#pragma once
+
+#include <dfb/base/cpu.hpp>
+
+#include <algorithm>
+#include <cmath>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <limits>
+#include <type_traits>
+
+#if defined(DFB_HAS_AVX2_CLONES)
+#include <immintrin.h>
+#endif
+
+// WireCodes: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
+// Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
+
+namespace dfb::detail {
+
+inline float floatOf(std::uint32_t bits) noexcept
+{
+    float value = 0;
+    std::memcpy(&value, &bits, sizeof value);
+    return value;
+}
+inline std::uint32_t bitsOf(float value) noexcept
+{
+    std::uint32_t bits = 0;
+    std::memcpy(&bits, &value, sizeof bits);
+    return bits;
+}
+
+// `condition` ? a : b. With masks, as compilers do not vectorize a choice of what is made of floats.
+inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) noexcept
+{
+    const std::uint32_t mask = 0u - static_cast<std::uint32_t>(condition);
+    return (a & mask) | (b & ~mask);
+}
+
+// To the nearest binary16, ties to even, of numbers from 0 to 65504.
+inline std::uint16_t positiveToHalf(float value) noexcept
+{
+    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
+    const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
+    const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
+    return static_cast<std::uint16_t>(choose(static_cast<std::int32_t>(bits) < 0x38800000, small, normal));
+}
+inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
+
+// To the nearest integer, ties to even, of a value within [0, 65535].
+inline std::uint32_t nearestInteger(float value) noexcept
+{
+    return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
+}
+
+// How a scaled channel of a colour travels. What is above `most` is none of a pixel in range.
+struct HalfCode {
+    using Word = std::uint16_t;
+    static constexpr Word most = 0x7800; // 2^15, to which alpha 1 is scaled, and beyond which no colour is
+    static Word of(float value) noexcept { return positiveToHalf(value); }
+    static float valueOf(Word code) noexcept { return positiveFromHalf(code); }
+};
+template <class Unsigned>
+struct UnormCode {
+    using Word = Unsigned;
+    static constexpr Word most = std::numeric_limits<Word>::max();
+    static Word of(float value) noexcept { return static_cast<Word>(nearestInteger(value)); }
+    static float valueOf(Word code) noexcept { return static_cast<float>(code); }
+};
+
+using Unorm16Code = UnormCode<std::uint16_t>;
+using Unorm8Code = UnormCode<std::uint8_t>;
+
+// What the channels of a pixel are multiplied by, and the least alpha that comes out of decoding.
+struct WireScales {
+    float color, alpha, leastAlpha = 0;
+};
+
+// Rows in plain C++. What bytes are made of or make goes through `words`: bytes could alias anything.
+constexpr int wireBlock = 256;
+
+template <class Code>
+DFB_INLINE void encodePixels(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
+{
+    const float scales[4] = {by.color, by.color, by.color, by.alpha};
+    typename Code::Word words[wireBlock];
+    for (int first = 0; first < 4 * count; first += wireBlock) {
+        const int size = std::min(wireBlock, 4 * count - first);
+        for (int i = 0; i < size; i += 4)
+            for (int c = 0; c < 4; ++c)
+                words[i + c] = Code::of(rgba[first + i + c] * scales[c]);
+        std::memcpy(out + sizeof words[0] * static_cast<std::size_t>(first), words,
+                    sizeof words[0] * static_cast<std::size_t>(size));
+    }
+}
+
+// False if there is a code that no pixel in range has.
+template <class Code>
+DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+{
+    const float scales[4] = {by.color, by.color, by.color, by.alpha}, least[4] = {0, 0, 0, by.leastAlpha};
+    typename Code::Word words[wireBlock];
+    std::uint16_t above = 0; // in its highest bit
+    for (int first = 0; first < 4 * count; first += wireBlock) {
+        const int size = std::min(wireBlock, 4 * count - first);
+        std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
+                    sizeof words[0] * static_cast<std::size_t>(size));
+        for (int i = 0; i < size; i += 4)
+            for (int c = 0; c < 4; ++c)
+                rgba[first + i + c] = std::max(Code::valueOf(words[i + c]) * scales[c], least[c]);
+        if constexpr (std::is_same_v<Code, HalfCode>)
+            for (int i = 0; i < size; ++i) // by itself, so that both are vectorized
+                above = static_cast<std::uint16_t>(above | words[i] | (words[i] + (0x7fff - Code::most)));
+    }
+    return above < 0x8000;
+}
+
+// Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
+DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) noexcept
+{
+    int out = 0;
+    for (int i = 0; i < count; ++i) {
+        const float alpha = rgba[4 * i + 3], most = maxColor * alpha;
+        for (int c = 0; c < 3; ++c)
+            out |= static_cast<int>(!(rgba[4 * i + c] >= 0.0f)) | static_cast<int>(!(rgba[4 * i + c] <= most));
+        out |= static_cast<int>(!(alpha >= 0.0f)) | static_cast<int>(!(alpha <= 1.0f));
+    }
+    return out == 0;
+}
+
+// The same with AVX2 and F16C: as many at a time as there are whole blocks, and the rest as above.
+#if defined(DFB_HAS_AVX2_CLONES)
+constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
+// Of two pixels.
+DFB_AVX2_F16C inline __m256 wireVector(float color, float alpha) noexcept
+{
+    return _mm256_setr_ps(color, color, color, alpha, color, color, color, alpha);
+}
+#endif
+
+template <class Code>
+DFB_AVX2_F16C inline void encodePixelsAvx2(const float* rgba, int count, const WireScales& by, std::byte* out) noexcept
+{
+    constexpr std::size_t wordBytes = sizeof(typename Code::Word);
+    int i = 0;
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 scales = wireVector(by.color, by.alpha), zero = _mm256_setzero_ps();
+    for (; i + 8 <= count; i += 8) {
+        __m256 scaled[4];
+        for (int part = 0; part < 4; ++part)
+            scaled[part] = _mm256_mul_ps(_mm256_loadu_ps(rgba + 4 * i + 8 * part), scales);
+        auto* to = reinterpret_cast<__m128i*>(out + 4 * wordBytes * static_cast<std::size_t>(i));
+        if constexpr (std::is_same_v<Code, HalfCode>) {
+            for (int part = 0; part < 4; ++part) // without the sign of -0
+                _mm_storeu_si128(to + part, _mm256_cvtps_ph(_mm256_max_ps(scaled[part], zero), toNearest));
+        } else {
+            __m256i codes[4];
+            for (int part = 0; part < 4; ++part)
+                codes[part] = _mm256_cvtps_epi32(scaled[part]);
+            const __m256i low = _mm256_packus_epi32(codes[0], codes[1]), high = _mm256_packus_epi32(codes[2], codes[3]);
+            auto* words = reinterpret_cast<__m256i*>(to);
+            if constexpr (wordBytes == 2) {
+                _mm256_storeu_si256(words, _mm256_permute4x64_epi64(low, 0xd8));
+                _mm256_storeu_si256(words + 1, _mm256_permute4x64_epi64(high, 0xd8));
+            } else {
+                const __m256i inOrder = _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7);
+                _mm256_storeu_si256(words, _mm256_permutevar8x32_epi32(_mm256_packus_epi16(low, high), inOrder));
+            }
+        }
+    }
+#endif
+    encodePixels<Code>(rgba + 4 * i, count - i, by, out + 4 * wordBytes * static_cast<std::size_t>(i));
+}
+
+template <class Code>
+DFB_AVX2_F16C inline bool decodePixelsAvx2(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
+{
+    constexpr std::size_t wordBytes = sizeof(typename Code::Word);
+    int i = 0;
+    bool inRange = true;
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 scales = wireVector(by.color, by.alpha), least = wireVector(0, by.leastAlpha);
+    if constexpr (std::is_same_v<Code, HalfCode>) {
+        __m128i largest[2] = {};
+        for (; i + 4 <= count; i += 4) // two at a time would be slower for the comparison
+            for (int part = 0; part < 2; ++part) {
+                const __m128i codes = _mm_loadu_si128(reinterpret_cast<const __m128i*>(in + 8 * i) + part);
+                largest[part] = _mm_max_epu16(largest[part], codes);
+                _mm256_storeu_ps(rgba + 4 * i + 8 * part,
+                                 _mm256_max_ps(_mm256_mul_ps(_mm256_cvtph_ps(codes), scales), least));
+            }
+        const __m128i all = _mm_max_epu16(largest[0], largest[1]), most = _mm_set1_epi16(HalfCode::most);
+        inRange = _mm_movemask_epi8(_mm_cmpeq_epi16(_mm_max_epu16(all, most), most)) == 0xffff;
+    } else {
+        for (; i + 2 <= count; i += 2) {
+            const auto* from = reinterpret_cast<const __m128i*>(in + 4 * wordBytes * static_cast<std::size_t>(i));
+            const __m256i codes = wordBytes == 2 ? _mm256_cvtepu16_epi32(_mm_loadu_si128(from))
+                                                 : _mm256_cvtepu8_epi32(_mm_loadl_epi64(from));
+            _mm256_storeu_ps(rgba + 4 * i, _mm256_max_ps(_mm256_mul_ps(_mm256_cvtepi32_ps(codes), scales), least));
+        }
+    }
+#endif
+    return decodePixels<Code>(in + 4 * wordBytes * static_cast<std::size_t>(i), count - i, by, rgba + 4 * i) && inRange;
+}
+
+DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, float maxColor) noexcept
+{
+    int i = 0, inRange = 0xff; // a bit for each lane
+#if defined(DFB_HAS_AVX2_CLONES)
+    const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), most = _mm256_set1_ps(maxColor);
+    __m256 in = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
+    for (; i + 2 <= count; i += 2) {
+        const __m256 value = _mm256_loadu_ps(rgba + 4 * i), alpha = _mm256_permute_ps(value, 0xff);
+        const __m256 limit = _mm256_blend_ps(_mm256_mul_ps(most, alpha), one, 0x88);
+        in = _mm256_and_ps(in, _mm256_and_ps(_mm256_cmp_ps(value, zero, _CMP_GE_OQ),
+                                             _mm256_cmp_ps(value, limit, _CMP_LE_OQ))); // false for NaN
+    }
+    inRange = _mm256_movemask_ps(in);
+#endif
+    return inRange == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
+}
+
+} // namespace dfb::detail
+
 // Wire formats: how exactly the colour of inputs travels, what that costs in accuracy, and the choice of the cheapest
 // that keeps an error budget.
 //
@@ -21,15 +249,6 @@
 // A mean of passes is no worse than its worst pass. Unorm is converted in float, four roundings of 2^-24 M: 2^-21 (M +
 // B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire_format.cpp
 // looks for pixels that are worse, also at the edges.
-#pragma once
-
-#include <dfb/wire/wire_codes.hpp>
-
-#include <algorithm>
-#include <cmath>
-#include <cstddef>
-#include <cstdint>
-#include <cstring>
 
 namespace dfb {
 

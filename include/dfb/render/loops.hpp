@@ -1,0 +1,312 @@
+// The plain rendering loops: ImageParallelLoop, where all ranks have the scene, and DataParallelLoop, where each has
+// bricks of it. A loop gives each tile to a renderer, on all workers; the renderer may throw.
+#pragma once
+
+#include <dfb/frame.hpp>
+#include <dfb/render/visibility.hpp>
+#include <dfb/render/world.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <memory>
+#include <numeric>
+#include <utility>
+#include <vector>
+
+// What the rendering loops have in common: tiles to render into, a job per tile and pass on all workers, and a
+// frame in which a renderer may throw. inPlace(): for renderers that have their pixels already.
+
+namespace dfb {
+
+// See inPlace().
+template <class Find>
+struct InPlace {
+    Find find;
+
+    template <class... Arguments>
+    decltype(auto) operator()(Arguments&&... arguments) const
+    {
+        return find(std::forward<Arguments>(arguments)...);
+    }
+};
+
+// For any loop in place of what renders, where the pixels are there already, as in an image that a rank has made by
+// itself: `find` gets a TileView in place of a Tile, and says where the pixels of view.region are. Nothing is copied
+// into a tile.
+template <class Find>
+InPlace<Find> inPlace(Find find)
+{
+    return {std::move(find)};
+}
+
+namespace detail {
+
+// What a loop hands to a renderer.
+template <class FrameBuffer, class Render>
+struct TileOf {
+    using Type = typename FrameBuffer::Tile;
+};
+template <class FrameBuffer, class Find>
+struct TileOf<FrameBuffer, InPlace<Find>> {
+    using Type = typename FrameBuffer::TileView;
+};
+
+// A job for each pass of each of some items, numbered item by item.
+class PassJobs {
+public:
+    // `passesOf(item)`: how many passes an item has.
+    template <class PassesOf>
+    void find(std::size_t itemCount, const PassesOf& passesOf)
+    {
+        count_ = 0;
+        passes_ = itemCount > 0 ? passesOf(0) : 1;
+        firstJob_.clear();
+        bool alike = true;
+        for (std::size_t i = 0; i < itemCount; ++i) {
+            const int passes = passesOf(i);
+            alike = alike && passes == passes_;
+            count_ += passes;
+        }
+        if (alike)
+            return;
+        firstJob_.resize(itemCount + 1, 0);
+        for (std::size_t i = 0; i < itemCount; ++i)
+            firstJob_[i + 1] = firstJob_[i] + passesOf(i);
+    }
+
+    std::int64_t count() const noexcept { return count_; }
+
+    struct Job {
+        std::size_t item = 0;
+        int pass = 0;
+    };
+    Job at(std::int64_t job) const
+    {
+        if (firstJob_.empty())
+            return {static_cast<std::size_t>(job / passes_), static_cast<int>(job % passes_)};
+        const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
+        const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
+        return {item, static_cast<int>(job - firstJob_[item])};
+    }
+
+private:
+    int passes_ = 1; // of the first item
+    std::int64_t count_ = 0;
+    std::vector<std::int64_t> firstJob_; // of each item, unless all have equally many passes
+};
+
+// Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own, of the kind that
+// `Render` wants. An exception of a job makes the frame fail on all ranks; then no further job is begun.
+template <class Render, class FrameBuffer, class Job>
+void forEachTile(FrameBuffer& fb, typename FrameBuffer::Frame& frame, std::int64_t count, const Job& job)
+{
+    using Tile = typename TileOf<FrameBuffer, Render>::Type;
+    frame.guard([&] {
+        fb.executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
+            if (frame.failed())
+                return;
+            // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be given
+            // another job on the same thread.
+            static thread_local std::unique_ptr<Tile> spare;
+            std::unique_ptr<Tile> tile = std::move(spare);
+            if (!tile)
+                tile.reset(new Tile); // start() clears it
+            tile->tile = -1;
+            frame.guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile); // the frame may do without that one
+            spare = std::move(tile);
+        });
+    });
+}
+
+} // namespace detail
+
+} // namespace dfb
+
+// ImageParallelLoop (Listing 2 of the paper): all ranks have the scene, each tile and pass is rendered by one of
+// them.
+
+namespace dfb {
+
+// Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many
+// samples is rendered by many ranks; the image does not depend on who renders what.
+enum class WorkDistribution : std::uint8_t {
+    Owned,      // a rank renders the tiles that it owns: no input travels
+    Linear,     // equal contiguous shares in the order of tiles
+    RoundRobin, // dealt out one by one
+    Dynamic     // one half dealt out evenly, the other handed out on demand, in shares that shrink
+};
+
+namespace detail {
+
+// The multiples of it, modulo `count`, are all numbers below that, and any few in a row are spread evenly: neighbours
+// in an image cost alike, so who gets some of these gets a fair share.
+inline std::int64_t scatteringStride(std::int64_t count)
+{
+    auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
+    while (stride > 1 && std::gcd(stride, count) != 1)
+        --stride;
+    return std::max<std::int64_t>(stride, 1);
+}
+
+} // namespace detail
+
+// One per rank, for any number of frames, which find its memory there; by one thread at a time. The framebuffer must
+// outlive it.
+template <class FrameBuffer>
+class ImageParallelLoop {
+public:
+    // The distribution must be the same on all ranks.
+    explicit ImageParallelLoop(FrameBuffer& fb, WorkDistribution distribution = WorkDistribution::Owned)
+        : fb_(fb), distribution_(distribution), tiles_(fb.ownedTiles())
+    {
+    }
+
+    // This rank renders these tiles, in this order; over all ranks each tile of the image is rendered once.
+    ImageParallelLoop(FrameBuffer& fb, std::vector<int> tiles) : fb_(fb), tiles_(std::move(tiles)) {}
+
+    // Renders this rank's share and returns the frame, which is to be ended; collective with WorkDistribution::Dynamic.
+    // `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and tile.sample;
+    // it writes the pixels of tile.region into the cleared tile. Throws what FrameBuffer::begin() throws; an exception
+    // of renderTile becomes a FrameError of Frame::end() on all ranks.
+    template <class RenderTile>
+    [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = false;
+        params.maxLayers = 1;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        frame.guard([&] {
+            const bool hasList = distribution_ == WorkDistribution::Owned;
+            const auto tileOf = [&](std::size_t item) { return hasList ? tiles_[item] : static_cast<int>(item); };
+            jobs_.find(hasList ? tiles_.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
+                       [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
+            const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
+            // `number` jobs: first, first + step and so on, modulo all there are.
+            const auto run = [&](std::int64_t first, std::int64_t number, std::int64_t step = 1) {
+                detail::forEachTile<RenderTile>(fb_, frame, number, [&](std::int64_t i, auto& tile) {
+                    const auto [item, pass] = jobs_.at((first + i * step) % count);
+                    frame.start(tile, tileOf(item), pass);
+                    renderTile(tile);
+                    frame.setTile(tile);
+                });
+            };
+            switch (distribution_) {
+            case WorkDistribution::Owned: run(0, count); break;
+            case WorkDistribution::Linear:
+                run(count * rank / size, count * (rank + 1) / size - count * rank / size);
+                break;
+            case WorkDistribution::RoundRobin: run(rank, (count - rank + size - 1) / size, size); break;
+            case WorkDistribution::Dynamic: {
+                const std::int64_t stride = detail::scatteringStride(count);
+                for (auto range = frame.nextJobs(count); range.begin < range.end && !frame.failed();
+                     range = frame.nextJobs(count))
+                    run(range.begin * stride, range.end - range.begin, stride);
+                break;
+            }
+            }
+        });
+        return frame;
+    }
+
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class RenderTile>
+    FrameReport render(const RenderTile& renderTile, const FrameParams& params = {},
+                       const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(renderTile, params, tileData, pixelData).end();
+    }
+
+private:
+    FrameBuffer& fb_;
+    WorkDistribution distribution_ = WorkDistribution::Owned;
+    std::vector<int> tiles_; // with WorkDistribution::Owned: what this rank renders
+    detail::PassJobs jobs_;
+};
+
+} // namespace dfb
+
+// DataParallelLoop (Listing 3 of the paper): each rank renders its bricks wherever they project.
+
+namespace dfb {
+
+namespace detail {
+
+// What there is to do for a rank that renders its own bricks, and what it declares.
+class OwnBricks {
+public:
+    // Calls job(brick, tile) for each brick, tile and pass, with a tile that has been started for them.
+    template <class Render, class FrameBuffer, class Camera, class Job>
+    void forEach(FrameBuffer& fb, typename FrameBuffer::Frame& frame, const World& world, const Camera& camera,
+                 const Job& job)
+    {
+        frame.guard([&] {
+            findVisibleTiles(world, camera, fb.layout(), pairs_);
+            findInputs(world, pairs_, inputs_);
+            frame.declare(inputs_);
+            jobs_.find(pairs_.size(), [&](std::size_t i) { return frame.samples(pairs_[i].tile).count; });
+            forEachTile<Render>(fb, frame, jobs_.count(), [&](std::int64_t i, auto& tile) {
+                const auto [item, pass] = jobs_.at(i);
+                const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs_[item].brick)];
+                frame.start(tile, pairs_[item].tile, pass);
+                tile.generation = 1;
+                tile.source = brick.id;
+                job(brick, tile);
+            });
+        });
+    }
+
+private:
+    std::vector<BrickInTile> pairs_;
+    std::vector<TileInput> inputs_;
+    PassJobs jobs_;
+};
+
+} // namespace detail
+
+// One per rank, for any number of frames, which find its memory there; by one thread at a time. Framebuffer and world
+// must outlive it; the world may change between frames. Every brick must be in the world of one rank only.
+template <class FrameBuffer>
+class DataParallelLoop {
+public:
+    DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
+
+    // Renders all bricks of the world into the tiles that they may project to, and returns the frame, which is to be
+    // ended. `renderBrick(brick, tile)` is called from several threads at once, for each pass with its own tile.pass;
+    // it writes colour and depth of the pixels of tile.region that rays meet within brick.bounds into the cleared tile,
+    // depth growing away from the camera. Unlike in Listing 3 the owners do not count the bricks that project to their
+    // tiles: each rank declares what it will send, so the two can not disagree. Throws what FrameBuffer::begin()
+    // throws; an exception of renderBrick becomes a FrameError of Frame::end() on all ranks.
+    template <class Camera, class RenderBrick>
+    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
+                                                    FrameParams params = {},
+                                                    const typename FrameBuffer::TileFrameData& tileData = {},
+                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        params.declared = true;
+        auto frame = fb_.begin(params, tileData, pixelData);
+        bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
+            renderBrick(brick, tile);
+            frame.setTile(tile);
+        });
+        return frame;
+    }
+
+    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    template <class Camera, class RenderBrick>
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+                       const typename FrameBuffer::TileFrameData& tileData = {},
+                       const typename FrameBuffer::PixelFrameData& pixelData = {})
+    {
+        return start(camera, renderBrick, params, tileData, pixelData).end();
+    }
+
+private:
+    FrameBuffer& fb_;
+    const World& world_;
+    detail::OwnBricks bricks_;
+};
+
+} // namespace dfb
