@@ -202,8 +202,6 @@ private:
     std::array<Buffer, detail::channelCount> planes_;
 };
 
-} // namespace dfb
-
 // Dither: conversion to 8 bit that leaves no bands in gradients. Each pixel's place in the image says from which part
 // of the way between two levels on it takes the upper one, so that the mean over neighbours is what no level is.
 //
@@ -212,8 +210,6 @@ private:
 // mean over every such block, and are made of integers alone. Colours are rounded to float first: then each step is
 // exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so grey stays grey
 // and what is less in one channel does not become more.
-
-namespace dfb {
 
 namespace detail {
 

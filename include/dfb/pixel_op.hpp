@@ -89,12 +89,8 @@ constexpr bool checkPixelOp()
 
 } // namespace detail
 
-} // namespace dfb
-
 // The pixel operations that come with dfb: tone mapping, and a chain of two.
-
-namespace dfb {
-
+//
 // Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
 // (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. Pixels of
 // alpha 0 are treated as if it were 1, so that emission is kept.

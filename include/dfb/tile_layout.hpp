@@ -96,12 +96,8 @@ inline int hashOwner(int tile, const TileLayout&, int rankCount)
     return static_cast<int>(h % static_cast<std::uint64_t>(rankCount));
 }
 
-} // namespace dfb
-
 // WallLayout: where the displays of a wall are, and which ranks drive them.
-
-namespace dfb {
-
+//
 // Displays of equal size in columns and rows, 0 at the upper left, row by row. The framebuffer has the pixels of all of
 // them and those behind the bezels between them, so that a line that crosses a bezel goes on straight.
 struct WallLayout {

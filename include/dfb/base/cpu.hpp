@@ -93,13 +93,8 @@ void forEachRun(std::uint64_t bits, const F& f)
     }
 }
 
-} // namespace dfb::detail
-
 // FloatEnvironment: while it lives, the thread computes with denormals. Renderers turn flush-to-zero on for
 // their threads, and compositing may run on those.
-
-namespace dfb::detail {
-
 class FloatEnvironment {
 public:
     FloatEnvironment(const FloatEnvironment&) = delete;

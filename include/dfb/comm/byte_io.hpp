@@ -63,13 +63,8 @@ private:
     std::vector<std::byte> many_; // all of them, if they are more than that
 };
 
-} // namespace dfb::detail
-
 // ByteWriter and ByteReader: the small control messages (manifests, verdicts), field by field; a reader never
 // reads beyond its end.
-
-namespace dfb::detail {
-
 class ByteWriter {
 public:
     template <class T>

@@ -90,13 +90,9 @@ private:
     std::vector<Peer> peers_;
 };
 
-} // namespace dfb::detail
-
 // CompressionTrial: whether a framebuffer's messages are worth compressing, found out by trying: what a network, a
 // codec and the cores beside them do together no formula knows.
-
-namespace dfb::detail {
-
+//
 // Ranks that are told the same times choose the same. To begin with, frames with and without take turns. Then those of
 // the better kind are made, and of the other one a few now and then, more and more seldom, and when frames have become
 // much slower or faster. Only who was better by a tenth replaces the other.

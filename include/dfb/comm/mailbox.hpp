@@ -384,6 +384,33 @@ public:
         return reduced;
     }
 
+    // Collective: what each rank has given, by rank. The numbers of bytes may differ.
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
+    {
+        ByteWriter out; // of each rank: which it is, the size, the bytes
+        out.put(static_cast<std::int32_t>(rank()));
+        out.put(static_cast<std::uint64_t>(own.size()));
+        Bytes mine = out.bytes();
+        mine.append(own.data(), own.data() + own.size());
+        const Bytes all = reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
+            Bytes both = a;
+            both.append(b.begin(), b.end());
+            return both;
+        });
+        std::vector<std::vector<std::byte>> result;
+        ByteReader in(all);
+        for (int from = 0; from < size(); ++from) { // in order, as they were combined
+            const auto whose = in.get<std::int32_t>();
+            const auto byteCount = in.get<std::uint64_t>();
+            in.require(whose == from && byteCount <= in.left());
+            result.emplace_back(static_cast<std::size_t>(byteCount));
+            for (std::byte& byte : result.back())
+                byte = in.get<std::byte>();
+        }
+        in.end();
+        return result;
+    }
+
 private:
     // A message that could not be read may have been a part of this, for which others may not be here yet, or of what
     // comes after, if they are through. The first one is what its owner's constructor does. `damage`: from before.

@@ -245,12 +245,8 @@ constexpr bool checkTransport()
 
 } // namespace detail
 
-} // namespace dfb
-
 // Link: a transport of any type, behind one abstract class. What uses it is no template.
-
-namespace dfb {
-
+//
 // Its members are those of the contract in comm/transport.hpp.
 class Link {
 public:

@@ -125,8 +125,7 @@ public:
         mailbox_->connection().throwIfFailed();
         params_ = params;
         terms_ = FrameTerms::of(params, rank());
-        declarations_.newFrame(
-            !outcome_->lastFailed()); // if it did, some owners may have what was declared in it, and others not
+        declarations_.newFrame(!outcome_->lastFailed()); // after one that failed, owners may know of different ones
 
         TileInfo info;
         info.rank = rank();
@@ -163,22 +162,7 @@ public:
         lastPoll_ = beginTime_ = Clock::now();
         mailbox_->newEpoch(info.frame);
         mailbox_->connection().expectMessages(true);
-        auto& early = open_.open();
-        open_.expectTiles(static_cast<std::int64_t>(kept.size()) + (params.declared ? 0 : rendered));
-        if (userError)
-            outcome_->failWhole(
-                userError); // comes out of end(), on all ranks; nothing is made with half of the frame's data
-        for (OpenFrame::Message& message : early)
-            incoming(message.source, message.header, std::move(message.bytes));
-        early.clear(); // some may still be there, if the frame has failed
-        failForDamage();
-        for (const int tile : kept)
-            if (open_.enter(info.frame)) {
-                submitFinish(tile);
-                open_.leave();
-            }
-        if (!params.declared && open_.expectNoMore())
-            allFinished();
+        open(userError, params.declared ? 0 : rendered, kept);
     }
 
     TileHeader headerOf(int tile, int pass) const override { return pipeline_->headerOf(tile, pass); }
@@ -381,28 +365,7 @@ public:
 
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) override
     {
-        ByteWriter out; // of each rank: which it is, the size, the bytes
-        out.put(static_cast<std::int32_t>(rank()));
-        out.put(static_cast<std::uint64_t>(own.size()));
-        Bytes mine = out.bytes();
-        mine.append(own.data(), own.data() + own.size());
-        const Bytes all = mailbox_->reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
-            Bytes both = a;
-            both.append(b.begin(), b.end());
-            return both;
-        });
-        std::vector<std::vector<std::byte>> result;
-        ByteReader in(all);
-        for (int from = 0; from < size(); ++from) { // in order, as they were combined
-            const auto whose = in.get<std::int32_t>();
-            const auto byteCount = in.get<std::uint64_t>();
-            in.require(whose == from && byteCount <= in.left());
-            result.emplace_back(static_cast<std::size_t>(byteCount));
-            for (std::byte& byte : result.back())
-                byte = in.get<std::byte>();
-        }
-        in.end();
-        return result;
+        return mailbox_->allGather(own);
     }
 
 private:
@@ -425,6 +388,27 @@ private:
         const bool isLeftOut = config_.compression == CompressionMode::Auto
                                && (mailbox_->connection().isSeenBy(other) || !gains_->isWorthwhile(other));
         return isLeftOut ? nullptr : config_.codec.get();
+    }
+
+    // Lets messages of the frame in. `tiles`: that this rank expects to finish, beside those of `withoutSamples`, of
+    // which the pixel operation sees what is there.
+    void open(const std::exception_ptr& userError, std::int64_t tiles, const std::vector<int>& withoutSamples)
+    {
+        auto& early = open_.open();
+        open_.expectTiles(tiles + static_cast<std::int64_t>(withoutSamples.size()));
+        if (userError) // comes out of end(), on all ranks; nothing is made with half of the frame's data
+            outcome_->failWhole(userError);
+        for (OpenFrame::Message& message : early)
+            incoming(message.source, message.header, std::move(message.bytes));
+        early.clear(); // some may still be there, if the frame has failed
+        failForDamage();
+        for (const int tile : withoutSamples)
+            if (open_.enter(open_.number())) {
+                submitFinish(tile);
+                open_.leave();
+            }
+        if (!params_.declared && open_.expectNoMore())
+            allFinished();
     }
 
     // ---- messages

@@ -186,58 +186,8 @@ public:
             table_.setFinished(tile);
             return;
         }
-        bool inTime = true;
         const FloatEnvironment floatEnvironment;
-        const Region region = table_.layout().region(tile);
-        BackgroundPixels& background = table_.backgroundPixels(tile);
-        if (!traits().hasPixelOp) {
-            auto place = gather_.reserve(tile);
-            background.newFrame(region.width(), region.height(), place.imageEpoch);
-            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither, &background);
-            table_.finish(tile, out);
-            inTime = gather_.commit(tile, std::move(place), out.writtenPixels());
-        } else {
-            const auto width = static_cast<std::size_t>(region.width()),
-                       height = static_cast<std::size_t>(region.height());
-            const auto channels = static_cast<ChannelMask>(colorChannel | imageChannels(config_));
-            Buffer floats = pool_->acquire(width * height * 4 * static_cast<std::size_t>(wordsPerPixel(channels)));
-            Planes planes;
-            std::byte* plane = floats.data();
-            for (std::size_t c = 0; c < channelCount; ++c)
-                if (hasChannel(channels, c)) {
-                    planes.at[c] = plane;
-                    plane += 4 * width * height * static_cast<std::size_t>(channelWords[c]);
-                }
-            FinishedTile out(region, OutputFormat::RGBA32F, planes, width);
-            table_.finish(tile, out);
-            PixelTile pixels;
-            pixels.frame = table_.frameInfo().frame;
-            pixels.tile = tile;
-            pixels.region = region;
-            pixels.color = floatsOf(planes.at[Color]);
-            pixels.depth = floatsOf(planes.at[Depth]);
-            pixels.aux = {floatsOf(planes.at[Normal]), floatsOf(planes.at[Albedo]), floatsOf(planes.at[Position]),
-                          idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
-            operations_.process(pixels);
-            auto place = gather_.reserve(tile);
-            background.newFrame(region.width(), region.height(), 0);
-            for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
-                const float* row = pixels.color + 4 * width * y;
-                std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format);
-                if (config_.dither)
-                    ditherPixels(row, region.width(), config_.format, region.x0, region.y0 + static_cast<int>(y), to);
-                else
-                    convertPixels(row, region.width(), config_.format, to);
-                for (std::size_t c = Depth; c < channelCount; ++c) {
-                    const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-                    if (place.planes.at[c])
-                        std::memcpy(place.planes.at[c] + y * place.stride * bytes, planes.at[c] + y * width * bytes,
-                                    width * bytes);
-                }
-            }
-            inTime = gather_.commit(tile, std::move(place), static_cast<std::int64_t>(width * height));
-        }
-        if (inTime)
+        if (traits().hasPixelOp ? finishThroughPixelOp(tile) : finishIntoPlace(tile))
             table_.setFinished(tile);
         if (traits().reports)
             addReport(tile);
@@ -318,6 +268,70 @@ public:
 
 private:
     const OperationTraits& traits() const noexcept { return operations_.traits(); }
+
+    // The tile operation writes straight to where the tile belongs. False if the frame is over.
+    bool finishIntoPlace(int tile)
+    {
+        const Region region = table_.layout().region(tile);
+        BackgroundPixels& background = table_.backgroundPixels(tile);
+        auto place = gather_.reserve(tile);
+        background.newFrame(region.width(), region.height(), place.imageEpoch);
+        FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither, &background);
+        table_.finish(tile, out);
+        return gather_.commit(tile, std::move(place), out.writtenPixels());
+    }
+
+    // The tile operation writes floats, the pixel operation changes them, then they are converted. False if the frame
+    // is over.
+    bool finishThroughPixelOp(int tile)
+    {
+        const Region region = table_.layout().region(tile);
+        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+        const auto channels = static_cast<ChannelMask>(colorChannel | imageChannels(config_));
+        Buffer floats = pool_->acquire(width * height * 4 * static_cast<std::size_t>(wordsPerPixel(channels)));
+        Planes planes;
+        std::byte* plane = floats.data();
+        for (std::size_t c = 0; c < channelCount; ++c)
+            if (hasChannel(channels, c)) {
+                planes.at[c] = plane;
+                plane += 4 * width * height * static_cast<std::size_t>(channelWords[c]);
+            }
+        FinishedTile out(region, OutputFormat::RGBA32F, planes, width);
+        table_.finish(tile, out);
+        PixelTile pixels;
+        pixels.frame = table_.frameInfo().frame;
+        pixels.tile = tile;
+        pixels.region = region;
+        pixels.color = floatsOf(planes.at[Color]);
+        pixels.depth = floatsOf(planes.at[Depth]);
+        pixels.aux = {floatsOf(planes.at[Normal]), floatsOf(planes.at[Albedo]), floatsOf(planes.at[Position]),
+                      idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
+        operations_.process(pixels);
+        auto place = gather_.reserve(tile);
+        table_.backgroundPixels(tile).newFrame(region.width(), region.height(), 0);
+        convert(planes, region, place);
+        return gather_.commit(tile, std::move(place), static_cast<std::int64_t>(width * height));
+    }
+
+    // Floats of a tile, to where they are stored in the image's format.
+    void convert(const Planes& planes, const Region& region, const FinalGather::Place& place) const
+    {
+        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+        for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
+            const float* row = floatsOf(planes.at[Color]) + 4 * width * y;
+            std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format);
+            if (config_.dither)
+                ditherPixels(row, region.width(), config_.format, region.x0, region.y0 + static_cast<int>(y), to);
+            else
+                convertPixels(row, region.width(), config_.format, to);
+            for (std::size_t c = Depth; c < channelCount; ++c) {
+                const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
+                if (place.planes.at[c])
+                    std::memcpy(place.planes.at[c] + y * place.stride * bytes, planes.at[c] + y * width * bytes,
+                                width * bytes);
+            }
+        }
+    }
 
     // For each rank, whether it has finished tiles to send to that one.
     std::vector<bool> sendersTo(int displayRank, int rankCount) const

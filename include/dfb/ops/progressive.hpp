@@ -62,7 +62,6 @@ struct Moments {
     double varianceOfMean() const noexcept { return count > 1 ? variance() / static_cast<double>(count) : 0; }
 };
 
-
 // `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The
 // image is the mean of all samples since FrameParams::accumulationId changed, a frame failed, or a tile began with
 // sample 0. "4 more samples a frame until the camera moves":

@@ -156,13 +156,9 @@ private:
     double errorBound_ = 0;
 };
 
-} // namespace dfb
-
 // DeepParallelLoop: data-parallel rendering with deep fragments: bricks need not be convex, and may be interleaved (A
 // before B before A along a ray).
-
-namespace dfb {
-
+//
 // Sorts segments, also those of one brick, and counts the pixels in which some overlap:
 // FrameReport::orderUndefinedPixels.
 template <int TileSize = 64>

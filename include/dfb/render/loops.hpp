@@ -121,13 +121,9 @@ void forEachTile(FrameBuffer& fb, typename FrameBuffer::Frame& frame, std::int64
 
 } // namespace detail
 
-} // namespace dfb
-
 // ImageParallelLoop (Listing 2 of the paper): all ranks have the scene, each tile and pass is rendered by one of
 // them.
-
-namespace dfb {
-
+//
 // Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many
 // samples is rendered by many ranks; the image does not depend on who renders what.
 enum class WorkDistribution : std::uint8_t {
@@ -226,11 +222,7 @@ private:
     detail::PassJobs jobs_;
 };
 
-} // namespace dfb
-
 // DataParallelLoop (Listing 3 of the paper): each rank renders its bricks wherever they project.
-
-namespace dfb {
 
 namespace detail {
 

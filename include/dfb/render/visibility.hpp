@@ -110,7 +110,6 @@ private:
     Region region_;
 };
 
-
 namespace detail {
 
 struct Point3 {
