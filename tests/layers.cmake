@@ -17,18 +17,19 @@ set(level_5 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp de
             tile_layout.hpp)
 set(level_6 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
             wire/sparse_planes.hpp wire/wire_losses.hpp)
-set(level_7 frame/declarations.hpp frame/frame_terms.hpp frame/job_share.hpp ops/sort_last.hpp pixel_op.hpp
-            render/sampling.hpp render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
+set(level_7 frame/declarations.hpp frame/frame_terms.hpp ops/sort_last.hpp pixel_op.hpp render/sampling.hpp
+            render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
 set(level_8 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
             render/loops.hpp render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp)
 set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/mixed_parallel.hpp
             testing/adversarial.hpp)
 set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp)
 set(level_11 display_wall.hpp frame/outcome.hpp)
-set(level_12 frame/frame_engine.hpp)
-set(level_13 distributed_framebuffer.hpp)
-set(level_14 dfb.hpp)
-set(last_level 14)
+set(level_12 frame/job_share.hpp)
+set(level_13 frame/frame_engine.hpp)
+set(level_14 distributed_framebuffer.hpp)
+set(level_15 dfb.hpp)
+set(last_level 15)
 
 # A dependency has one door.
 set(door_of_mpi comm/mpi_transport.hpp)

@@ -21,6 +21,7 @@
 #include <optional>
 #include <string>
 #include <thread>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -121,6 +122,15 @@ public:
         header.receiver = address_;
         header.number = number;
         send(destination, makeMessage(*connection_->pool(), header, body.data(), body.size()));
+    }
+
+    // The same with a body of plain bytes.
+    template <class Body>
+    void sendBody(int destination, MessageKind kind, std::int64_t number, const Body& body)
+    {
+        static_assert(std::is_trivially_copyable_v<Body>);
+        const auto* first = reinterpret_cast<const std::byte*>(&body);
+        send(destination, kind, number, Bytes(first, first + sizeof body));
     }
 
     // Messages that carry pixels need credit of their receiver, and are kept until they have it. Never blocks.

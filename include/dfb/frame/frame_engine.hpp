@@ -66,6 +66,8 @@ public:
                                                        [this](Buffer&& message) { sendToDisplay(std::move(message)); });
             outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                       [this](Verdict& verdict) { addFigures(verdict); });
+            // The rank after the display rank hands out jobs, as that one has enough to do.
+            jobs_.emplace(*mailbox_, open_, *outcome_, (config_.displayRank + 1) % size());
             mine = Agreement::of(traits(), config_, mailbox_->connection().options().checksums, rank(),
                                  TilePipeline::travelling(traits(), config_), layout().tileCount(),
                                  [this](int tile) { return tileOwner(tile); });
@@ -86,6 +88,7 @@ public:
         const auto all = agree(*mailbox_, mine);
         if (!all.fine) {
             mailbox_->stop(); // what has come already is for this object, as long as it is whole
+            jobs_.reset();
             outcome_.reset();
             mailbox_.reset(); // before the exception passes: all ranks throw it, so this end is in order
             all.refuse();
@@ -141,7 +144,7 @@ public:
         } catch (...) {
             userError = std::current_exception();
         }
-        jobs_.newFrame();
+        jobs_->newFrame();
         if (traits().opaqueHides)
             hidden_.newFrame(layout().tileCount());
         outcome_->newFrame({terms_, params.declared, params.allowPartial, std::chrono::milliseconds(params.timeoutMs),
@@ -201,7 +204,7 @@ public:
         if (other == rank())
             hidden_.hide(tile, generation);
         else
-            sendBody(other, MessageKind::Hidden, HiddenTiles::Message{tile, generation});
+            mailbox_->sendBody(other, MessageKind::Hidden, open_.number(), HiddenTiles::Message{tile, generation});
     }
 
     void expectLayers(int layers) override { pipeline_->setLayers(layers); }
@@ -212,23 +215,7 @@ public:
 
     JobRange nextJobs(std::int64_t count) override
     {
-        std::optional<JobRange> range = jobs_.take(count, rank(), size());
-        askForJobs(count); // for the next time, while this one is worked on
-        if (!range) {
-            std::optional<Clock::time_point> deadline;
-            if (params_.timeoutMs > 0)
-                deadline = Clock::now() + std::chrono::milliseconds(params_.timeoutMs);
-            if (!mailbox_->wait([this] { return jobs_.ready() || outcome_->failed(); }, deadline)) {
-                ErrorInfo info;
-                info.kind = ErrorKind::TimedOut;
-                info.from = jobServer();
-                info.message = "no word of rank " + std::to_string(jobServer()) + " on what there is to render";
-                outcome_->fail(std::make_exception_ptr(Error(std::move(info))));
-            }
-            range = jobs_.take(count, rank(), size());
-            askForJobs(count);
-        }
-        return range.value_or(JobRange{});
+        return jobs_->next(count, std::chrono::milliseconds(params_.timeoutMs));
     }
 
     void waitForRoom()
@@ -443,27 +430,6 @@ private:
         open_.leave();
     }
 
-    // By the rank after the display rank, which has enough to do.
-    int jobServer() const { return (config_.displayRank + 1) % size(); }
-
-    void askForJobs(std::int64_t count)
-    {
-        if (!jobs_.shouldAsk())
-            return;
-        const JobRequest request{count, config_.executor->concurrency(), 0};
-        if (jobServer() == rank())
-            outcome_->guarded([&] { jobs_.receive(jobs_.give(request, size())); });
-        else
-            sendBody(jobServer(), MessageKind::JobRequest, request);
-    }
-
-    template <class Body>
-    void sendBody(int to, MessageKind kind, const Body& body)
-    {
-        const auto* first = reinterpret_cast<const std::byte*>(&body);
-        mailbox_->send(to, kind, open_.number(), Bytes(first, first + sizeof body));
-    }
-
     void sendToDisplay(Buffer&& message)
     {
         if (mailbox_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
@@ -491,9 +457,8 @@ private:
             pipeline_->gather().shareImage([&](const std::byte* block) { return connection.placeOf(block); });
         if (!places)
             return;
-        const auto* first = reinterpret_cast<const std::byte*>(&*places);
         for (const int other : seers)
-            mailbox_->send(other, MessageKind::ImagePlace, open_.next(), Bytes(first, first + sizeof *places));
+            mailbox_->sendBody(other, MessageKind::ImagePlace, open_.next(), *places);
     }
 
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
@@ -549,15 +514,8 @@ private:
             hidden_.hide(body.tile, body.generation);
         } else if (kind == MessageKind::Manifest || kind == MessageKind::ManifestAck) {
             receiveDeclaration(source, header, message);
-        } else if (kind == MessageKind::JobRequest) {
-            if (rank() != jobServer())
-                failMalformed("a request for jobs to a rank that hands out none", jobServer(), rank());
-            sendBody(source, MessageKind::Jobs, jobs_.give(bodyOf<JobRequest>(message), size()));
-        } else if (kind == MessageKind::Jobs) {
-            if (source != jobServer())
-                failMalformed("jobs from a rank that hands out none", jobServer(), source);
-            jobs_.receive(bodyOf<JobRange>(message));
-            mailbox_->notify();
+        } else {
+            jobs_->receive(source, header, message);
         }
     }
 
@@ -758,12 +716,12 @@ private:
     std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
     Declarations declarations_;
-    JobShare jobs_;
     HiddenTiles hidden_;
 
     // The frame.
     OpenFrame open_;
     std::unique_ptr<FrameOutcome> outcome_;
+    std::optional<JobExchange> jobs_;
     FrameParams params_;
     FrameTerms terms_; // of params_
     std::uint64_t lastAccumulationId_ = 0;

@@ -1,15 +1,22 @@
-// JobShare: the jobs of a frame that every rank could do, half of them shared out beforehand, the other half on
-// demand (guided self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with what is left.
+// The jobs of a frame that every rank could do, half of them shared out beforehand, the other half on demand (guided
+// self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with what is left. JobShare has the numbers,
+// JobExchange the messages.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
+#include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/outcome.hpp>
 
 #include <algorithm>
+#include <chrono>
 #include <cstdint>
+#include <exception>
 #include <mutex>
 #include <optional>
+#include <string>
+#include <utility>
 
 namespace dfb::detail {
 
@@ -102,6 +109,79 @@ private:
     std::int64_t handedOutOf_ = 0, count_ = 0;
     Fifo<JobRange> mine_;
     bool began_ = false, asked_ = false, exhausted_ = false;
+};
+
+// One per rank. Rank `server` hands out.
+class JobExchange {
+public:
+    // All must live as long as this.
+    JobExchange(Mailbox& mailbox, const OpenFrame& frame, FrameOutcome& outcome, int server)
+        : mailbox_(mailbox), frame_(frame), outcome_(outcome), server_(server)
+    {
+    }
+
+    void newFrame() { share_.newFrame(); }
+
+    // The next range of `count` jobs; empty if there are no more, or the frame has failed. Waits for the rank that
+    // hands out for at most `timeout`, unless that is 0; then the frame fails.
+    JobRange next(std::int64_t count, std::chrono::milliseconds timeout)
+    {
+        std::optional<JobRange> range = take(count);
+        if (!range) {
+            std::optional<Mailbox::Clock::time_point> deadline;
+            if (timeout.count() > 0)
+                deadline = Mailbox::Clock::now() + timeout;
+            if (!mailbox_.wait([this] { return share_.ready() || outcome_.failed(); }, deadline)) {
+                ErrorInfo info;
+                info.kind = ErrorKind::TimedOut;
+                info.from = server_;
+                info.message = "no word of rank " + std::to_string(server_) + " on what there is to render";
+                outcome_.fail(std::make_exception_ptr(Error(std::move(info))));
+            }
+            range = take(count);
+        }
+        return range.value_or(JobRange{});
+    }
+
+    // False if the message is of another kind. Throws Error (MalformedMessage).
+    bool receive(int source, const MessageHeader& header, const Buffer& message)
+    {
+        if (header.kind == MessageKind::JobRequest) {
+            if (mailbox_.rank() != server_)
+                failMalformed("a request for jobs to a rank that hands out none", server_, mailbox_.rank());
+            mailbox_.sendBody(source, MessageKind::Jobs, frame_.number(),
+                              share_.give(bodyOf<JobRequest>(message), mailbox_.size()));
+            return true;
+        }
+        if (header.kind != MessageKind::Jobs)
+            return false;
+        if (source != server_)
+            failMalformed("jobs from a rank that hands out none", server_, source);
+        share_.receive(bodyOf<JobRange>(message));
+        mailbox_.notify();
+        return true;
+    }
+
+private:
+    // Asks for more at once, so that it comes while this is worked on.
+    std::optional<JobRange> take(std::int64_t count)
+    {
+        const auto range = share_.take(count, mailbox_.rank(), mailbox_.size());
+        if (share_.shouldAsk()) {
+            const JobRequest request{count, mailbox_.executor().concurrency(), 0};
+            if (mailbox_.rank() == server_)
+                outcome_.guarded([&] { share_.receive(share_.give(request, mailbox_.size())); });
+            else
+                mailbox_.sendBody(server_, MessageKind::JobRequest, frame_.number(), request);
+        }
+        return range;
+    }
+
+    Mailbox& mailbox_;
+    const OpenFrame& frame_;
+    FrameOutcome& outcome_;
+    const int server_;
+    JobShare share_;
 };
 
 } // namespace dfb::detail
