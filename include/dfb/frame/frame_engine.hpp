@@ -297,7 +297,7 @@ public:
         pipeline_->fillBackground();
         if (!verdict.error) {
             if (config_.codec)
-                compressionTrial_.took(static_cast<double>(verdict.maxima[3]));
+                compressionTrial_.took(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
             gains_->endFrame();
             lastAccumulationId_ = params_.accumulationId;
             nextSample_ = params_.samples ? 0 : pipeline_->table().frameInfo().firstSample + params_.passes;
@@ -638,20 +638,21 @@ private:
     {
         const std::int64_t repeated = mailbox_->connection().duplicates();
         const auto reports = pipeline_->reports();
-        v.sums = {mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes(),
-                  mailbox_->messagesSent() - messagesBefore_,
-                  open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0,
-                  pipeline_->nonFinitePixels(),
-                  open_.takeLateCount(),
-                  repeated - repeatedBefore_,
-                  reports.orderUndefinedPixels,
-                  pipeline_->alphaOutsidePixels(),
-                  gains_->links(),
-                  inputsSent_ - pipeline_->table().arrivedCount(),
-                  pipeline_->table().endedEarlyCount()};
-        v.maxima = {static_cast<std::int64_t>(pool_->peakBytes()), renderNs_,
-                    static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes()),
-                    std::chrono::nanoseconds(Clock::now() - beginTime_).count()};
+        v.sums[Verdict::BytesSent] = mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes();
+        v.sums[Verdict::MessagesSent] = mailbox_->messagesSent() - messagesBefore_;
+        v.sums[Verdict::TilesTouched] = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
+        v.sums[Verdict::NonFinitePixels] = pipeline_->nonFinitePixels();
+        v.sums[Verdict::LateMessages] = open_.takeLateCount();
+        v.sums[Verdict::RepeatedMessages] = repeated - repeatedBefore_;
+        v.sums[Verdict::OrderUndefinedPixels] = reports.orderUndefinedPixels;
+        v.sums[Verdict::AlphaOutsidePixels] = pipeline_->alphaOutsidePixels();
+        v.sums[Verdict::CompressedLinks] = gains_->links();
+        v.sums[Verdict::InputsLeft] = inputsSent_ - pipeline_->table().arrivedCount();
+        v.sums[Verdict::TilesEndedEarly] = pipeline_->table().endedEarlyCount();
+        v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
+        v.maxima[Verdict::RenderNs] = renderNs_;
+        v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
+        v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
         v.wireErrorBound = reports.wireErrorBound;
         v.tileErrors = FrameFigures::of(reports.errors);
         figures_.addTo(v);

@@ -69,12 +69,23 @@ struct Verdict {
     std::optional<ErrorInfo> error;
     FrameTerms terms;      // what begin() was given; the same on all ranks
     std::string differing; // what of it is not, in words
-    // Bytes, messages, tiles touched, non-finite pixels, late messages, repeated messages, pixels of undefined order,
-    // pixels with alpha outside [0, 1], compressed links, inputs that were sent without those that have come, tiles
-    // that needed no more although more was to come.
-    std::array<std::int64_t, 11> sums{};
-    // Peak memory in bytes, rendering in ns, peak of the inbox in bytes, ns from begin() until all is done here.
-    std::array<std::int64_t, 4> maxima{};
+    enum Sum {
+        BytesSent,
+        MessagesSent,
+        TilesTouched,
+        NonFinitePixels,
+        LateMessages,
+        RepeatedMessages,
+        OrderUndefinedPixels,
+        AlphaOutsidePixels, // outside [0, 1]
+        CompressedLinks,
+        InputsLeft,      // sent, less those that have come
+        TilesEndedEarly, // they needed no more, although more was to come
+        sumCount
+    };
+    enum Maximum { PeakMemoryBytes, RenderNs, PeakInboxBytes, TotalNs, maximumCount };
+    std::array<std::int64_t, sumCount> sums{};
+    std::array<std::int64_t, maximumCount> maxima{};
     double wireErrorBound = 0;            // a maximum
     std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
     std::vector<Figure> figures;          // by key; sums
@@ -142,18 +153,18 @@ struct Verdict {
     // What is the same on all ranks.
     void addTo(FrameReport& report) const
     {
-        report.bytesSent = sums[0];
-        report.messagesSent = sums[1];
-        report.tilesTouched = sums[2];
-        report.nonFinitePixels = sums[3];
-        report.lateMessages = sums[4];
-        report.repeatedMessages = sums[5];
-        report.peakMemoryBytes = maxima[0];
-        report.renderMsMax = static_cast<double>(maxima[1]) / 1e6;
-        report.peakInboxBytes = maxima[2];
-        report.orderUndefinedPixels = sums[6];
-        report.alphaOutsidePixels = sums[7];
-        report.compressedLinks = sums[8];
+        report.bytesSent = sums[BytesSent];
+        report.messagesSent = sums[MessagesSent];
+        report.tilesTouched = sums[TilesTouched];
+        report.nonFinitePixels = sums[NonFinitePixels];
+        report.lateMessages = sums[LateMessages];
+        report.repeatedMessages = sums[RepeatedMessages];
+        report.peakMemoryBytes = maxima[PeakMemoryBytes];
+        report.renderMsMax = static_cast<double>(maxima[RenderNs]) / 1e6;
+        report.peakInboxBytes = maxima[PeakInboxBytes];
+        report.orderUndefinedPixels = sums[OrderUndefinedPixels];
+        report.alphaOutsidePixels = sums[AlphaOutsidePixels];
+        report.compressedLinks = sums[CompressedLinks];
         report.wireErrorBound = wireErrorBound;
         report.mergeErrorBound = 0;
         for (const Figure& f : mergeErrors)
@@ -203,7 +214,7 @@ struct Verdict {
     // comes to a tile that needs no more may be too late as well: then nothing can be said.
     std::optional<ErrorInfo> strayInputs() const
     {
-        const std::int64_t count = sums[10] == 0 ? sums[9] : 0;
+        const std::int64_t count = sums[TilesEndedEarly] == 0 ? sums[InputsLeft] : 0;
         if (count == 0)
             return std::nullopt;
         ErrorInfo info;
