@@ -57,9 +57,11 @@ public:
           flow_(connection_->size(), poolBytes,
                 {[this](int to, Buffer&& message) { connection_->send(to, std::move(message)); },
                  [this](int to, const FlowControl::Request& request) {
-                     sendStruct(to, MessageKind::CreditRequest, request);
+                     sendBody(to, MessageKind::CreditRequest, epoch_, request);
                  },
-                 [this](int to, const FlowControl::Credit& credit) { sendStruct(to, MessageKind::Credit, credit); }}),
+                 [this](int to, const FlowControl::Credit& credit) {
+                     sendBody(to, MessageKind::Credit, epoch_, credit);
+                 }}),
           reductions_(connection_->rank(), connection_->size(),
                       [this](int to, const ReductionKey& key, bool up, const Bytes& bytes) {
                           sendReduction(to, key, up, bytes);
@@ -527,13 +529,6 @@ private:
         MessageHeader header;
         Buffer message;
     };
-
-    template <class Body>
-    void sendStruct(int destination, MessageKind kind, const Body& body)
-    {
-        const auto* first = reinterpret_cast<const std::byte*>(&body);
-        send(destination, kind, epoch_, Bytes(first, first + sizeof body));
-    }
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
