@@ -1,4 +1,4 @@
-#include "../mpi/ranks.hpp"
+#include "ranks.hpp"
 #include "catch.hpp"
 
 #include <dfb/comm/mpi_transport.hpp>

@@ -1,6 +1,6 @@
 // A framebuffer inside the user's OpenMP code: tiles are rendered and set by its threads, frames begun and ended
 // outside; and framebuffers that belong to a thread each.
-#include "../inproc/scene.hpp"
+#include "scene.hpp"
 #include "catch.hpp"
 
 #include <omp.h>

@@ -247,7 +247,7 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 //   Float16:         |d| <= u c, |e| <= u a, u = 2^-11, and sum_j T'_j a'_j <= 1: u / (1 - u) (M + B), however many
 //                    layers there are. Values below 2^-28 M are denormal there: 2^-39 (M + B) more for each layer.
 // A mean of passes is no worse than its worst pass. Unorm is converted in float, four roundings of 2^-24 M: 2^-21 (M +
-// B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire_format.cpp
+// B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire/wire_format.cpp
 // looks for pixels that are worse, also at the edges.
 
 namespace dfb {

@@ -1,0 +1,386 @@
+// What errors name: the rank, the setting and its values, the input; on every rank alike, and the next frame is right.
+
+#include "everywhere.hpp"
+
+#include <array>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace frame_cases {
+
+template <class Transport>
+using BlameFrameBuffer = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport>;
+
+// "rank 2"
+inline std::string rankText(int rank) { return "rank " + std::to_string(rank); }
+
+inline void expectText(Result& result, const std::string& what, const std::string& text,
+                       const std::vector<std::string>& parts)
+{
+    for (const std::string& part : parts)
+        result.expect(scene::has(text, part), what + ": no \"" + part + "\" in: " + text);
+}
+
+// A good frame, compared with the reference.
+template <class Fb>
+void expectGoodFrame(Result& result, Fb& fb, const scene::Scene& s, const std::string& what)
+{
+    const std::string text = scene::outcomeOf([&] {
+        const auto report = scene::renderLoop(fb, s, scene::Loop::Declared);
+        if (fb.isDisplayRank())
+            result.expect(wrongValues(scene::Picture(fb.image(), report), referenceOf(s)) == 0,
+                          "a wrong image after " + what);
+    });
+    result.expect(text == "fine", "after " + what + ": " + text);
+}
+
+// The first and the last rank in turn are the odd one.
+inline std::vector<int> oddRanks(int size) { return size > 1 ? std::vector<int>{0, size - 1} : std::vector<int>{}; }
+
+// What a text has where `odd` has `its`, and the others `usual`: any of them may be named.
+inline std::string valuesText(int odd, const std::string& usual, const std::string& its)
+{
+    return odd == 0 ? its + " on rank 0 and " + usual + " on rank " : " and " + its + " on rank " + std::to_string(odd);
+}
+
+// Frames that begin with different parameters.
+struct BlamedParams {
+    struct Case {
+        const char* name;
+        std::function<void(dfb::FrameParams&)> change; // on the odd rank
+        const char *usual, *its;
+    };
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Params = dfb::FrameParams;
+        const std::vector<Case> cases{
+            {"background", [](Params& p) { p.background[2] = 0.75f; }, "(0.125, 0.25, 0.5, 1)",
+             "(0.125, 0.25, 0.75, 1)"},
+            {"passes", [](Params& p) { p.passes = 3; }, "2", "3"},
+            {"samples",
+             [](Params& p) {
+                 p.samples = std::make_shared<std::vector<dfb::TileSamples>>(28, dfb::TileSamples{0, 2});
+             },
+             "null", "a plan of 56 samples"},
+            {"maxLayers", [](Params& p) { p.maxLayers = 9; }, "4", "9"},
+            {"accumulationId", [](Params& p) { p.accumulationId = 77; }, "5", "77"},
+            {"timeoutMs", [](Params& p) { p.timeoutMs = 31000; }, "30000", "31000"},
+            {"allowPartial", [](Params& p) { p.allowPartial = true; }, "false", "true"}};
+        const scene::Scene s = scene::makeScene(3);
+        Result result;
+        BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+        for (const int odd : oddRanks(fb.size()))
+            for (const Case& c : cases) {
+                std::int64_t number = 0;
+                const std::string text = scene::outcomeOf([&] {
+                    Params params;
+                    params.background = {0.125f, 0.25f, 0.5f, 1.0f};
+                    params.passes = 2;
+                    params.maxLayers = 4;
+                    params.accumulationId = 5;
+                    params.declared = true;
+                    params.timeoutMs = 30000;
+                    if (fb.rank() == odd)
+                        c.change(params);
+                    auto frame = fb.begin(params);
+                    number = frame.number();
+                    frame.declare({}); // no rank waits for anything: the verdict alone tells
+                    frame.end();
+                });
+                const std::string what = std::string(c.name) + " of rank " + std::to_string(odd);
+                expectText(result, what, text,
+                           {"FrameError: dfb: ranks disagree: frame " + std::to_string(number),
+                            std::string("FrameParams::") + c.name + " is ", valuesText(odd, c.usual, c.its),
+                            std::string(c.usual) + " on rank ", "it must be the same on all ranks"});
+                expectGoodFrame(result, fb, s, what);
+            }
+        return result;
+    }
+};
+
+// Framebuffers that are configured differently, or wrongly on one rank.
+struct BlamedConfig {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Config = dfb::FrameBufferConfig;
+        struct Different {
+            const char* name;
+            std::function<void(Config&)> change; // on the odd rank
+            const char *usual, *its;
+        };
+        const std::vector<Different> differences{
+            {"width", [](Config& c) { c.width = 98; }, "97", "98"},
+            {"height", [](Config& c) { c.height = 192; }, "61", "192"},
+            {"format", [](Config& c) { c.format = dfb::OutputFormat::SRGBA8; }, "RGBA32F", "SRGBA8"},
+            {"depth", [](Config& c) { c.depth = false; }, "true", "false"},
+            {"dither", [](Config& c) { c.dither = true; }, "false", "true"},
+            {"framesInFlight", [](Config& c) { c.framesInFlight = 2; }, "1", "2"},
+            {"compression", [](Config& c) { c.compression = dfb::CompressionMode::Auto; }, "Always", "Auto"},
+            {"messagePoolBytes", [](Config& c) { c.messagePoolBytes = 1 << 28; }, "67108864", "268435456"},
+            {"minTransmittance", [](Config& c) { c.minTransmittance = 0.5f; }, "0", "0.5"},
+            {"wire.color", [](Config& c) { c.wire = dfb::WireFormat::Float16; }, "float32", "float16"}};
+        struct Wrong {
+            std::function<void(Config&)> change;
+            const char* text;
+        };
+        const std::vector<Wrong> wrongs{
+            {[](Config& c) { c.width = 0; }, "the image size is 0x61"},
+            {[](Config& c) { c.displayRank = 99; }, "the display rank is 99 of "},
+            {[](Config& c) { c.framesInFlight = 0; }, "0 frames in flight"},
+            {[](Config& c) { c.minTransmittance = 2; }, "a least transmittance of 2"},
+            {[](Config& c) { c.aux = dfb::normalChannel; }, "auxiliary channels"},
+            {[](Config& c) { c.ownerMap = [](int, const dfb::TileLayout&, int) { return 99; }; },
+             "the owner map gives tile 0 to rank 99 of "},
+            {[](Config& c) {
+                 c.ownerMap = [](int, const dfb::TileLayout&, int) -> int { throw std::runtime_error("no such map"); };
+             },
+             "no such map"}};
+        const scene::Scene s = scene::makeScene(3);
+        Result result;
+        int size = 0, rank = 0;
+        const auto make = [&](int odd, const std::function<void(Config&)>& change) {
+            Config config = configOf(s);
+            if (rank == odd)
+                change(config);
+            return scene::outcomeOf([&] { BlameFrameBuffer<Transport> fb(communicator, config); });
+        };
+        {
+            BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+            size = fb.size(), rank = fb.rank();
+        }
+        for (const int odd : oddRanks(size)) {
+            for (const Different& d : differences)
+                expectText(result, std::string(d.name) + " of rank " + std::to_string(odd), make(odd, d.change),
+                           {"InvalidArgument: dfb: invalid argument: ", std::string(d.name) + " is ",
+                            valuesText(odd, d.usual, d.its), std::string(d.usual) + " on rank ",
+                            "it must be the same on all ranks"});
+            for (const Wrong& w : wrongs)
+                expectText(result, std::string(w.text) + " on rank " + std::to_string(odd), make(odd, w.change),
+                           {"InvalidArgument: dfb: invalid argument: rank " + std::to_string(odd) + ": ", w.text});
+        }
+        for (const int odd : oddRanks(size)) {
+            const auto makeWall = [&](bool checksums, int bezel, int displays) {
+                dfb::ConnectionOptions options;
+                options.checksums = checksums;
+                dfb::WallLayout layout;
+                layout.columns = displays;
+                layout.displayWidth = layout.displayHeight = 8;
+                layout.bezelX = bezel;
+                layout.ranks = {0, 1};
+                const auto connection = dfb::connect<Transport>(communicator, options);
+                return scene::outcomeOf([&] {
+                    dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8,
+                                          std::make_shared<dfb::ThreadExecutor>(1));
+                });
+            };
+            // The exception takes the connection along.
+            const auto makeWide = [&](int width) {
+                return scene::outcomeOf([&] {
+                    const auto connection = dfb::connect<Transport>(communicator);
+                    Config config = configOf(s);
+                    config.width = width;
+                    BlameFrameBuffer<Transport> fb(connection, config);
+                });
+            };
+            const std::string sums = scene::outcomeOf([&] {
+                dfb::ConnectionOptions options;
+                options.checksums = rank == odd;
+                BlameFrameBuffer<Transport> fb(communicator, configOf(s), options);
+            });
+            expectText(result, "checksums of rank " + std::to_string(odd), sums,
+                       {"InvalidArgument: dfb: invalid argument: checksums is ", valuesText(odd, "false", "true")});
+            const std::string what = "a wall, rank " + std::to_string(odd),
+                              refused = "InvalidArgument: dfb: invalid argument: ";
+            expectText(result, what, makeWall(rank == odd, 0, 2),
+                       {refused + "checksums is ", valuesText(odd, "false", "true")});
+            expectText(result, what, makeWall(false, rank == odd ? 3 : 1, 2),
+                       {refused + "the size of its bezels is ", valuesText(odd, "1x0", "3x0")});
+            expectText(result, what, makeWall(false, 0, rank == odd ? 3 : 2),
+                       {refused + rankText(odd) + ": a wall of 3 displays names 2 ranks"});
+            expectText(result, "width of rank " + std::to_string(odd), makeWide(rank == odd ? 98 : 97),
+                       {refused + "width is ", valuesText(odd, "97", "98")});
+        }
+        BlameFrameBuffer<Transport> fb(communicator, configOf(s));
+        for (const int odd : oddRanks(size)) {
+            std::vector<std::int64_t> values(rank == odd ? 3 : 2);
+            expectText(result, "allReduce() of rank " + std::to_string(odd),
+                       scene::outcomeOf([&] { fb.allReduce(values, BlameFrameBuffer<Transport>::Reduce::Sum); }),
+                       {"InvalidArgument: dfb: invalid argument: the number of values in allReduce() is ",
+                        valuesText(odd, "2", "3"), "2 on rank "});
+        }
+        expectGoodFrame(result, fb, s, "all of them");
+        return result;
+    }
+};
+
+// Own trees and bricks.
+struct BlamedTree {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Fb = BlameFrameBuffer<Transport>;
+        Result result;
+        const scene::Scene s = scene::makeScene(3);
+        Fb fb(communicator, configOf(s));
+        const int size = fb.size(), owner = fb.tileOwner(5);
+        const auto tile = std::make_unique<typename Fb::Tile>();
+        {
+            // The owner announces what never comes.
+            dfb::FrameParams params;
+            params.timeoutMs = 300;
+            std::string text;
+            dfb::ErrorInfo error;
+            try {
+                auto frame = fb.begin(params);
+                for (const int index : fb.ownedTiles()) {
+                    frame.start(*tile, index);
+                    tile->children = index == 5 ? 2 : 0;
+                    tile->source = static_cast<std::uint32_t>(40 + fb.rank());
+                    frame.setTile(*tile);
+                }
+                frame.end();
+            } catch (const dfb::FrameError& e) {
+                text = e.what();
+                error = e.info();
+            }
+            expectText(result, "a missing input", text,
+                       {"dfb: timed out: noticed by " + rankText(owner) + ", announced by " + rankText(owner),
+                        "tile 5: generation 1 has 0 of 2 inputs; announced by source " + std::to_string(40 + owner)
+                            + " of " + rankText(owner)});
+            result.expect(error.rank == owner && error.from == owner, "ranks of a time-out: " + text);
+            expectGoodFrame(result, fb, s, "a missing input");
+        }
+        if (size == 1)
+            return result;
+        for (const int first : {0, size - 2}) {
+            // Two ranks have the brick.
+            const int second = size - 1;
+            std::vector<dfb::Brick> bricks;
+            if (fb.rank() == first || fb.rank() == second)
+                bricks.push_back({7, {{3, 5, 0}, {90, 60, 1}}});
+            dfb::ErrorInfo error;
+            std::string text;
+            try {
+                dfb::DataParallelLoop(fb, dfb::World(bricks))
+                    .render(scene::FlatCamera(), [](const dfb::Brick&, auto& t) { t.pixel(0, 0)[3] = 1; });
+            } catch (const dfb::FrameError& e) {
+                text = e.what();
+                error = e.info();
+            }
+            expectText(result, "a brick of two ranks", text,
+                       {"dfb: duplicate input: noticed by rank ", "generation 1, source 7",
+                        "source 7 (in the library's loops: the id of a brick) comes from " + rankText(first)
+                            + " and from " + rankText(second),
+                        "SharedWorld"});
+            result.expect(error.source == 7 && error.from == second
+                              && error.rank == fb.tileOwner(static_cast<int>(error.tile)),
+                          "ranks of a duplicate: " + text);
+            expectGoodFrame(result, fb, s, "a brick of two ranks");
+        }
+        // One rank sends twice.
+        const std::string text = scene::outcomeOf([&] {
+            auto frame = fb.begin();
+            for (int i = 0; i < 2 && fb.rank() == size - 1; ++i) {
+                frame.start(*tile, 5);
+                tile->generation = 1;
+                tile->source = 50;
+                frame.setTile(*tile);
+            }
+            frame.end();
+        });
+        expectText(result, "an input that comes twice", text,
+                   {"dfb: duplicate input: noticed by " + rankText(owner) + ", from " + rankText(size - 1), "tile 5",
+                    "source 50 (in the library's loops: the id of a brick) comes twice from " + rankText(size - 1)});
+        result.expect(!scene::has(text, "SharedWorld"), text);
+        expectGoodFrame(result, fb, s, "an input that comes twice");
+        return result;
+    }
+};
+
+// A camera that breaks on one rank.
+struct BrokenCamera : scene::FlatCamera {
+    bool isBroken = false;
+    dfb::Region project(const dfb::Box3& b, int w, int h) const
+    {
+        if (isBroken)
+            throw std::runtime_error("the lens is gone");
+        return FlatCamera::project(b, w, h);
+    }
+};
+
+// Exceptions between begin() and end().
+struct BlamedLoop {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Fb = BlameFrameBuffer<Transport>;
+        Result result;
+        const scene::Scene s = scene::makeScene(3);
+        Fb fb(communicator, configOf(s));
+        const auto tile = std::make_unique<typename Fb::Tile>();
+        for (const int culprit : {0, fb.size() / 2, fb.size() - 1})
+            for (const bool named : {false, true}) {
+                std::int64_t number = 0;
+                bool through = false;
+                const std::string text = scene::outcomeOf([&] {
+                    auto frame = fb.begin();
+                    number = frame.number();
+                    const auto renderAll = [&] {
+                        for (const int index : fb.ownedTiles()) {
+                            frame.start(*tile, index);
+                            if (fb.rank() == culprit)
+                                throw std::runtime_error("out of paint");
+                            frame.setTile(*tile);
+                        }
+                    };
+                    through = named ? frame.guard(renderAll, *tile) : frame.guard(renderAll);
+                    frame.end();
+                });
+                const std::string where = named ? ", tile " : ": out of paint";
+                expectText(result, "an own loop", text,
+                           {"FrameError: dfb: exception in user code: " + rankText(culprit) + ", frame "
+                                + std::to_string(number) + where,
+                            ": out of paint"});
+                result.expect(through == (fb.rank() != culprit), "guard() returned the wrong thing");
+                expectGoodFrame(result, fb, s, "an exception in an own loop");
+            }
+        for (const int culprit : oddRanks(fb.size())) {
+            BrokenCamera camera;
+            camera.isBroken = fb.rank() == culprit;
+            const dfb::World world(scene::bricksOf(scene::makeScene(fb.size()), fb.rank(), fb.size()));
+            const std::string text = scene::outcomeOf(
+                [&] { dfb::DataParallelLoop(fb, world).render(camera, [](const dfb::Brick&, auto&) {}); });
+            expectText(result, "a camera", text,
+                       {"FrameError: dfb: exception in user code: " + rankText(culprit), ": the lens is gone"});
+            expectGoodFrame(result, fb, s, "a broken camera");
+        }
+        return result;
+    }
+};
+
+} // namespace frame_cases
+
+TEST_CASE("Parameters of frames that differ are named, with ranks and values", "[blame]")
+{
+    everywhere<frame_cases::BlamedParams>();
+}
+TEST_CASE("A configuration that is wrong or differs is named, with ranks and values", "[blame]")
+{
+    everywhere<frame_cases::BlamedConfig>();
+}
+TEST_CASE("Inputs that are missing or come twice are named, with their ranks", "[blame]")
+{
+    everywhere<frame_cases::BlamedTree>();
+}
+TEST_CASE("An exception between begin() and end() is told to all ranks", "[blame]")
+{
+    everywhere<frame_cases::BlamedLoop>();
+}

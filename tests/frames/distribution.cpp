@@ -1,0 +1,372 @@
+// Bricks that several ranks hold, and bricks in a known order.
+
+#include "everywhere.hpp"
+
+#include <algorithm>
+#include <atomic>
+#include <cmath>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <string>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+namespace frame_cases {
+
+using Blend = dfb::BasicAlphaBlend<16>;
+template <class Transport>
+using BlendFrameBuffer = dfb::DistributedFrameBuffer<Blend, dfb::NoPixelOp, Transport>;
+
+// Brick i is held by the ranks i, i + 1, ... of `copies`, counted round.
+inline dfb::World replicated(const std::vector<dfb::Brick>& bricks, int rank, int size, int copies)
+{
+    dfb::World world;
+    for (int i = 0; i < static_cast<int>(bricks.size()); ++i)
+        for (int k = 0; k < std::min(copies, size); ++k)
+            if ((i + k) % size == rank)
+                world.add(bricks[static_cast<std::size_t>(i)]);
+    return world;
+}
+
+// ---- who renders what does not show ----------------------------------------------------------------------------
+
+struct Mixed {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(7, 3, 97, 61, 3);
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 2));
+        const auto check = [&](const dfb::FrameReport& report, const std::string& name) {
+            if (!fb.isDisplayRank())
+                return;
+            const scene::Picture picture(fb.image(), report);
+            result.expect(wrongValues(picture, referenceOf(s)) == 0, name + ": values");
+            result.expect(result.hash == 0 || result.hash == picture.hash(), name + ": another image");
+            result.hash = picture.hash();
+        };
+        check(dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                  .render(
+                      scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); },
+                      paramsOf(s)),
+              "data-parallel");
+        for (const int copies : {1, 2, fb.size()}) {
+            const dfb::SharedWorld world(fb, replicated(s.bricks, fb.rank(), fb.size(), copies));
+            result.expect(world.bricks().size() == s.bricks.size(), "bricks of all ranks");
+            const std::string name = std::to_string(copies) + " copies";
+            std::mutex mutex;
+            std::map<std::tuple<std::uint32_t, int, int>, int> rendered;
+            const auto render = [&](const dfb::Brick& b, auto& tile) {
+                renderBrick(s, b, tile);
+                const std::lock_guard<std::mutex> lock(mutex);
+                ++rendered[{b.id, tile.tile, tile.pass}];
+                return 1.0;
+            };
+            const auto renderedOnce = [&](const std::string& what) {
+                const std::int64_t pairs =
+                    static_cast<std::int64_t>(visibleTiles(world, scene::FlatCamera(), fb.layout()).size());
+                const std::int64_t all =
+                    fb.allReduce({static_cast<std::int64_t>(rendered.size())}, decltype(fb)::Reduce::Sum).front();
+                result.expect(all == 3 * pairs, what + ": " + std::to_string(all) + " tiles of bricks rendered of "
+                                                    + std::to_string(3 * pairs));
+                rendered.clear();
+            };
+            for (const bool share : {false, true}) {
+                dfb::RoundRobinBricks owner{share};
+                const auto report =
+                    dfb::MixedParallelLoop(fb, world, owner).render(scene::FlatCamera(), render, paramsOf(s));
+                result.expect(report.figures.empty(), "costs that nobody wants");
+                check(report, name + ", round robin");
+                renderedOnce(name + ", round robin");
+            }
+            dfb::MeasuredCostBricks owner;
+            dfb::MixedParallelLoop loop(fb, world, owner);
+            for (int frame = 0; frame < 3; ++frame) {
+                const auto report = loop.render(scene::FlatCamera(), render, paramsOf(s));
+                owner.update(report);
+                check(report, name + ", by cost");
+                renderedOnce(name + ", by cost");
+            }
+        }
+        return result;
+    }
+};
+
+// Two ranks with the same id and other bounds are told so, all of them.
+struct OtherBounds {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(2);
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        const auto wide = static_cast<float>(1 + (fb.rank() == fb.size() - 1 ? 1 : 0));
+        const std::string outcome = scene::outcomeOf([&] {
+            const dfb::SharedWorld world(fb, dfb::World({{7, {{0, 0, 0}, {wide, 1, 1}}}}));
+        });
+        result.expect(fb.size() == 1 ? outcome == "fine" : scene::has(outcome, "brick 7 has other bounds"), outcome);
+        // The same bounds and another id: two bricks.
+        const dfb::SharedWorld world(fb, dfb::World({{1, {{0, 0, 0}, {1, 1, 1}}}, {2, {{0, 0, 0}, {1, 1, 1}}}}));
+        result.expect(world.bricks().size() == 2, "two bricks with equal bounds");
+        return result;
+    }
+};
+
+// All data in one corner of the view, most of it in one brick: two ranks for each brick take much of the slowest rank's
+// work, and more if the costs decide.
+struct Unbalanced {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        scene::Scene s = scene::makeScene(0, 1, 256, 256, 1);
+        const int size = std::max(2, communicatorSize<Transport>(communicator));
+        for (int i = 0; i < size; ++i) { // beside each other, the first the largest
+            const float x0 = i == 0 ? 0 : 64.0f + 8.0f * static_cast<float>(i - 1),
+                        x1 = 64.0f + 8.0f * static_cast<float>(i);
+            s.bricks.push_back({static_cast<std::uint32_t>(i), {{x0, 0, 0}, {x1, 96, 1}}});
+        }
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        std::atomic<std::int64_t> samples{0};
+        const auto render = [&](const dfb::Brick& b, auto& tile) {
+            renderBrick(s, b, tile);
+            const dfb::Region r = dfb::intersection(tile.region, scene::FlatCamera().project(b.bounds, 0, 0));
+            const std::int64_t here = static_cast<std::int64_t>(r.width()) * r.height();
+            samples += here;
+            return static_cast<double>(here);
+        };
+        const auto slowest = [&] {
+            return static_cast<double>(fb.allReduce({samples.exchange(0)}, decltype(fb)::Reduce::Max).front());
+        };
+        dfb::DataParallelLoop(fb, replicated(s.bricks, fb.rank(), fb.size(), 1))
+            .render(scene::FlatCamera(), render, paramsOf(s));
+        const double dataParallel = slowest();
+        const dfb::SharedWorld world(fb, replicated(s.bricks, fb.rank(), fb.size(), 2));
+        dfb::RoundRobinBricks inTurn;
+        dfb::MixedParallelLoop(fb, world, inTurn).render(scene::FlatCamera(), render, paramsOf(s));
+        const double roundRobin = slowest();
+        dfb::MeasuredCostBricks byCost;
+        dfb::MixedParallelLoop loop(fb, world, byCost);
+        byCost.update(loop.render(scene::FlatCamera(), render, paramsOf(s)));
+        slowest();
+        const auto report = loop.render(scene::FlatCamera(), render, paramsOf(s));
+        const double measured = slowest();
+        if (fb.size() > 1) {
+            const std::string text = std::to_string(dataParallel) + " samples on the slowest rank data-parallel, "
+                                     + std::to_string(roundRobin) + " dealt out, " + std::to_string(measured)
+                                     + " by cost";
+            result.expect(measured <= 0.65 * dataParallel, text);
+            result.expect(measured < roundRobin, text);
+        }
+        if (fb.isDisplayRank())
+            result.expect(wrongValues(scene::Picture(fb.image(), report), referenceOf(s)) == 0, "values");
+        return result;
+    }
+
+    // The scene has a brick per rank, so its image depends on how many there are, and no hash is compared.
+    template <class Transport>
+    static int communicatorSize(const typename Transport::Communicator& communicator)
+    {
+        dfb::FrameBufferConfig config;
+        config.width = config.height = 1;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        return BlendFrameBuffer<Transport>(communicator, config).size();
+    }
+};
+
+// ---- in a known order ------------------------------------------------------------------------------------------
+
+// Boxes of glass with bubbles, seen by a camera that stands among them.
+struct Ordered {
+    static std::vector<dfb::Brick> boxes()
+    {
+        std::vector<dfb::Brick> all;
+        for (int z = 0; z < 3; ++z)
+            for (int y = 0; y < 2; ++y)
+                for (int x = 0; x < 2; ++x) {
+                    const auto i = static_cast<std::uint32_t>(all.size());
+                    const auto at = [](int v, float shift) { return 1.5f * static_cast<float>(v) + shift; };
+                    const dfb::Vec3 lower{at(x, 0), at(y, 0.1f * static_cast<float>(x)), at(z, 0)};
+                    const float side = i % 3 == 0 ? 0.9f : 1.4f; // those with 1.4 nearly touch
+                    all.push_back({11 - i, {lower, lower + dfb::Vec3{side, side, side}}});
+                }
+        return all;
+    }
+
+    static float enter(const dfb::Box3& b, const dfb::Vec3& eye, const dfb::Vec3& d)
+    {
+        float first = 0, last = 1e30f;
+        const auto axis = [&](float lo, float hi, float e, float v) {
+            const float t0 = (lo - e) / v, t1 = (hi - e) / v;
+            first = std::max(first, std::min(t0, t1));
+            last = std::min(last, std::max(t0, t1));
+        };
+        axis(b.lower.x, b.upper.x, eye.x, d.x);
+        axis(b.lower.y, b.upper.y, eye.y, d.y);
+        axis(b.lower.z, b.upper.z, eye.z, d.z);
+        return first < last ? first : -1;
+    }
+
+    template <class Op, class Transport>
+    static void render(const typename Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
+                       std::int64_t& bytes)
+    {
+        const dfb::Vec3 eye{0.7f, 0.8f, 6.5f}, target{1.1f, 1.0f, 0};
+        const dfb::PerspectiveCamera camera(eye, target, {0, 1, 0}, 50);
+        dfb::FrameBufferConfig config;
+        config.width = 97;
+        config.height = 61;
+        config.format = dfb::OutputFormat::RGBA32F;
+        config.executor = std::make_shared<dfb::ThreadExecutor>(2);
+        dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
+        const dfb::SharedWorld world(fb, replicated(boxes(), fb.rank(), fb.size(), copies));
+        const auto shade = [&](const dfb::Brick& b, int x, int y, float* rgba, float& depth) {
+            const float t = enter(b.bounds, eye, camera.direction(x + 0.5, y + 0.5, 97, 61));
+            if (t < 0 || (x + y) % 11 == static_cast<int>(b.id) % 11)
+                return;
+            rgba[3] = 0.3f + 0.05f * static_cast<float>(b.id % 5);
+            rgba[b.id % 3] = rgba[3] * 0.9f;
+            depth = t;
+        };
+        const auto renderBrick = [&](const dfb::Brick& b, auto& tile) {
+            tile.forEachPixel([&](int x, int y, float* rgba, float& depth) { shade(b, x, y, rgba, depth); });
+        };
+        // The same pixels, as images of this rank's bricks that are there beforehand.
+        constexpr std::size_t stride = 97 + 5;
+        struct BrickImage {
+            std::vector<float> rgba = std::vector<float>(4 * stride * 61, 0.0f);
+            std::vector<float> depth = std::vector<float>(stride * 61, std::numeric_limits<float>::infinity());
+        };
+        std::map<std::uint32_t, BrickImage> images;
+        for (const dfb::SharedBrick& b : world.bricks())
+            for (std::size_t i = 0; i < stride * 61; ++i)
+                if (BrickImage& image = images[b.brick.id]; i % stride < 97)
+                    shade(b.brick, static_cast<int>(i % stride), static_cast<int>(i / stride), &image.rgba[4 * i],
+                          image.depth[i]);
+        const auto findBrick = dfb::inPlace([&](const dfb::Brick& b, auto& view) {
+            const std::size_t first =
+                static_cast<std::size_t>(view.region.y0) * stride + static_cast<std::size_t>(view.region.x0);
+            view.stride = stride;
+            view.color = &images.at(b.id).rgba[4 * first];
+            view.depth = &images.at(b.id).depth[first];
+        });
+        dfb::FrameParams params;
+        params.passes = 2;
+        params.background = {0.1f, 0.2f, 0.3f, 1};
+        dfb::RoundRobinBricks owner{copies > 1};
+        const auto frame = [&](const auto& brickSource) {
+            if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
+                return dfb::OrderedLoop(fb, world, owner)
+                    .render(camera, dfb::visibilityOrder(world, eye), brickSource, params);
+            else
+                return dfb::MixedParallelLoop(fb, world, owner).render(camera, brickSource, params);
+        };
+        const dfb::FrameReport report = inPlace ? frame(findBrick) : frame(renderBrick);
+        bytes = report.bytesSent;
+        if (!fb.isDisplayRank())
+            return;
+        const std::uint64_t hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
+        result.expect(result.hash == 0 || result.hash == hash, "another image, " + std::to_string(copies) + " copies");
+        result.hash = hash;
+    }
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        for (const int copies : {1, 2}) {
+            std::int64_t sorted = 0, ordered = 0;
+            for (const bool inPlace : {true, false}) {
+                render<Blend, Transport>(communicator, result, copies, inPlace, sorted);
+                render<dfb::BasicOrderedBlend<16>, Transport>(communicator, result, copies, inPlace, ordered);
+            }
+            result.expect(sorted == 0 || ordered < sorted, "no depth to send, and yet " + std::to_string(ordered)
+                                                               + " bytes beside " + std::to_string(sorted));
+        }
+        return result;
+    }
+};
+
+// An owner that names a rank without the brick, and an order that is none, are errors on all ranks; the next frame is
+// right.
+struct WrongOwner {
+    struct Owner {
+        int size = 1, shift = 0; // from one that has it; -1: nobody
+
+        int operator()(const dfb::SharedBrick& brick, int, int) const
+        {
+            return shift < 0 ? size : (brick.ranks.front() + shift) % size;
+        }
+    };
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        scene::Scene s = scene::makeScene(3, 6);
+        s.timeoutMs = 5000; // nothing waits for it
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport> inOrder(communicator,
+                                                                                                   configOf(s, 1));
+        const dfb::World mine(bricksOf(s, fb.rank(), fb.size()));
+        const dfb::SharedWorld world(fb, mine);
+        const auto render = [&](const dfb::Brick& b, auto& tile) {
+            if (std::none_of(mine.bricks().begin(), mine.bricks().end(), [&](auto& m) { return m.id == b.id; }))
+                result.expect(false, "a brick that this rank does not have is rendered");
+            renderBrick(s, b, tile);
+        };
+        const auto frame = [&](Owner owner, const std::vector<int>& order, bool isOrdered) {
+            return scene::outcomeOf([&] {
+                if (isOrdered)
+                    dfb::OrderedLoop(inOrder, world, owner).render(scene::FlatCamera(), order, render, paramsOf(s));
+                else
+                    dfb::MixedParallelLoop(fb, world, owner).render(scene::FlatCamera(), render, paramsOf(s));
+            });
+        };
+        for (const bool isOrdered : {false, true}) {
+            for (const int shift : {1, -1}) {
+                const std::string outcome = frame({fb.size(), shift}, {0, 1, 2}, isOrdered);
+                result.expect(shift == 1 && fb.size() == 1 ? outcome == "fine"
+                                                           : scene::has(outcome, "which does not hold it"),
+                              outcome);
+                const std::string after = frame({fb.size(), 0}, {0, 1, 2}, isOrdered);
+                result.expect(after == "fine", "the frame after: " + after);
+            }
+        }
+        for (const std::vector<int>& order :
+             std::vector<std::vector<int>>{{0, 1}, {0, 1, 1}, {0, 1, 3}, {-1, 1, 2}, {0, 1, 2, 0}, {}}) {
+            const std::string outcome = frame({fb.size(), 0}, order, true);
+            result.expect(scene::has(outcome, "the order does not have each brick once"), outcome);
+        }
+        return result;
+    }
+};
+
+} // namespace frame_cases
+
+TEST_CASE("Mixed-parallel rendering gives the data-parallel image, whoever renders what", "[distribution]")
+{
+    everywhere<frame_cases::Mixed>();
+}
+
+TEST_CASE("A brick has the same bounds everywhere, and an id of its own", "[distribution]")
+{
+    everywhere<frame_cases::OtherBounds>();
+}
+
+TEST_CASE("Two ranks per brick take a third and more of the slowest rank's work, by cost most", "[distribution]")
+{
+    everywhere<frame_cases::Unbalanced>();
+}
+
+TEST_CASE("Bricks in a known order blend to the image of sorted ones, without depth", "[distribution]")
+{
+    everywhere<frame_cases::Ordered>();
+}
+
+TEST_CASE("An owner that has not got the brick, or a wrong order, is an error on all ranks", "[distribution]")
+{
+    everywhere<frame_cases::WrongOwner>();
+}

@@ -1,0 +1,162 @@
+// What an opaque input hides is not waited for, nor sent by those who have heard of it.
+
+#include "everywhere.hpp"
+
+#include <array>
+#include <atomic>
+#include <chrono>
+#include <memory>
+#include <string>
+#include <thread>
+
+namespace frame_cases {
+
+struct Hidden {
+    template <class Transport>
+    using Fb = dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport>;
+
+    static dfb::FrameBufferConfig config(bool depth)
+    {
+        dfb::FrameBufferConfig c;
+        c.width = 90;
+        c.height = 70;
+        c.format = dfb::OutputFormat::RGBA32F;
+        c.depth = depth;
+        c.executor = std::make_shared<dfb::ThreadExecutor>(2);
+        return c;
+    }
+
+    // Brick `i` at a pixel; that with number 2 is opaque on the left.
+    static std::array<float, 4> colorOf(std::uint32_t i, int x, int y)
+    {
+        const float alpha = i == 2 && x < 55 ? 1.0f : 0.25f + 0.0625f * static_cast<float>((x + y) % 4);
+        return {alpha * 0.125f * static_cast<float>(i), alpha * 0.25f, alpha * static_cast<float>(x % 3) / 4, alpha};
+    }
+
+    // 6 bricks over the whole image, through the loop.
+    template <class Transport>
+    static void renderAll(const typename Transport::Communicator& communicator, Result& result)
+    {
+        Fb<Transport> fb(communicator, config(false));
+        dfb::World mine;
+        for (std::uint32_t i = 0; i < 6; ++i)
+            if (static_cast<int>(i) % fb.size() == fb.rank())
+                mine.add({i, {{0, 0, static_cast<float>(i)}, {90, 70, static_cast<float>(i + 1)}}});
+        const dfb::SharedWorld world(fb, mine);
+        std::vector<int> order(6);
+        for (std::size_t place = 0; place < 6; ++place)
+            order[world.bricks()[place].brick.id] = static_cast<int>(place);
+        dfb::RoundRobinBricks owner;
+        dfb::OrderedLoop loop(fb, world, owner);
+        std::atomic<int> rendered{0};
+        const auto render = [&](const dfb::Brick& b, auto& tile) {
+            ++rendered;
+            tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+                const auto c = colorOf(b.id, x, y);
+                std::copy(c.begin(), c.end(), rgba);
+            });
+        };
+        for (int frame = 0; frame < 5; ++frame) {
+            rendered = 0;
+            loop.render(scene::FlatCamera(), order, render);
+            const std::int64_t all = fb.allReduce({rendered}, Fb<Transport>::Reduce::Sum)[0];
+            // On a single rank at most one worker is at the tile while the other renders what hides it.
+            const int tiles = fb.layout().tileCount();
+            result.expect(all >= 3 * tiles && all <= 6 * tiles, std::to_string(all) + " tiles rendered");
+            result.expect(fb.size() > 1 || all < 6 * tiles, "all tiles rendered, also those that are hidden");
+            if (!fb.isDisplayRank())
+                continue;
+            std::size_t wrong = 0;
+            for (int y = 0; y < 70; ++y)
+                for (int x = 0; x < 90; ++x) {
+                    std::vector<dfb::testing::Sample> samples;
+                    for (std::uint32_t i = 0; i < 6; ++i)
+                        samples.push_back({colorOf(i, x, y)});
+                    const auto exact = dfb::testing::compositeInOrder(samples, {});
+                    for (std::size_t c = 0; c < 4; ++c)
+                        wrong += dfb::testing::ulpsBetween(
+                                     fb.image().rgba32f()[4 * static_cast<std::size_t>(y * 90 + x) + c],
+                                     dfb::testing::toFloat(exact.rgba[c]))
+                                 > 1;
+                }
+            result.expect(wrong == 0, std::to_string(wrong) + " values are wrong");
+            const std::uint64_t hash = dfb::testing::hashOf(fb.image().bytes(), fb.image().pixelCount() * 16);
+            result.expect(result.hash == 0 || result.hash == hash, "another image");
+            result.hash = hash;
+        }
+    }
+
+    // By hand: rank 0 hides what the next one has, which waits for the word and then sends nothing.
+    template <class Transport>
+    static void byHand(const typename Transport::Communicator& communicator, Result& result)
+    {
+        Fb<Transport> fb(communicator, config(false));
+        const int other = 1 % fb.size();
+        for (int round = 0; round < 3; ++round) {
+            auto frame = fb.begin();
+            const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+            for (int t = 0; t < fb.layout().tileCount() && fb.rank() == 0; ++t) {
+                result.expect(fb.size() == 1 || !frame.isHidden(t, 1), "a tile is hidden from the last frame");
+                frame.start(*tile, t);
+                tile->fill({0.5f, 0.25f, 0.125f, 1.0f});
+                tile->children = 1;
+                frame.setTile(*tile);
+                result.expect(frame.hidesRest(*tile), "an opaque tile hides nothing");
+                frame.hide(t, 1, other);
+                tile->pixel(3, 3)[3] = 0.875f;
+                result.expect(!frame.hidesRest(*tile), "a tile that is not opaque hides something");
+            }
+            for (int t = 0; t < fb.layout().tileCount() && fb.rank() == other; ++t) {
+                const auto end = std::chrono::steady_clock::now() + std::chrono::seconds(60);
+                while (!frame.isHidden(t, 1) && std::chrono::steady_clock::now() < end)
+                    std::this_thread::yield();
+                result.expect(frame.isHidden(t, 1) && frame.isHidden(t, 7) && !frame.isHidden(t, 0), "no word");
+                frame.start(*tile, t);
+                tile->fill({1, 1, 1, 1});
+                tile->generation = 1;
+                tile->children = 5; // that would never come
+                if (t % 2 == 0)
+                    frame.setTile(*tile);
+            }
+            const dfb::FrameReport report = frame.end();
+            result.expect(report.lateMessages == 0, "what is hidden was sent");
+            for (std::size_t i = 0; fb.isDisplayRank() && i < fb.image().pixelCount(); ++i)
+                result.expect(fb.image().rgba32f()[4 * i] == 0.5f, "another colour");
+        }
+    }
+
+    // Where the image has depths all that there is counts.
+    template <class Transport>
+    static void withDepth(const typename Transport::Communicator& communicator, Result& result)
+    {
+        Fb<Transport> fb(communicator, config(true));
+        auto frame = fb.begin();
+        const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+        for (const int t : fb.ownedTiles()) {
+            frame.start(*tile, t);
+            tile->fill({0.5f, 0.25f, 0.125f, 1.0f});
+            frame.setTile(*tile);
+            result.expect(!frame.hidesRest(*tile), "depths count for nothing");
+        }
+        result.expect(scene::has(scene::outcomeOf([&] { frame.hide(0, 1, 0); }), "InvalidArgument"),
+                      "hide() with depths");
+        frame.end();
+    }
+
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        renderAll<Transport>(communicator, result);
+        byHand<Transport>(communicator, result);
+        withDepth<Transport>(communicator, result);
+        return result;
+    }
+};
+
+} // namespace frame_cases
+
+TEST_CASE("What an opaque tile hides need not be sent, and does not show", "[hidden]")
+{
+    everywhere<frame_cases::Hidden>();
+}

@@ -1,0 +1,169 @@
+// The image of the display rank, into which the owners of its node write themselves.
+#include "large_image.hpp"
+#include "scene.hpp"
+#include "catch.hpp"
+#include "ranks.hpp"
+
+#include <dfb/comm/mpi_transport.hpp>
+#include <dfb/dfb.hpp>
+
+#include <atomic>
+#include <chrono>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+#include <memory>
+#include <string>
+#include <thread>
+
+namespace shared_image_cases {
+
+namespace {
+
+using scene::Picture;
+using scene::Scene;
+
+// Like AlphaBlend, but its end takes long where and when it is told to.
+std::atomic<int> slowTile{-1};
+std::atomic<bool> isThere{false}, mayGoOn{false};
+class SlowBlend : public dfb::BasicAlphaBlend<16> {
+public:
+    void newFrame(const dfb::TileInfo& info)
+    {
+        tile_ = info.tile;
+        dfb::BasicAlphaBlend<16>::newFrame(info);
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        const bool isSlow = tile_ == slowTile;
+        if (isSlow) {
+            isThere = true;
+            while (!mayGoOn)
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        }
+        dfb::BasicAlphaBlend<16>::finish(out);
+    }
+
+private:
+    int tile_ = -1;
+};
+
+} // namespace
+
+namespace {
+
+Scene sceneFor(int bricks, std::uint64_t seed)
+{
+    Scene s = scene::makeScene(bricks, seed);
+    s.timeoutMs = 30000; // no frame takes so long
+    return s;
+}
+
+template <class Fb>
+bool goodFrame(Fb& fb, const Scene& s, dfb::FrameReport& report)
+{
+    report = scene::renderLoop(fb, s, scene::Loop::Declared);
+    return !fb.isDisplayRank() || scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s)) == 0;
+}
+
+} // namespace
+
+TEST_CASE("Owners that see the image of the display rank send it no tiles", "[shared_image]")
+{
+    const Scene s = sceneFor(5, 1);
+    std::int64_t messages[2] = {}, bytes[2] = {};
+    for (const bool shared : {true, false}) {
+        auto config = scene::configOf(s);
+        config.displayRank = sizeOf(MPI_COMM_WORLD) - 1;
+        dfb::ConnectionOptions options;
+        options.sharedMemory = shared;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config, options);
+        dfb::FrameReport report;
+        for (int i = 0; i < 4; ++i)
+            CHECK(goodFrame(fb, s, report));
+        messages[shared] = report.messagesSent;
+        bytes[shared] = report.bytesSent;
+    }
+    const int others = seesNextRank(MPI_COMM_WORLD) ? sizeOf(MPI_COMM_WORLD) - 1 : 0;
+    CHECK(messages[true] == messages[false] - others);      // a batch each
+    CHECK((others == 0 || bytes[true] > bytes[false] / 2)); // what they put there counts all the same
+}
+
+TEST_CASE("From an owner that does not leave the image is taken away", "[shared_image]")
+{
+    if (sizeOf(MPI_COMM_WORLD) == 1 || !seesNextRank(MPI_COMM_WORLD))
+        return;
+    const int rank = rankIn(MPI_COMM_WORLD);
+    const Scene s = sceneFor(5, 2);
+    for (const bool allowPartial : {false, true}) {
+        dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s));
+        dfb::FrameReport report;
+        CHECK(goodFrame(fb, s, report));
+        CHECK(goodFrame(fb, s, report));
+        const std::int64_t messagesBefore = report.messagesSent;
+        const std::byte* imageBefore = fb.image().bytes();
+        const Picture before(fb.image(), report);
+
+        for (int tile = 0; tile < fb.layout().tileCount() && rank == 1; ++tile)
+            if (fb.tileOwner(tile) == 1 && tile % 2 == 1)
+                slowTile = tile;
+        isThere = mayGoOn = false;
+        MPI_Request go = MPI_REQUEST_NULL;
+        int word = 0;
+        if (rank == 1)
+            MPI_Irecv(&word, 1, MPI_INT, 0, 0, MPI_COMM_WORLD, &go);
+        std::thread waiter([&] {
+            for (int done = 0; rank == 1 && !done; std::this_thread::sleep_for(std::chrono::milliseconds(1)))
+                MPI_Test(&go, &done, MPI_STATUS_IGNORE);
+            mayGoOn = true;
+        });
+        Scene impatient = s;
+        impatient.timeoutMs = 2000; // by then rank 1 has long been at that tile
+        impatient.allowPartial = allowPartial;
+        const std::string text =
+            scene::outcomeOf([&] { report = scene::renderLoop(fb, impatient, scene::Loop::Declared); });
+        if (allowPartial)
+            CHECK((report.failure && report.failure->kind == dfb::ErrorKind::TimedOut && report.tilesIncomplete > 0));
+        else
+            CHECK(scene::has(text, "timed out"));
+        if (rank == 0) {
+            CHECK(fb.image().empty() == !allowPartial);
+            // Who still writes costs its tiles, and no others.
+            const Picture after(fb.image(), report);
+            const std::size_t width = static_cast<std::size_t>(s.width), pixelBytes = dfb::bytesPerPixel(before.format);
+            int lost = 0, wrong = 0;
+            for (int tile = 0; tile < fb.layout().tileCount() && allowPartial; ++tile) {
+                const dfb::Region region = fb.layout().region(tile);
+                lost += !fb.isComplete(tile) && fb.tileOwner(tile) != 1;
+                for (int y = region.y0; y < region.y1 && fb.isComplete(tile); ++y) {
+                    const std::size_t at =
+                        (static_cast<std::size_t>(y) * width + static_cast<std::size_t>(region.x0)) * pixelBytes;
+                    wrong += std::memcmp(after.bytes.data() + at, before.bytes.data() + at,
+                                         static_cast<std::size_t>(region.width()) * pixelBytes)
+                             != 0;
+                }
+            }
+            CHECK(lost == 0);
+            CHECK(wrong == 0);
+            MPI_Send(&word, 1, MPI_INT, 1, 0, MPI_COMM_WORLD);
+        }
+        waiter.join();
+        CHECK((rank != 1 || isThere));
+        slowTile = -1;
+        for (int i = 0; i < 3; ++i)
+            CHECK(goodFrame(fb, s, report));
+        CHECK((rank != 0 || fb.image().bytes() != imageBefore));
+        CHECK(report.messagesSent > messagesBefore); // tiles are sent again
+    }
+}
+
+// More than the ranks of a node share (NodeMemory::capacity): finished tiles are lent, or go through MPI.
+TEST_CASE("A float image of 2.25 GiB gets to the display rank, lent and through MPI", "[.stress]")
+{
+    for (const bool shared : {false, true}) {
+        INFO((shared ? "lent" : "through MPI"));
+        CHECK(largeImage<dfb::MpiTransport>(MPI_COMM_WORLD, shared) == "");
+    }
+}
+
+} // namespace shared_image_cases

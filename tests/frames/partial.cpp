@@ -1,0 +1,304 @@
+// Frames that lose something: with allowPartial the rest of the image, and a list of what is missing; and frames that
+// are cancelled, from any rank and thread at any time.
+
+#include "everywhere.hpp"
+#include "send_all.hpp"
+
+#include <algorithm>
+#include <chrono>
+#include <memory>
+#include <set>
+#include <stdexcept>
+#include <thread>
+#include <vector>
+
+namespace frame_cases {
+
+// An operation that fails for one tile, if it is told so.
+struct FailsAt {
+    int tile = -1;
+};
+class FailingBlend : public dfb::BasicAlphaBlend<16> {
+public:
+    using FrameData = FailsAt;
+
+    void newFrame(const dfb::TileInfo& info, const FailsAt& data)
+    {
+        BasicAlphaBlend::newFrame(info);
+        fails_ = info.tile == data.tile;
+    }
+    void finish(dfb::FinishedTile& out)
+    {
+        if (fails_)
+            throw std::runtime_error("this operation can not");
+        BasicAlphaBlend::finish(out);
+    }
+
+private:
+    bool fails_ = false;
+};
+
+// On the display rank: tiles that are complete are right, the others background; `missing` are among the latter. With
+// `exactly` there are no others: a machine that has too much to do may miss a time-out that was not meant for it.
+template <class FrameBuffer>
+void checkTiles(Result& result, const FrameBuffer& fb, const dfb::FrameReport& report, const scene::Scene& s,
+                const std::set<int>& missing, bool exactly, const std::string& what)
+{
+    if (!fb.isDisplayRank())
+        return;
+    const scene::Picture picture(fb.image(), report);
+    std::set<int> incomplete;
+    for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+        if (!fb.isComplete(tile))
+            incomplete.insert(tile);
+    const std::size_t wrong = wrongValues(picture, referenceOf(s, fb, referenceOf(s)));
+    result.expect(wrong == 0, what + ": " + std::to_string(wrong) + " values");
+    result.expect(exactly ? incomplete == missing
+                          : std::includes(incomplete.begin(), incomplete.end(), missing.begin(), missing.end()),
+                  what + ": other tiles are missing, " + std::to_string(incomplete.size()));
+    const bool mayLoseAll = report.failure && report.failure->kind == dfb::ErrorKind::Cancelled;
+    result.expect(mayLoseAll || 2 * incomplete.size() < static_cast<std::size_t>(fb.layout().tileCount()),
+                  what + ": most tiles are missing, " + std::to_string(incomplete.size()));
+    result.expect(report.tilesIncomplete == static_cast<std::int64_t>(incomplete.size()), what + ": the count");
+    if (exactly)
+        result.hash = result.hash * 31 + picture.hash();
+}
+
+struct PartialFrames {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        for (const bool shared : {true, false}) {
+            dfb::ConnectionOptions options;
+            options.sharedMemory = shared;
+            const scene::Scene s = scene::makeScene(5, 3);
+            auto config = configOf(s, 2);
+            using FrameBuffer = dfb::DistributedFrameBuffer<FailingBlend, dfb::NoPixelOp, Transport>;
+            FrameBuffer fb(communicator, config, options);
+            auto params = paramsOf(s);
+            params.allowPartial = true;
+            const auto mine = bricksOf(s, fb.rank(), fb.size());
+            // A tile with the first brick in it, and the ones after.
+            const dfb::Region box = scene::FlatCamera().project(s.bricks[0].bounds, 0, 0);
+            int lost = 0;
+            while (dfb::intersection(box, fb.layout().region(lost)).empty())
+                ++lost;
+            constexpr int never = 20000, soon = 2000; // ms; enough for all but what is missing, on a busy machine
+            const dfb::World world(mine);
+            dfb::DataParallelLoop loop(fb, world);
+            const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
+                params.timeoutMs = timeoutMs;
+                return loop.render(scene::FlatCamera(), render, params, fails);
+            };
+            const auto renderAll = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
+            const std::set<int> one{lost}, none;
+            const auto fails = [&](const dfb::FrameReport& report, dfb::ErrorKind kind, const std::string& text,
+                                   const std::set<int>& missing, bool exactly, const std::string& what) {
+                result.expect(report.failure && report.failure->kind == kind
+                                  && scene::has(report.failure->message, text),
+                              what + ": " + (report.failure ? report.failure->message : std::string("no failure")));
+                checkTiles(result, fb, report, s, missing, exactly, what);
+            };
+            const auto isFine = [&](const std::string& what) {
+                const dfb::FrameReport report = frame(never, renderAll, {});
+                result.expect(!report.failure && report.tilesIncomplete == 0, what + ": it does not count as whole");
+                checkTiles(result, fb, report, s, none, true, what);
+            };
+            isFine("the first");
+            fails(frame(soon,
+                        [&](const dfb::Brick& b, auto& tile) {
+                            if (tile.tile == lost && b.id == s.bricks[0].id)
+                                throw std::runtime_error("this renderer can not");
+                            renderBrick(s, b, tile);
+                        },
+                        {}),
+                  dfb::ErrorKind::UserCode, "this renderer can not", one, false, "a renderer");
+            isFine("after a renderer");
+            const auto start = std::chrono::steady_clock::now();
+            fails(frame(never, renderAll, {lost}), dfb::ErrorKind::UserCode, "this operation can not", one, true,
+                  "an operation");
+            result.expect(std::chrono::steady_clock::now() - start < std::chrono::milliseconds(never / 2),
+                          "an operation that fails is waited for");
+            isFine("after an operation");
+            {
+                // Inputs that are announced and never come.
+                params.timeoutMs = soon;
+                auto open = fb.begin(params);
+                const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+                if (fb.tileOwner(lost) == fb.rank()) {
+                    open.start(*tile, lost);
+                    tile->source = 1000;
+                    tile->children = 1;
+                    open.setTile(*tile);
+                }
+                for (int index = 0; index < fb.layout().tileCount(); ++index)
+                    if (index != lost && fb.tileOwner(index) == fb.rank()) {
+                        open.start(*tile, index);
+                        for (const dfb::Brick& b : s.bricks)
+                            tile->children += meets(fb, b, index);
+                        open.setTile(*tile);
+                    }
+                for (int index = 0; index < fb.layout().tileCount(); ++index)
+                    for (const dfb::Brick& b : mine)
+                        if (index != lost && meets(fb, b, index)) {
+                            open.start(*tile, index);
+                            tile->generation = 1;
+                            tile->source = b.id;
+                            renderBrick(s, b, *tile);
+                            open.setTile(*tile);
+                        }
+                fails(open.end(), dfb::ErrorKind::TimedOut, "tile " + std::to_string(lost), one, false,
+                      "a missing input");
+            }
+            {
+                params.timeoutMs = never;
+                auto open = fb.begin(params);
+                sendAll(fb, open, s, false);
+                if (fb.rank() == fb.size() / 2)
+                    open.cancel();
+                fails(open.end(), dfb::ErrorKind::Cancelled, "cancelled", none, false, "a frame that is cancelled");
+            }
+            isFine("the last");
+        }
+        return result;
+    }
+
+private:
+    template <class FrameBuffer>
+    static bool meets(const FrameBuffer& fb, const dfb::Brick& b, int index)
+    {
+        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
+    }
+};
+
+struct CancelledFrames {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        enum When { AtOnce, HalfWay, BeforeEnd, InEnd, Times };
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 3);
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator,
+                                                                                            configOf(s, 2));
+        for (int who = 0; who < fb.size(); ++who)
+            for (int when = AtOnce; when < Times; ++when) {
+                const std::string what = "rank " + std::to_string(who) + " at " + std::to_string(when);
+                {
+                    auto frame = fb.begin(paramsOf(s));
+                    const auto cancel = [&](int now) {
+                        if (fb.rank() == who && when == now)
+                            std::thread([&] { frame.cancel(); }).join(); // any thread may
+                    };
+                    cancel(AtOnce);
+                    sendAll(fb, frame, s, false);
+                    cancel(HalfWay);
+                    if (when == BeforeEnd)
+                        sendAll(fb, frame, s, true);
+                    cancel(BeforeEnd);
+                    std::thread other;
+                    if (fb.rank() == who && when == InEnd) // which can not come to an end without it
+                        other = std::thread([&] { frame.cancel(); });
+                    const std::string outcome = scene::outcomeOf([&] { frame.end(); });
+                    if (other.joinable())
+                        other.join();
+                    result.expect(when == BeforeEnd ? outcome == "fine" || scene::has(outcome, "cancelled")
+                                                    : scene::has(outcome, "FrameError")
+                                                          && scene::has(outcome, "the frame was cancelled"),
+                                  what + ": " + outcome);
+                }
+                const dfb::FrameReport report = renderLoop(fb, s, scene::Loop::Listing3);
+                if (fb.isDisplayRank()) {
+                    const scene::Picture picture(fb.image(), report);
+                    result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": the frame after");
+                    result.hash = picture.hash();
+                }
+            }
+        return result;
+    }
+};
+
+// Of which frame the image is, if there is one.
+struct ImageOfFrame {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 3);
+        for (const int inFlight : {1, 2}) {
+            auto config = configOf(s, 2);
+            config.framesInFlight = inFlight;
+            dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+            const bool isAlone = inFlight == 1; // then each frame has the memory of the last one
+            const auto expect = [&](std::int64_t frame, const std::string& when) {
+                const std::int64_t here = fb.isDisplayRank() ? frame : -1;
+                const std::string what = when + ", " + std::to_string(inFlight) + " in flight";
+                result.expect(fb.imageFrame() == here, what + ": the image is of " + std::to_string(fb.imageFrame()));
+                result.expect(fb.image().empty() == (here < 0), what + ": there is an image or not");
+                if (here >= 0) {
+                    const scene::Picture picture(fb.image(), {});
+                    result.expect(wrongValues(picture, referenceOf(s)) == 0, what + ": values");
+                    result.hash = picture.hash();
+                }
+            };
+            const auto isThere = [&](const std::string& when) {
+                const std::int64_t frame = renderLoop(fb, s, scene::Loop::Listing3).frame;
+                expect(frame, when);
+                return frame;
+            };
+            expect(-1, "before the first frame");
+            std::int64_t last = isThere("the first");
+            {
+                auto frame = fb.begin(paramsOf(s));
+                expect(isAlone ? -1 : last, "during a frame");
+                sendAll(fb, frame, s, false);
+                if (fb.rank() == fb.size() - 1) // when all but some inputs are there
+                    frame.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
+                sendAll(fb, frame, s, true);
+                const std::string outcome = scene::outcomeOf([&] { frame.end(); });
+                result.expect(scene::has(outcome, "on purpose"), outcome);
+                expect(isAlone ? -1 : last, "after one that failed");
+            }
+            last = isThere("the next");
+            auto wrong = paramsOf(s);
+            wrong.timeoutMs = -1;
+            result.expect(scene::has(scene::outcomeOf([&] { fb.begin(wrong); }), "InvalidArgument"), "no begin()");
+            expect(last, "after a begin() that was refused");
+            {
+                auto frame = fb.begin(paramsOf(s));
+                sendAll(fb, frame, s, false);
+            }
+            expect(isAlone ? -1 : last, "after one that was left");
+            auto partial = paramsOf(s);
+            partial.timeoutMs = 20000;
+            partial.allowPartial = true;
+            auto frame = fb.begin(partial);
+            sendAll(fb, frame, s, false);
+            sendAll(fb, frame, s, true);
+            if (fb.rank() == fb.size() - 1)
+                frame.abort(std::make_exception_ptr(std::runtime_error("on purpose")));
+            const auto report = frame.end();
+            result.expect(report.failure && report.tilesIncomplete == 0, "a failure that costs no tile");
+            expect(report.frame, "after one that is partial");
+            isThere("the last");
+        }
+        return result;
+    }
+};
+
+} // namespace frame_cases
+
+TEST_CASE("A frame that may be partial has all tiles but those that lost something", "[partial]")
+{
+    everywhereAtOnce<frame_cases::PartialFrames>();
+}
+
+TEST_CASE("A frame can be cancelled by any rank and thread at any time, and the next is right", "[partial]")
+{
+    everywhere<frame_cases::CancelledFrames>();
+}
+
+TEST_CASE("There is an image of a frame that ended well, and none of one that failed", "[partial]")
+{
+    everywhere<frame_cases::ImageOfFrame>();
+}

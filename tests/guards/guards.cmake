@@ -1,0 +1,170 @@
+# Tests of the source tree: they call the compiler with -fsyntax-only, so they need no build folder of their own and
+# run side by side.
+if(MSVC)
+  return()
+endif()
+
+# Without source lines in the messages, so that only the message itself can be taken for the message.
+if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
+  set(_terse -fno-diagnostics-show-caret)
+else()
+  set(_terse -fno-caret-diagnostics)
+endif()
+set(_compile ${CMAKE_CXX_COMPILER} -std=c++17 -fsyntax-only ${_terse})
+set(_include ${PROJECT_SOURCE_DIR}/include)
+set(_testing_include ${PROJECT_SOURCE_DIR}/tests/include)
+
+add_test(NAME guard.layers
+  COMMAND ${CMAKE_COMMAND} "-DROOTS=${_include};${_testing_include}" -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/layers.cmake)
+set_tests_properties(guard.layers PROPERTIES LABELS guard)
+
+add_test(NAME guard.readme
+  COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/readme.cmake)
+add_test(NAME guard.architecture
+  COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/architecture.cmake)
+set_tests_properties(guard.readme guard.architecture PROPERTIES LABELS guard)
+
+# Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
+# with that component, the umbrella with each set of components, all others with nothing but our include folder.
+# Bodies that dfb::compiled compiles once are read where the header itself has some; elsewhere they take half the time.
+function(_dfb_flags_of out target)
+  set(folders "$<TARGET_PROPERTY:${target},INTERFACE_INCLUDE_DIRECTORIES>")
+  set(${out} "$<$<BOOL:${folders}>:-idirafter$<JOIN:${folders},$<SEMICOLON>-idirafter>>" PARENT_SCOPE)
+endfunction()
+
+function(_dfb_add_header_test name header)
+  set(mode -DDFB_COMPILED)
+  set(bodies "")
+  if(EXISTS ${_include}/${header})
+    file(STRINGS ${_include}/${header} bodies REGEX "DFB_HAS_BODIES|DFB_COMPILED")
+  endif()
+  if(bodies OR name STREQUAL "dfb") # which is also compiled as a user has it without dfb::compiled
+    set(mode "")
+  endif()
+  add_test(NAME header.${name}
+    COMMAND ${_compile} -Wall -Wextra -Wpedantic -Wshadow -Wconversion -Werror ${mode} -I${_include} ${ARGN}
+      -include ${header} -include ${header} -x c++ ${CMAKE_CURRENT_SOURCE_DIR}/guards/empty.cpp
+    COMMAND_EXPAND_LISTS)
+  set_tests_properties(header.${name} PROPERTIES LABELS guard)
+endfunction()
+
+_dfb_flags_of(_mpi_flags MPI::MPI_CXX)
+_dfb_flags_of(_tbb_flags TBB::tbb)
+_dfb_flags_of(_snappy_flags Snappy::snappy)
+set(_mpi_doors dfb/comm/mpi_transport.hpp dfb/comm/mpi_session.hpp)
+set(_tbb_doors dfb/tbb_executor.hpp)
+set(_snappy_doors dfb/comm/snappy_codec.hpp)
+
+file(GLOB_RECURSE _headers CONFIGURE_DEPENDS RELATIVE ${_include} ${_include}/dfb/*.hpp)
+list(REMOVE_ITEM _headers ${_mpi_doors} ${_tbb_doors} ${_snappy_doors})
+foreach(_header IN LISTS _headers)
+  string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_header})
+  string(REPLACE "/" "." _name ${_name})
+  _dfb_add_header_test(${_name} ${_header})
+endforeach()
+file(GLOB_RECURSE _testing_headers CONFIGURE_DEPENDS RELATIVE ${_testing_include} ${_testing_include}/dfb/*.hpp)
+foreach(_header IN LISTS _testing_headers)
+  string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_header})
+  string(REPLACE "/" "." _name ${_name})
+  _dfb_add_header_test(${_name} ${_header} -I${_testing_include})
+endforeach()
+foreach(_component mpi tbb snappy)
+  if(TARGET dfb::${_component})
+    string(TOUPPER ${_component} _upper)
+    foreach(_door IN LISTS _${_component}_doors)
+      string(REGEX REPLACE "^dfb/(.*)\\.hpp$" "\\1" _name ${_door})
+      string(REPLACE "/" "." _name ${_name})
+      _dfb_add_header_test(${_name} ${_door} "${_${_component}_flags}")
+    endforeach()
+    _dfb_add_header_test(dfb.with_${_component} dfb/dfb.hpp -DDFB_HAS_${_upper}=1 "${_${_component}_flags}")
+  endif()
+endforeach()
+
+# Without components nothing of MPI, oneTBB and Snappy is touched, even where they are installed.
+list(TRANSFORM _headers REPLACE "(.+)" "#include <\\1>\n" OUTPUT_VARIABLE _include_all)
+list(JOIN _include_all "" _include_all)
+file(CONFIGURE OUTPUT all_of_core.cpp CONTENT "${_include_all}" @ONLY)
+add_test(NAME guard.core_dependencies # -M lists what is included, and compiles nothing
+  COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -M -I${_include} ${CMAKE_CURRENT_BINARY_DIR}/all_of_core.cpp)
+set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
+  FAIL_REGULAR_EXPRESSION "/mpi\\.h;/mpicxx\\.h;/snappy[a-z-]*\\.h;/(tbb|oneapi)/[a-z_/]*\\.h")
+
+# The benchmarks, which are not built with the tests, still compile.
+if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
+  file(GLOB _programs CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/bench/bench_*.cpp)
+  find_package(benchmark CONFIG QUIET)
+  if(NOT TARGET benchmark::benchmark)
+    list(FILTER _programs EXCLUDE REGEX "bench_kernels")
+  endif()
+  foreach(_program IN LISTS _programs)
+    get_filename_component(_name ${_program} NAME_WE)
+    add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -DDFB_COMPILED -I${_include} -I${_testing_include}
+      -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1 -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
+    set_tests_properties(guard.${_name} PROPERTIES LABELS guard)
+  endforeach()
+endif()
+
+# Two translation units that use everything make one program; the headers stay quiet under stricter warnings.
+add_executable(test_odr guards/odr/first.cpp guards/odr/second.cpp)
+target_link_libraries(test_odr PRIVATE dfb_developer_headers)
+target_compile_options(test_odr PRIVATE -Wconversion)
+add_test(NAME guard.odr COMMAND test_odr)
+set_tests_properties(guard.odr PROPERTIES LABELS guard)
+
+# A program of which some files link dfb::compiled and others have the library as headers is refused by the linker.
+if(NOT DFB_DEVELOP_HEADER_ONLY AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
+  add_test(NAME guard.compiled_mixed COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -I${_include}
+    ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/headers.cpp ${CMAKE_CURRENT_SOURCE_DIR}/guards/mixed/compiled.cpp
+    $<TARGET_FILE:dfb_compiled> -pthread -o guard_compiled_mixed)
+  set_tests_properties(guard.compiled_mixed PROPERTIES LABELS guard
+    PASS_REGULAR_EXPRESSION "dfb_either_all_files_with_dfb_compiled_or_none: TLS definition")
+endif()
+
+# Wrong use gives our message, as the first error. The cases stand in the files: a line
+#   #elif defined(CASE_<NAME>) // expect: <message>      or   // flags: <flag>... expect: <message>
+# is all that a new one needs here. Without a case the file is the control, which must compile. dfb.hpp is compiled
+# beforehand, once for all files that begin with it; a compiler that cannot use the result reads dfb.hpp itself.
+set(_early ${CMAKE_CURRENT_BINARY_DIR}/compile_fail/dfb_early.hpp)
+file(CONFIGURE OUTPUT ${_early} CONTENT "#include <dfb/dfb.hpp>\n" @ONLY)
+if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
+  set(_early_suffix gch)
+else()
+  set(_early_suffix pch)
+endif()
+add_test(NAME compile_fail.dfb_early COMMAND ${CMAKE_CXX_COMPILER} -std=c++17 -DDFB_COMPILED -I${_include}
+  -x c++-header ${_early} -o ${_early}.${_early_suffix})
+set_tests_properties(compile_fail.dfb_early PROPERTIES LABELS compile_fail FIXTURES_SETUP dfb_early)
+
+function(_dfb_add_compile_fail file)
+  set(path ${CMAKE_CURRENT_SOURCE_DIR}/guards/compile_fail/${file}.cpp)
+  set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS ${path})
+  set(early "")
+  set(fixture "")
+  file(STRINGS ${path} umbrella REGEX "^#include <dfb/dfb\\.hpp>")
+  if(umbrella)
+    set(early -include ${_early})
+    set(fixture FIXTURES_REQUIRED dfb_early)
+  endif()
+  add_test(NAME compile_fail.${file}.control COMMAND ${_compile} -DDFB_COMPILED -I${_include} ${early} ${path})
+  set_tests_properties(compile_fail.${file}.control PROPERTIES LABELS compile_fail ${fixture})
+  file(STRINGS ${path} lines REGEX "defined\\(CASE_")
+  foreach(line IN LISTS lines)
+    if(NOT line MATCHES "^#(el)?if defined\\(CASE_([A-Z0-9_]+)\\) // (flags: (.*) )?expect: (.+)$")
+      message(FATAL_ERROR "${path}: no case and its message in '${line}'")
+    endif()
+    set(case ${CMAKE_MATCH_2})
+    separate_arguments(flags UNIX_COMMAND "${CMAKE_MATCH_4}")
+    string(REGEX REPLACE "([][+.*()^?|$\\])" "\\\\\\1" message "${CMAKE_MATCH_5}")
+    string(TOLOWER ${case} name)
+    add_test(NAME compile_fail.${file}.${name}
+      COMMAND ${_compile} -Wfatal-errors -DDFB_COMPILED -I${_include} ${flags} ${early} -DCASE_${case} ${path})
+    set_tests_properties(compile_fail.${file}.${name} PROPERTIES
+      LABELS compile_fail ${fixture} PASS_REGULAR_EXPRESSION "error:[^\n]*${message}")
+  endforeach()
+endfunction()
+
+file(GLOB _files CONFIGURE_DEPENDS guards/compile_fail/*.cpp)
+foreach(_file IN LISTS _files)
+  get_filename_component(_file ${_file} NAME_WE)
+  _dfb_add_compile_fail(${_file})
+endforeach()

@@ -1,0 +1,28 @@
+// Runs the cases with ranks in this process.
+#include "everywhere.hpp"
+
+#include <cstddef>
+#include <future>
+#include <vector>
+
+void frame_cases::runEverywhere(Run run, bool atOnce)
+{
+#if defined(__has_feature)
+#if __has_feature(thread_sanitizer)
+    atOnce = false; // with it a case that mostly waits mostly computes
+#endif
+#endif
+    const std::vector<int> counts{1, 2, 3, 4, 7};
+    std::vector<std::future<Result>> results;
+    for (const int ranks : counts)
+        results.push_back(std::async(atOnce ? std::launch::async : std::launch::deferred, inProcess, run, ranks));
+    std::uint64_t hash = 0; // with one rank
+    for (std::size_t i = 0; i < counts.size(); ++i) {
+        const Result result = results[i].get();
+        if (i == 0)
+            hash = result.hash;
+        INFO(counts[i] << " ranks");
+        CHECK(result.wrong == "");
+        CHECK(result.hash == hash);
+    }
+}

@@ -1,0 +1,37 @@
+// sendAll: a scene by hand.
+#pragma once
+
+#include "scene.hpp"
+
+#include <memory>
+
+namespace frame_cases {
+
+// Sends what this rank has of a scene into an open frame, as in Listing 3 of the paper.
+template <class FrameBuffer, class Frame>
+void sendAll(FrameBuffer& fb, Frame& frame, const scene::Scene& s, bool second)
+{
+    const auto mine = bricksOf(s, fb.rank(), fb.size());
+    const auto tile = std::make_unique<typename FrameBuffer::Tile>();
+    const auto meets = [&](const dfb::Brick& b, int index) {
+        return !dfb::intersection(scene::FlatCamera().project(b.bounds, 0, 0), fb.layout().region(index)).empty();
+    };
+    for (int index = second ? 1 : 0; index < fb.layout().tileCount(); index += 2) { // one half, then the other
+        if (fb.tileOwner(index) == fb.rank()) {
+            frame.start(*tile, index);
+            for (const dfb::Brick& b : s.bricks)
+                tile->children += meets(b, index);
+            frame.setTile(*tile);
+        }
+        for (const dfb::Brick& b : mine)
+            if (meets(b, index)) {
+                frame.start(*tile, index);
+                tile->generation = 1;
+                tile->source = b.id;
+                renderBrick(s, b, *tile);
+                frame.setTile(*tile);
+            }
+    }
+}
+
+} // namespace frame_cases

@@ -1,0 +1,154 @@
+// CompressionGains: who does not gain is left alone, and asked again more and more seldom.
+#include "catch.hpp"
+
+#include <dfb/comm/compression.hpp>
+
+#include <algorithm>
+#include <random>
+#include <vector>
+
+namespace compression_gains_cases {
+
+namespace {
+
+// In which of so many frames rank 1 of 2 is worthwhile, if messages of 1000 bytes to it become `sent(frame)`.
+template <class Sent>
+std::vector<int> triedIn(int frames, const Sent& sent)
+{
+    dfb::detail::CompressionGains gains(2);
+    std::vector<int> tried;
+    for (int frame = 0; frame < frames; ++frame) {
+        CHECK(gains.isWorthwhile(0)); // who is not sent anything
+        if (gains.isWorthwhile(1)) {
+            tried.push_back(frame);
+            gains.add(1, 600, static_cast<std::size_t>(sent(frame)) - 400);
+            gains.add(1, 400, 400); // nothing gained with this one
+            CHECK(gains.links() == (sent(frame) < 1000));
+        }
+        gains.endFrame();
+        CHECK(gains.links() == 0);
+    }
+    return tried;
+}
+
+} // namespace
+
+TEST_CASE("Compression for a rank that gains goes on", "[compression]")
+{
+    CHECK(triedIn(500, [](int) { return 940; }).size() == 500); // no more than a little
+}
+
+TEST_CASE("Compression for a rank that gains nothing is tried more and more seldom", "[compression]")
+{
+    const std::vector<int> tried = triedIn(3000, [](int) { return 1000; });
+    REQUIRE(tried.size() > 8);
+    CHECK(std::vector<int>(tried.begin(), tried.begin() + 4) == std::vector<int>{0, 17, 50, 115});
+    CHECK(tried[8] - tried[7] == 513);
+    CHECK(tried.size() < 12);
+}
+
+TEST_CASE("A rank that begins to gain is compressed for again, if it is worth it", "[compression]")
+{
+    CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 500; }).size() == 1000 - 16);
+    // Between giving up and coming back there is some room.
+    CHECK(triedIn(1000, [](int frame) { return frame < 10 ? 1000 : 930; }).size() < 12);
+}
+
+} // namespace compression_gains_cases
+
+// CompressionTrial: the better of two ways is found and kept, whatever the noise, and again when things change.
+namespace compression_trial_cases {
+
+using dfb::detail::CompressionTrial;
+
+namespace {
+
+// How many of `frames` frames were compressed, and the time of them all. `time(compressed, frame)`: of one.
+struct Run {
+    int compressed = 0, chosenAfter = -1;
+    double total = 0;
+};
+template <class Time>
+Run run(CompressionTrial& trial, int frames, const Time& time)
+{
+    Run result;
+    for (int frame = 0; frame < frames; ++frame) {
+        if (trial.isChosen() && result.chosenAfter < 0)
+            result.chosenAfter = frame;
+        const bool compressed = trial.compresses();
+        const double t = time(compressed, frame);
+        result.compressed += compressed;
+        result.total += t;
+        trial.took(t);
+    }
+    return result;
+}
+
+} // namespace
+
+TEST_CASE("The faster way is found within ten frames and kept", "[compression]")
+{
+    for (const bool with : {false, true}) {
+        CompressionTrial trial;
+        const Run r = run(trial, 1000, [&](bool compressed, int) { return compressed == with ? 1.0 : 2.0; });
+        CHECK(r.chosenAfter == 10);
+        CHECK(trial.compresses() == with);
+        CHECK(r.total < 1.02 * 1000);
+    }
+}
+
+TEST_CASE("Where both are alike nothing is compressed", "[compression]")
+{
+    CompressionTrial trial;
+    const Run r = run(trial, 1000, [](bool, int) { return 3.0; });
+    CHECK(r.compressed < 30);
+}
+
+TEST_CASE("Noise and slow frames do not turn it round", "[compression]")
+{
+    for (unsigned seed = 1; seed <= 20; ++seed) {
+        std::mt19937 random(seed);
+        const auto noise = [&] { // up to a tenth, and one frame in twenty three times as long
+            return (1 + 0.1 * static_cast<double>(random() % 1000) / 1000) * (random() % 20 == 0 ? 3 : 1);
+        };
+        for (const bool with : {false, true}) {
+            CompressionTrial trial;
+            run(trial, 100, [&](bool compressed, int) { return (compressed == with ? 1.0 : 1.5) * noise(); });
+            const Run r =
+                run(trial, 900, [&](bool compressed, int) { return compressed == with ? noise() : 1.5 * noise(); });
+            INFO("seed " << seed << ", with " << with);
+            const int right = with ? r.compressed : 900 - r.compressed;
+            CHECK(right > 800);
+        }
+    }
+}
+
+TEST_CASE("When the network becomes slow, or fast again, it is noticed soon", "[compression]")
+{
+    CompressionTrial trial;
+    const auto fast = [](bool compressed, int) { return compressed ? 2.0 : 1.0; };
+    const auto slow = [](bool compressed, int) { return compressed ? 6.0 : 10.0; };
+    run(trial, 3000, fast);
+    CHECK_FALSE(trial.compresses());
+    CHECK(run(trial, 50, slow).compressed > 30);
+    CHECK(trial.compresses());
+    run(trial, 3000, slow);
+    CHECK(run(trial, 50, fast).compressed < 20);
+    CHECK_FALSE(trial.compresses());
+    // If nothing else changes than which is better, at the next trial.
+    CHECK(run(trial, 2000, [](bool compressed, int) { return compressed ? 0.7 : 1.0; }).compressed > 1000);
+}
+
+TEST_CASE("Who is told the same chooses the same", "[compression]")
+{
+    CompressionTrial a, b;
+    std::mt19937 random(3);
+    for (int frame = 0; frame < 5000; ++frame) {
+        REQUIRE(a.compresses() == b.compresses());
+        const double time = static_cast<double>(random() % 100 + 1);
+        a.took(time);
+        b.took(time);
+    }
+}
+
+} // namespace compression_trial_cases

@@ -1,0 +1,233 @@
+// Executors: loops and tasks on workers.
+#include "catch.hpp"
+
+#include <dfb/exec.hpp>
+#if defined(DFB_HAS_TBB)
+#include <dfb/tbb_executor.hpp>
+#endif
+
+#include <algorithm>
+#include <atomic>
+#include <condition_variable>
+#include <memory>
+#include <mutex>
+#include <set>
+#include <stdexcept>
+#include <string>
+#include <thread>
+#include <vector>
+
+namespace exec_cases {
+
+namespace {
+
+template <class Executor, class... Arguments>
+void check(Arguments... threads)
+{
+    SECTION("a loop calls each index once")
+    {
+        Executor executor(threads...);
+        CHECK(executor.concurrency() >= 1);
+        for (const std::size_t count : {0, 1, 2, 3, 17, 5000}) {
+            std::vector<std::atomic<int>> calls(count);
+            executor.parallelFor(count, [&](std::size_t i) { ++calls[i]; });
+            CHECK(std::all_of(calls.begin(), calls.end(), [](const auto& n) { return n == 1; }));
+        }
+    }
+    SECTION("loops nest, in loops and in tasks")
+    {
+        std::atomic<int> inner{0}, inTask{0};
+        {
+            Executor executor(threads...);
+            executor.parallelFor(13, [&](std::size_t) {
+                executor.parallelFor(7, [&](std::size_t) { executor.parallelFor(3, [&](std::size_t) { ++inner; }); });
+            });
+            CHECK(inner == 13 * 7 * 3);
+            for (int i = 0; i < 5; ++i)
+                executor.submit([&] { executor.parallelFor(11, [&](std::size_t) { ++inTask; }); });
+        }
+        CHECK(inTask == 55);
+    }
+    SECTION("tasks with loops do not run in each other, however many wait")
+    {
+        std::atomic<int> deepest{0};
+        {
+            Executor executor(threads...);
+            for (int i = 0; i < 1000; ++i)
+                executor.submit([&] {
+                    static thread_local int depth = 0;
+                    ++depth;
+                    executor.parallelFor(2, [&](std::size_t) {
+                        for (int seen = deepest; depth > seen && !deepest.compare_exchange_weak(seen, depth);) {
+                        }
+                    });
+                    --depth;
+                });
+            while (executor.help()) {
+            }
+        }
+        CHECK(deepest == 1);
+    }
+    SECTION("an exception of a body comes out of the loop, and the executor goes on")
+    {
+        Executor executor(threads...);
+        for (const std::size_t culprit : {0, 50, 99}) {
+            std::string what;
+            try {
+                executor.parallelFor(100, [&](std::size_t i) {
+                    if (i == culprit)
+                        throw std::runtime_error("body " + std::to_string(i));
+                });
+            } catch (const std::runtime_error& e) {
+                what = e.what();
+            }
+            CHECK(what == "body " + std::to_string(culprit));
+            std::atomic<int> calls{0};
+            executor.parallelFor(10, [&](std::size_t) { ++calls; });
+            CHECK(calls == 10);
+        }
+        // From within a nested loop too.
+        CHECK_THROWS_AS(executor.parallelFor(3,
+                                             [&](std::size_t) {
+                                                 executor.parallelFor(3, [](std::size_t i) {
+                                                     if (i == 1)
+                                                         throw std::runtime_error("inner");
+                                                 });
+                                             }),
+                        std::runtime_error);
+    }
+    SECTION("what was submitted has run when the executor is gone, also what tasks submit")
+    {
+        std::atomic<int> ran{0};
+        {
+            Executor executor(threads...);
+            std::vector<std::thread> submitters;
+            for (int t = 0; t < 3; ++t)
+                submitters.emplace_back([&] {
+                    for (int i = 0; i < 200; ++i)
+                        executor.submit([&] {
+                            ++ran;
+                            if (ran % 2 == 0)
+                                executor.submit([&] { ran += 1000000; });
+                        });
+                });
+            for (std::thread& thread : submitters)
+                thread.join();
+        }
+        CHECK(ran % 1000000 == 600);
+        CHECK(ran >= 1000000);
+    }
+    SECTION("loops of several threads at once")
+    {
+        Executor executor(threads...);
+        std::atomic<int> calls{0};
+        std::vector<std::thread> callers;
+        for (int t = 0; t < 4; ++t)
+            callers.emplace_back([&] {
+                for (int i = 0; i < 20; ++i)
+                    executor.parallelFor(25, [&](std::size_t) { ++calls; });
+            });
+        for (std::thread& thread : callers)
+            thread.join();
+        CHECK(calls == 4 * 20 * 25);
+    }
+}
+
+} // namespace
+
+TEST_CASE("ThreadExecutor", "[executor]")
+{
+    for (const int threads : {1, 2, 3, 0})
+        DYNAMIC_SECTION("threads: " << threads) { check<dfb::ThreadExecutor>(threads); }
+}
+
+TEST_CASE("CallerExecutor", "[executor]") { check<dfb::CallerExecutor>(); }
+
+TEST_CASE("CallerExecutor has no workers", "[executor]")
+{
+    dfb::CallerExecutor executor;
+    CHECK(executor.concurrency() == 1);
+    CHECK(!executor.hasWorkers());
+    bool ran = false;
+    executor.submit([&] { ran = true; });
+    CHECK(executor.hasTasks());
+    std::set<std::thread::id> threads;
+    executor.parallelFor(3, [&](std::size_t) { threads.insert(std::this_thread::get_id()); });
+    CHECK(threads == std::set<std::thread::id>{std::this_thread::get_id()});
+    CHECK(ran);
+    CHECK(!executor.hasTasks());
+    CHECK(!executor.help());
+}
+
+#if defined(DFB_HAS_TBB)
+TEST_CASE("TbbExecutor", "[executor]")
+{
+    for (const int threads : {1, 2, 3, 0})
+        DYNAMIC_SECTION("threads: " << threads) { check<dfb::TbbExecutor>(threads); }
+}
+#endif
+
+TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[executor]")
+{
+    CHECK(dfb::ThreadExecutor(3).concurrency() == 3);
+    dfb::ThreadExecutor executor(3);
+    // Each body waits for the others: with fewer workers this would not end.
+    std::mutex mutex;
+    std::condition_variable changed;
+    int arrived = 0;
+    executor.parallelFor(3, [&](std::size_t) {
+        std::unique_lock<std::mutex> lock(mutex);
+        ++arrived;
+        changed.notify_all();
+        changed.wait(lock, [&] { return arrived == 3; });
+    });
+    CHECK(arrived == 3);
+}
+
+TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
+{
+    const auto check = [](dfb::Executor& executor) {
+        std::atomic<int> tasks{0};
+        std::vector<int> seen(5);
+        executor.parallelFor(5, [&](std::size_t i) {
+            seen[i] = tasks;
+            executor.submit([&] { ++tasks; });
+        });
+        std::sort(seen.begin(), seen.end());
+        CHECK(seen == std::vector<int>{0, 1, 2, 3, 4});
+    };
+    dfb::ThreadExecutor thread(1);
+    check(thread);
+    dfb::CallerExecutor caller;
+    check(caller);
+}
+
+TEST_CASE("Processors: their number, whether two sets meet, and what each of several ranks gets of them")
+{
+    dfb::Processors low, high, both;
+    CHECK(low.count() == 0);
+    for (const int i : {0, 2, 63}) {
+        low.add(i);
+        both.add(i);
+    }
+    for (const int i : {64, 66, 127, 1023}) { // the same places of other words
+        high.add(i);
+        both.add(i);
+    }
+    low.add(2);
+    CHECK(low.count() == 3);
+    CHECK(high.count() == 4);
+    CHECK(both.count() == 7);
+    CHECK_FALSE(low.meets(high));
+    CHECK(low.meets(low));
+    CHECK(both.meets(high));
+    CHECK(low.meets(both));
+    CHECK(dfb::Processors::ofThisThread().count() >= 1);
+    CHECK(dfb::threadShare(64, 1) == 64);
+    CHECK(dfb::threadShare(64, 4) == 16);
+    CHECK(dfb::threadShare(6, 4) == 1);
+    CHECK(dfb::threadShare(2, 7) == 1);
+    CHECK(dfb::threadShare(2, 0) == 2);
+}
+
+} // namespace exec_cases
