@@ -91,7 +91,11 @@ set_tests_properties(guard.core_dependencies PROPERTIES LABELS guard
 
 # The benchmarks, which are not built with the tests, still compile.
 if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
-  file(GLOB _programs CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/bench/bench_*.cpp)
+  file(GLOB _programs CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/bench/*/bench_*.cpp)
+  set(_bench_include "")
+  foreach(_folder common compositing rendering)
+    list(APPEND _bench_include -I${PROJECT_SOURCE_DIR}/bench/${_folder})
+  endforeach()
   find_package(benchmark CONFIG QUIET)
   if(NOT TARGET benchmark::benchmark)
     list(FILTER _programs EXCLUDE REGEX "bench_kernels")
@@ -99,7 +103,7 @@ if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   foreach(_program IN LISTS _programs)
     get_filename_component(_name ${_program} NAME_WE)
     add_test(NAME guard.${_name} COMMAND ${_compile} -Wall -Wextra -Werror -DDFB_COMPILED -I${_include} -I${_testing_include}
-      -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1 -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
+      ${_bench_include} -DDFB_HAS_MPI=1 -DDFB_HAS_TBB=1 -DDFB_HAS_SNAPPY=1 "${_mpi_flags}" "${_tbb_flags}" "${_snappy_flags}" ${_program} COMMAND_EXPAND_LISTS)
     set_tests_properties(guard.${_name} PROPERTIES LABELS guard)
   endforeach()
 endif()
