@@ -1,7 +1,7 @@
 // A framebuffer inside the user's OpenMP code: tiles are rendered and set by its threads, frames begun and ended
 // outside; and framebuffers that belong to a thread each.
-#include "scene.hpp"
 #include "catch.hpp"
+#include "random_scene.hpp"
 
 #include <omp.h>
 

@@ -1,7 +1,7 @@
 // The scene with auxiliary channels.
 #pragma once
 
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <algorithm>
 #include <cmath>

@@ -7,7 +7,7 @@
 
 #include "any_transport.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <cstdint>
 #include <mutex>

@@ -2,7 +2,7 @@
 // every rank as long as the ranks can still talk. What is done to the messages follows from a seed.
 #pragma once
 
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <dfb/testing/fault_transport.hpp>
 

@@ -2,7 +2,7 @@
 // pool. For the tests with ranks in one process and those with MPI.
 #pragma once
 
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <cstdint>
 #include <functional>

@@ -1,7 +1,7 @@
 // An image of which more than 2 GiB come from one rank.
 #pragma once
 
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <cstdint>
 #include <cstdio>

@@ -1,7 +1,7 @@
 // sendAll: a scene by hand.
 #pragma once
 
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <memory>
 

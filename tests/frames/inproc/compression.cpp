@@ -1,6 +1,6 @@
 // CompressionMode: the image is the same, and all ranks try and choose alike.
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <dfb/dfb.hpp>
 #if defined(DFB_HAS_SNAPPY)

@@ -1,6 +1,6 @@
 // Dithered images: the same bit for bit whatever could get in between, and right by the reference.
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <cstddef>
 #include <cstdint>

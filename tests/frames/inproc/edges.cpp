@@ -2,7 +2,7 @@
 // has threads of its own.
 #include "catch.hpp"
 #include "large_image.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <algorithm>
 #include <atomic>

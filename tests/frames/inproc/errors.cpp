@@ -3,7 +3,7 @@
 #include "board.hpp"
 #include "catch.hpp"
 #include "forward.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <dfb/wire/fragment_message.hpp>
 

@@ -1,6 +1,6 @@
 // The image of a frame: right by the serial reference, and the same bit for bit whatever could get in between.
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <algorithm>
 #include <cstdint>

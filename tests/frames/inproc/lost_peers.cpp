@@ -3,7 +3,7 @@
 // are threads, each with a progress thread of its own, which a test can hold.
 #include "board.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <atomic>
 #include <chrono>

@@ -4,7 +4,7 @@
 #include "catch.hpp"
 #include "flood.hpp"
 #include "forward.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <dfb/comm/reduction.hpp>
 

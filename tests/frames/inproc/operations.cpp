@@ -1,6 +1,6 @@
 // Tile and pixel operations inside the framebuffer: those that come with it and those that a user writes.
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <atomic>
 #include <cmath>

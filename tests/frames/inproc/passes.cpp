@@ -1,7 +1,7 @@
 // How often a pixel is copied on its way: out of the renderer's image into its message, and out of that into the image.
 #include "board.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <algorithm>
 #include <cstddef>

@@ -1,7 +1,7 @@
 // Frames that are right, on ranks and networks that are slow at random, while ranks look all the time whether anything
 // is still under way: none may be taken for one that misses an input. And some that do miss one are.
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include "send_all.hpp"
 

@@ -2,7 +2,7 @@
 // even be agreed on is a TransportError. Ranks are threads; every test has a time limit.
 #include "board.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <algorithm>
 #include <atomic>

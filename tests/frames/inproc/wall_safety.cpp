@@ -2,7 +2,7 @@
 // and none waits for ever; never a display that is wrong without a word.
 #include "board.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <atomic>
 #include <cstdint>

@@ -2,7 +2,7 @@
 // none waits for ever. (That no bytes at all do harm is what tests/fuzz looks at.)
 #include "board.hpp"
 #include "catch.hpp"
-#include "scene.hpp"
+#include "random_scene.hpp"
 
 #include <dfb/wire/fragment_message.hpp>
 

@@ -1,6 +1,6 @@
 // What goes wrong, over MPI: the same error on every rank, no hang, and the next frame is right.
-#include "scene.hpp"
 #include "catch.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <algorithm>

@@ -1,6 +1,6 @@
 // The image over MPI: right by the serial reference, and bit for bit that of ranks in one process.
-#include "scene.hpp"
 #include "catch.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <cstdint>

@@ -1,9 +1,9 @@
 // Credit, several framebuffers, repeated and damaged messages, time-outs and progress by the caller, over MPI. Any
 // number of ranks; every frame that could hang has a time-out.
+#include "catch.hpp"
 #include "flood.hpp"
 #include "forward.hpp"
-#include "scene.hpp"
-#include "catch.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <dfb/wire/fragment_message.hpp>

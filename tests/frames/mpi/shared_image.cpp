@@ -1,7 +1,7 @@
 // The image of the display rank, into which the owners of its node write themselves.
-#include "large_image.hpp"
-#include "scene.hpp"
 #include "catch.hpp"
+#include "large_image.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <dfb/comm/mpi_transport.hpp>

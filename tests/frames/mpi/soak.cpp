@@ -1,7 +1,7 @@
 // Many framebuffers and frames, one after the other: sizes, cameras, bricks, loops and communicators change, some
 // frames are cancelled or fail; memory does not grow, and no thread, file descriptor or communicator is left behind.
-#include "scene.hpp"
 #include "catch.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <atomic>
