@@ -114,13 +114,16 @@ struct BadFrame {
 
 // `frame(fb)` runs the bad frame on each rank and may throw; after it comes a good one.
 template <class Fb, class Frame>
-BadFrame badFrame(int ranks, const Scene& s, const dfb::FrameBufferConfig& config, const Frame& frame)
+BadFrame badFrame(int ranks, const Scene& s, const dfb::FrameBufferConfig& config, const Frame& frame, int threads = 1)
 {
     BadFrame result;
     result.texts.resize(static_cast<std::size_t>(ranks));
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         auto mine = config;
-        mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        if (threads > 0)
+            mine.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+        else // the rank's own thread looks at messages, in their order
+            mine.executor = std::make_shared<dfb::CallerExecutor>();
         Fb fb(communicator, mine);
         result.texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { frame(fb); });
         const auto report = scene::renderLoop(fb, s, Loop::Listing3);
@@ -1039,23 +1042,26 @@ TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]"
             for (const bool sendFirst : {false, true}) {
                 auto config = configOf(s);
                 config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 4 || tile == 5 ? 1 : 0; };
-                const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
-                    dfb::FrameParams params;
-                    params.declared = true;
-                    auto frame = fb.begin(params);
-                    auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
-                    const auto sendAll = [&] {
-                        for (const dfb::TileInput& input : mistake.sent)
-                            if (fb.rank() == culprit)
-                                send(frame, *tile, input.tile, 1, input.source, input.part, 0);
-                    };
-                    if (sendFirst)
-                        sendAll();
-                    frame.declare(fb.rank() == culprit ? mistake.declared : std::vector<dfb::TileInput>());
-                    if (!sendFirst)
-                        sendAll();
-                    frame.end();
-                });
+                const BadFrame bad = badFrame<FrameBuffer<Blend>>(
+                    3, s, config,
+                    [&](auto& fb) {
+                        dfb::FrameParams params;
+                        params.declared = true;
+                        auto frame = fb.begin(params);
+                        auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
+                        const auto sendAll = [&] {
+                            for (const dfb::TileInput& input : mistake.sent)
+                                if (fb.rank() == culprit)
+                                    send(frame, *tile, input.tile, 1, input.source, input.part, 0);
+                        };
+                        if (sendFirst)
+                            sendAll();
+                        frame.declare(fb.rank() == culprit ? mistake.declared : std::vector<dfb::TileInput>());
+                        if (!sendFirst)
+                            sendAll();
+                        frame.end();
+                    },
+                    0);
                 INFO(mistake.name << " on rank " << culprit << (sendFirst ? ", sent before" : ", sent after")
                                   << joined(bad.texts));
                 CHECK(allSame(bad.texts));
