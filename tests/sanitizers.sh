@@ -2,10 +2,10 @@
 # sh tests/sanitizers.sh [--brief] [PRESET...]
 # Installs what is missing, then builds the presets "asan", "tsan" and "clang", or those that are named, and runs the
 # tests of what the library does in each. With --brief, for CI,
-#   "asan" leaves out what runs in one process with ranks as threads, which "tsan" has; what computes numbers or steps of
-#     credit for a minute and more, which "tsan" has as well; 2 and 7 ranks over MPI, as it has 3; instruction sets; and
-#     uses of a function's variables after its end, for which it takes most of the time;
-#   "tsan" leaves out instruction sets, and fuzz targets of one thread, which "asan" has.
+#   "asan" leaves out what runs in one process with ranks as threads, which "tsan" has; 2 and 7 ranks over MPI, as it has
+#     3; and uses of a function's variables after its end, for which it takes most of the time;
+#   "tsan" leaves out what has one thread, which "asan" has: fuzz targets, and the longer ones of the unit tests;
+#   both leave out instruction sets, numbers and steps of credit, which take them minutes.
 set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
@@ -24,14 +24,15 @@ jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 # fails.
 run() {
     cmake --preset "$1" || return
-    without='^test_odr$' tests='^$' test_preset=$1
+    without='^test_odr$' tests='^$' test_preset=$1 long='stress[.]|unit[.]flow_control$'
     if [ "$1" = asan ] && [ $brief = yes ]; then
         without='^test_(odr|inproc|stress|isa_[a-z_]+)$'
-        tests='^(inproc[.]|stress[.]|unit[.]flow_control$|(mpi|conformance_mpi)[.][a-z_]+[.]np[27]$)' test_preset=asan-brief
+        tests="^($long|inproc[.]|(mpi|conformance_mpi)[.][a-z_]+[.]np[27]\$)" test_preset=asan-brief
     elif [ "$1" = tsan ] && [ $brief = yes ]; then
         fuzz='control|finished|fragment|packet|readers|tracker'
-        without="^test_(odr|isa_[a-z_]+|fuzz_($fuzz))\$"
-        tests="^(stress[.]isa|fuzz[.]($fuzz)\$)"
+        unit='blend_kernels|dependency_tracker|fragment_message|levels|quiescence|sparse_planes|tile_ops|visibility|wire_format'
+        without="^test_(odr|stress|isa_[a-z_]+|fuzz_($fuzz))\$"
+        tests="^($long|unit[.]($unit)\$|fuzz[.]($fuzz)\$)"
     fi
     targets=$(cmake --build --preset "$1" --target help | sed -nE 's/^((test|mpi)_[a-z_]+): phony$/\1/p' |
         grep -Ev "$without") || return
