@@ -70,10 +70,10 @@ public:
             fail(ErrorKind::UnannouncedInput, 0, source, rank, 0, 0, "the generation is negative");
         if (generationIndex >= maxGenerations)
             fail(ErrorKind::UnannouncedInput, generationIndex, source, rank, maxGenerations, generationIndex,
-                 "a tree has at most " + std::to_string(maxGenerations) + " generations");
+                 detail::printed("a tree has at most %d generations", maxGenerations));
         if (children < 0)
             fail(ErrorKind::NegativeChildren, generationIndex, source, rank, -1, -1,
-                 "announced " + std::to_string(children) + " children");
+                 detail::printed("announced %d children", children));
         const auto place = std::lower_bound(inputs_.begin(), inputs_.end(), input);
         if (place != inputs_.end() && *place == input)
             failTwice(generationIndex, source, part, place->rank, rank);
@@ -104,15 +104,15 @@ public:
         info.source = source;
         info.expected = 1;
         info.got = 2;
-        info.message = "source " + std::to_string(source) + " (in the library's loops: the id of a brick)"
-                       + (part > 0 ? " part " + std::to_string(part) : "");
+        info.message = detail::printed("source %u (in the library's loops: the id of a brick)", source);
+        if (part > 0)
+            info.message += detail::printed(" part %d", part);
         if (std::min(rank, otherRank) < 0 || rank == otherRank)
-            info.message += " comes twice" + (info.from < 0 ? "" : " from rank " + std::to_string(info.from));
+            info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
         else
-            info.message += " comes from rank " + std::to_string(std::min(rank, otherRank)) + " and from rank "
-                            + std::to_string(std::max(rank, otherRank))
-                            + ": a brick may be in the World of one rank only. If several hold it, use SharedWorld and "
-                              "MixedParallelLoop";
+            info.message += detail::printed(" comes from rank %d and from rank %d: a brick may be in the World of one "
+                                            "rank only. If several hold it, use SharedWorld and MixedParallelLoop",
+                                            std::min(rank, otherRank), std::max(rank, otherRank));
         throw Error(std::move(info));
     }
 
@@ -131,8 +131,8 @@ public:
 
         std::string text() const
         {
-            return "generation " + std::to_string(generation) + " has " + std::to_string(got) + " of "
-                   + std::to_string(expected) + " inputs";
+            return detail::printed("generation %d has %lld of %lld inputs", generation, static_cast<long long>(got),
+                                   static_cast<long long>(expected));
         }
     };
 
@@ -226,7 +226,7 @@ private:
     {
         if (!std::binary_search(declared_.begin(), declared_.end(), std::make_pair(input.source, input.part)))
             fail(ErrorKind::UnannouncedInput, input.generation, input.source, input.rank, 0, 1,
-                 "its rank did not declare it, part " + std::to_string(input.part));
+                 detail::printed("its rank did not declare it, part %d", input.part));
     }
 
     // Blames the first input of a generation, where the culprit can not be told from the others.

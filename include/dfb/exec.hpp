@@ -130,7 +130,7 @@ public:
             threadCount = Processors::ofThisThread().count();
         threads_.reserve(static_cast<std::size_t>(threadCount));
         for (int i = 0; i < threadCount; ++i)
-            threads_.emplace_back([this] { work(); });
+            threads_.push_back(std::thread([this] { work(); }));
     }
 
     ~ThreadExecutor() override

@@ -27,8 +27,7 @@ public:
     TileLayout(int width, int height, int tileSize) : width_(width), height_(height), tileSize_(tileSize)
     {
         if (width < 1 || height < 1 || width > maxImageSize || height > maxImageSize)
-            throw InvalidArgument("the image size is " + std::to_string(width) + "x" + std::to_string(height)
-                                  + ", it must be 1 to 65536 pixels a side");
+            detail::failArgument("the image size is %dx%d, it must be 1 to 65536 pixels a side", width, height);
         tilesX_ = (width + tileSize - 1) / tileSize;
         tilesY_ = (height + tileSize - 1) / tileSize;
     }

@@ -33,7 +33,7 @@ public:
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         for (; begin != end; ++begin)
             if (!(*begin)->empty())
-                cursors_.emplace_back(**begin);
+                cursors_.push_back(FragmentCursor(**begin));
     }
 
     void skipRows(int count)

@@ -9,10 +9,10 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <vector>
 
 #if defined(DFB_HAS_AVX2_CLONES)
 #include <immintrin.h>
+#include <vector>
 #endif
 
 namespace dfb::detail {
@@ -119,7 +119,7 @@ public:
         static thread_local std::array<std::vector<SortNetwork>, mostLayers + 1> made;
         auto& one = made[static_cast<std::size_t>(layers)];
         if (one.empty())
-            one.emplace_back(layers);
+            one.push_back(SortNetwork(layers));
         return one.front();
     }
 

@@ -17,11 +17,9 @@
 #include <cstring>
 #include <exception>
 #include <functional>
-#include <map>
 #include <memory>
 #include <mutex>
 #include <optional>
-#include <set>
 #include <string>
 #include <thread>
 #include <unordered_map>
@@ -157,12 +155,13 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         address = addresses_++;
-        receivers_.emplace(address, &receiver);
-        if (const auto early = early_.find(address); early != early_.end()) {
-            for (Early& e : early->second)
-                receiver.receive(e.source, e.header, std::move(e.message));
-            early_.erase(early);
-        }
+        receivers_.push_back({address, &receiver});
+        std::vector<Early> all, its;
+        all.swap(early_);
+        for (Early& e : all)
+            (e.header.receiver == address ? its : early_).push_back(std::move(e));
+        for (Early& e : its)
+            receiver.receive(e.source, e.header, std::move(e.message));
         if (stray_)
             receiver.malformed(stray_->first, stray_->second);
         stray_.reset();
@@ -172,7 +171,8 @@ public:
     void detach(std::uint32_t address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        receivers_.erase(address);
+        if (const auto place = findReceiver(address); place != receivers_.end())
+            receivers_.erase(place);
     }
 
     // `message` starts with a MessageHeader; `destination` is another rank. Never blocks.
@@ -212,14 +212,11 @@ public:
     std::string lost() const
     {
         const std::lock_guard<std::mutex> lock(peersMutex_);
-        std::map<int, std::size_t> missing;
-        for (const auto& [source, peer] : peers_)
-            if (peer.received.missing() > 0)
-                missing[source] = peer.received.missing();
         std::string text;
-        for (const auto& [source, count] : missing)
-            text += (text.empty() ? "messages on the way or lost: " : ", ") + std::to_string(count) + " from rank "
-                    + std::to_string(source);
+        for (int source = 0; source < size_; ++source)
+            if (const auto peer = peers_.find(source); peer != peers_.end() && peer->second.received.missing() > 0)
+                text += detail::printed("%s%zu from rank %d", text.empty() ? "messages on the way or lost: " : ", ",
+                                        peer->second.received.missing(), source);
         return text;
     }
 
@@ -371,11 +368,19 @@ private:
             return;
         }
         const std::lock_guard<std::mutex> lock(mutex_);
-        const auto receiver = receivers_.find(header.receiver);
-        if (receiver != receivers_.end())
+        if (const auto receiver = findReceiver(header.receiver); receiver != receivers_.end())
             receiver->second->receive(source, header, std::move(message));
         else if (header.receiver >= addresses_)
-            early_[header.receiver].push_back({source, header, std::move(message)});
+            early_.push_back({source, header, std::move(message)});
+    }
+
+    using Receiver = std::pair<std::uint32_t, detail::MessageReceiver*>;
+
+    // The end if there is none.
+    std::vector<Receiver>::iterator findReceiver(std::uint32_t address)
+    {
+        return std::find_if(receivers_.begin(), receivers_.end(),
+                            [&](const Receiver& r) { return r.first == address; });
     }
 
     // Objects are made in the same order on all ranks, so that no rank is far ahead.
@@ -392,7 +397,8 @@ private:
         const std::lock_guard<std::mutex> lock(peersMutex_);
         heartbeat_.heard(source, header.kind == detail::MessageKind::Present);
         if (header.kind == detail::MessageKind::AreYouThere) {
-            askers_.insert(source);
+            if (std::find(askers_.begin(), askers_.end(), source) == askers_.end())
+                askers_.push_back(source);
             isAsked_ = true;
         }
         const auto result = peers_[source].received.arrive(header.sequence);
@@ -448,7 +454,7 @@ private:
     void beat(Clock::time_point now, bool expecting)
     {
         if (isAsked_ && isAsked_.exchange(false)) {
-            std::set<int> askers;
+            std::vector<int> askers;
             {
                 const std::lock_guard<std::mutex> lock(peersMutex_);
                 askers.swap(askers_);
@@ -475,9 +481,9 @@ private:
         ErrorInfo error;
         error.kind = ErrorKind::Transport;
         error.rank = other;
-        error.message = "this rank is lost: it has ended, is stopped or can not be reached. Rank "
-                        + std::to_string(rank()) + " has heard nothing of it for "
-                        + std::to_string(options_.peerTimeoutMs) + " ms (peerTimeoutMs)";
+        error.message = detail::printed("this rank is lost: it has ended, is stopped or can not be reached. Rank %d "
+                                        "has heard nothing of it for %d ms (peerTimeoutMs)",
+                                        rank(), options_.peerTimeoutMs);
         if (link_->canAbort() && !options_.onPeerLost)
             link_->abort(error.describe());
         if (giveUp(error) && options_.onPeerLost)
@@ -505,15 +511,15 @@ private:
     // Under peersMutex_:
     std::unordered_map<int, Peer> peers_; // made when first needed
     detail::Heartbeat heartbeat_{rank_, size_, peerTimeout()};
-    std::set<int> askers_; // that want a sign of life
+    std::vector<int> askers_; // that want a sign of life
 
     std::atomic<bool> isAsked_{false}; // there are askers
     Clock::time_point nextBeat_{};     // only the thread that polls uses it
 
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
-    std::map<std::uint32_t, detail::MessageReceiver*> receivers_;
-    std::map<std::uint32_t, std::vector<Early>> early_; // for receivers to come
-    std::optional<std::pair<int, ErrorInfo>> stray_;    // what was malformed when there was no receiver
+    std::vector<Receiver> receivers_;
+    std::vector<Early> early_;                       // for receivers to come
+    std::optional<std::pair<int, ErrorInfo>> stray_; // what was malformed when there was no receiver
     std::uint32_t addresses_ = 0;
     int expecting_ = 0;
 

@@ -56,10 +56,8 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         free_ += extraInUse_;
         extraInUse_ = 0;
-        for (auto& [destination, out] : outgoing_)
-            out.reset(allowance_);
-        for (auto& [source, in] : incoming_)
-            in.reset(allowance_);
+        for (auto& [rank, peer] : peers_)
+            peer.reset(allowance_);
         asking_.clear();
         underWay_ = 0;
         peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
@@ -72,7 +70,8 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         matters_ = std::move(matters);
-        for (auto& [destination, out] : outgoing_)
+        for (auto& [rank, peer] : peers_) {
+            Outgoing& out = peer.out;
             for (std::size_t left = out.queue.size(); left > 0; --left) {
                 Buffer message = out.queue.pop();
                 if (matters_(message)) {
@@ -82,14 +81,14 @@ public:
                 underWay_ -= message.size();
                 out.queuedBytes -= message.size();
             }
+        }
     }
 
     // Whether nothing waits for credit.
     bool allSent() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return std::all_of(outgoing_.begin(), outgoing_.end(),
-                           [](const auto& out) { return out.second.queue.empty(); });
+        return std::all_of(peers_.begin(), peers_.end(), [](const auto& p) { return p.second.out.queue.empty(); });
     }
 
     // ---- the sender's side
@@ -132,10 +131,10 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         std::string text;
-        for (const auto& [destination, out] : outgoing_)
-            if (const std::uint64_t bytes = out.sent - out.consumed + out.queuedBytes; bytes > 0)
-                text += (text.empty() ? "rank " : ", rank ") + std::to_string(destination) + " has not taken "
-                        + std::to_string(bytes) + " bytes";
+        for (const auto& [destination, peer] : peers_)
+            if (const std::uint64_t bytes = peer.out.sent - peer.out.consumed + peer.out.queuedBytes; bytes > 0)
+                text += printed("%srank %d has not taken %llu bytes", text.empty() ? "" : ", ", destination,
+                                static_cast<unsigned long long>(bytes));
         return text;
     }
 
@@ -265,21 +264,26 @@ private:
         }
     };
 
-    Outgoing& outgoingTo(int rank)
-    {
-        const auto [place, isNew] = outgoing_.try_emplace(rank);
-        if (isNew)
-            place->second.reset(allowance_);
-        return place->second;
-    }
+    struct Peer {
+        Outgoing out;
+        Incoming in;
 
-    Incoming& incomingFrom(int rank)
+        void reset(std::uint64_t allowance)
+        {
+            out.reset(allowance);
+            in.reset(allowance);
+        }
+    };
+
+    Peer& peerOf(int rank)
     {
-        const auto [place, isNew] = incoming_.try_emplace(rank);
+        const auto [place, isNew] = peers_.try_emplace(rank);
         if (isNew)
             place->second.reset(allowance_);
         return place->second;
     }
+    Outgoing& outgoingTo(int rank) { return peerOf(rank).out; }
+    Incoming& incomingFrom(int rank) { return peerOf(rank).in; }
 
     // For the first message that waits, and as many of the next as fit in a quarter of the pool.
     Request requestOf(Outgoing& out) const
@@ -353,8 +357,7 @@ private:
     std::size_t free_;           // of the half that is granted on request
     std::size_t extraInUse_ = 0; // the rest of it
     // Of each rank since it was first met:
-    std::unordered_map<int, Outgoing> outgoing_;
-    std::unordered_map<int, Incoming> incoming_;
+    std::unordered_map<int, Peer> peers_;
     Fifo<int> asking_;
     Fifo<std::pair<int, Credit>> grants_; // to be told
     std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;

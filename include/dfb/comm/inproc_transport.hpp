@@ -15,7 +15,6 @@
 #include <memory>
 #include <mutex>
 #include <optional>
-#include <random>
 #include <string>
 #include <thread>
 #include <utility>
@@ -34,7 +33,7 @@ public:
         TransportHandler* handler = nullptr;
         bool stopped = false;
         std::vector<std::pair<int, Buffer>> waiting; // came before start(), or are held back to be shuffled
-        std::mt19937_64 random;
+        std::uint64_t random = 0;
         int patience = 0; // polls without an arrival
         NapSignal signal;
     };
@@ -55,7 +54,7 @@ public:
         if (index == channels_.size()) {
             channels_.push_back(std::make_unique<Channel>(static_cast<std::size_t>(size_)));
             for (std::size_t r = 0; shuffleSeed_ && r < channels_.back()->size(); ++r)
-                (*channels_.back())[r].random.seed(*shuffleSeed_ + 1000003 * index + 7919 * r);
+                (*channels_.back())[r].random = *shuffleSeed_ + 1000003 * index + 7919 * r;
         }
         return *channels_[index];
     }
@@ -166,6 +165,15 @@ public:
         }
     }
 
+    // SplitMix64 (Steele, Lea and Flood 2014).
+    static std::uint64_t nextRandom(std::uint64_t& state)
+    {
+        std::uint64_t z = state += 0x9e3779b97f4a7c15u;
+        z = (z ^ (z >> 30)) * 0xbf58476d1ce4e5b9u;
+        z = (z ^ (z >> 27)) * 0x94d049bb133111ebu;
+        return z ^ (z >> 31);
+    }
+
     // Only where arrivals are shuffled: waits until some have gathered or no more come, then delivers any one.
     bool poll()
     {
@@ -177,7 +185,8 @@ public:
             self.signal.interrupt(); // to be asked again soon
             return false;
         }
-        std::swap(self.waiting[static_cast<std::size_t>(self.random() % self.waiting.size())], self.waiting.back());
+        std::swap(self.waiting[static_cast<std::size_t>(nextRandom(self.random) % self.waiting.size())],
+                  self.waiting.back());
         auto [source, message] = std::move(self.waiting.back());
         self.waiting.pop_back();
         self.handler->receive(source, std::move(message));
@@ -213,7 +222,7 @@ inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)
                      std::optional<std::uint64_t> shuffleSeed = std::nullopt)
 {
     if (rankCount < 1)
-        throw InvalidArgument("the number of ranks is " + std::to_string(rankCount) + ", it must be at least 1");
+        detail::failArgument("the number of ranks is %d, it must be at least 1", rankCount);
     const auto hub = std::make_shared<detail::InprocHub>(rankCount, shuffleSeed);
     std::mutex mutex;
     std::exception_ptr first;

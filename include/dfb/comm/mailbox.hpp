@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/base/fifo.hpp>
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
@@ -154,8 +155,7 @@ public:
     // `over()`. Runs waiting tasks meanwhile, so that ranks that wait for each other's inboxes get on. On a thread that
     // could not make progress it returns at once. False if nobody takes anything for as long as `limit`, unless that is
     // 0.
-    template <class Over>
-    bool waitForRoom(const Over& over, std::chrono::milliseconds limit)
+    bool waitForRoom(FunctionRef<bool()> over, std::chrono::milliseconds limit)
     {
         std::size_t before = flow_.underWay();
         const auto roomy = [this] { return flow_.underWay() <= flow_.poolBytes(); };
@@ -190,8 +190,7 @@ public:
     void requireProgress() const
     {
         if (connection_->needsCaller() && !connection_->mayPoll())
-            throw InvalidArgument("at this thread level of MPI calls that wait belong to the thread that initialised "
-                                  "it");
+            failArgument("at this thread level of MPI calls that wait belong to the thread that initialised it");
     }
 
     // Takes note that this message of the epoch has been taken.
@@ -301,8 +300,7 @@ public:
 
     // Waits until `ready()`, which must not lock what is held while calling notify(); makes progress if that is the
     // caller's business. False if `deadline` has passed before. Throws TransportError.
-    template <class Ready>
-    bool wait(const Ready& ready, std::optional<Clock::time_point> deadline = std::nullopt)
+    bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
         const auto over = [&] { return failed() || ready(); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
@@ -426,8 +424,7 @@ public:
 private:
     // A message that could not be read may have been a part of this, for which others may not be here yet, or of what
     // comes after, if they are through. The first one is what its owner's constructor does. `damage`: from before.
-    template <class Ready>
-    void waitForResult(const Ready& ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
+    void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
         const std::chrono::milliseconds late(connection_->options().peerTimeoutMs);
@@ -454,8 +451,7 @@ private:
 
     // For a moment a waiting thread does by itself what those do that would otherwise have to be woken, each of which
     // may wait for a core then. Gives up when nothing has come for some time, or when others need the core.
-    template <class Over>
-    void waitAwake(const Over& over)
+    void waitAwake(FunctionRef<bool()> over)
     {
         if (!connection_->hasProgressThread())
             return;

@@ -148,13 +148,13 @@ T loadAs(const std::byte* bytes)
     return value;
 }
 
-[[noreturn]] inline void failMalformed(std::string message, std::int64_t expected = -1, std::int64_t got = -1)
+[[noreturn]] inline void failMalformed(const char* message, std::int64_t expected = -1, std::int64_t got = -1)
 {
     ErrorInfo info;
     info.kind = ErrorKind::MalformedMessage;
     info.expected = expected;
     info.got = got;
-    info.message = std::move(message);
+    info.message = message;
     throw Error(std::move(info));
 }
 

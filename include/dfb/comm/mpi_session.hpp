@@ -72,8 +72,8 @@ private:
         check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
         if (level_ < needed) {
             finalize();
-            throw TransportError(std::string("this MPI library has the thread level ") + detail::mpiLevelName(level_)
-                                     + " at most, " + detail::mpiLevelName(needed) + " was asked for",
+            throw TransportError(detail::printed("this MPI library has the thread level %s at most, %s was asked for",
+                                                 detail::mpiLevelName(level_), detail::mpiLevelName(needed)),
                                  rank_);
         }
     }

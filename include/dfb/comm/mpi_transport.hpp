@@ -16,6 +16,7 @@
 
 #include <dfb/base/cpu.hpp>
 #include <dfb/base/fifo.hpp>
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
@@ -63,8 +64,8 @@ inline void checkMpi(int code, const char* call, int rank, int peer = -1)
     int length = 0;
     if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
         length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
-    throw TransportError(call + (peer < 0 ? "" : " with rank " + std::to_string(peer)) + ": "
-                             + std::string(text, static_cast<std::size_t>(length)),
+    throw TransportError(peer < 0 ? printed("%s: %.*s", call, length, text)
+                                  : printed("%s with rank %d: %.*s", call, peer, length, text),
                          rank);
 }
 
@@ -185,7 +186,7 @@ public:
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             first = outbox_.empty();
-            outbox_.emplace_back(destination, std::move(message));
+            outbox_.push_back({destination, std::move(message)});
         }
         if (first)
             signal_.interrupt();
@@ -242,15 +243,17 @@ private:
         int level = MPI_THREAD_SINGLE;
         MPI_Query_thread(&level);
         if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
-            throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
-                                 + ", Progress::Thread needs MPI_THREAD_MULTIPLE: call MPI_Init_thread with it, or "
-                                   "leave Progress::Auto");
+            throw TransportError(
+                detail::printed("MPI was initialised at thread level %s, Progress::Thread needs MPI_THREAD_MULTIPLE: "
+                                "call MPI_Init_thread with it, or leave Progress::Auto",
+                                detail::mpiLevelName(level)));
         if (level < MPI_THREAD_SERIALIZED) {
             int isMain = 0;
             MPI_Is_thread_main(&isMain);
             if (!isMain)
-                throw TransportError(std::string("MPI was initialised at thread level ") + detail::mpiLevelName(level)
-                                     + " by another thread: only that one may call MPI");
+                throw TransportError(detail::printed(
+                    "MPI was initialised at thread level %s by another thread: only that one may call MPI",
+                    detail::mpiLevelName(level)));
             onlyThread_ = std::this_thread::get_id();
         }
     }
@@ -269,8 +272,7 @@ private:
 
     // What a rank does alone. If it fails the rank does nothing more of that kind, but still takes part in what all do
     // together, as they wait for it there, until it can tell them.
-    template <class Step>
-    static void attempt(Reason& wrong, const Step& step)
+    static void attempt(Reason& wrong, detail::FunctionRef<void()> step)
     {
         if (wrong[0] != 0)
             return;
@@ -311,7 +313,7 @@ private:
 
     void postPackets()
     {
-        packetRequests_.resize(postedPackets, MPI_REQUEST_NULL);
+        packetRequests_.assign(postedPackets, MPI_REQUEST_NULL);
         packets_ = pool_->acquire(detail::packetBytes * postedPackets);
         for (int slot = 0; slot < postedPackets; ++slot)
             postPacket(slot);
@@ -330,15 +332,16 @@ private:
         if (differs == all.end())
             return;
         const int other = static_cast<int>(differs - all.begin());
-        std::string text = "ranks were built with versions of dfb that can not read each other: rank 0 sends packets "
-                           "of format "
-                           + std::to_string(all.front());
+        const auto number = [](std::uint64_t format) { return static_cast<unsigned long long>(format); };
+        std::string text = detail::printed("ranks were built with versions of dfb that can not read each other: rank 0 "
+                                           "sends packets of format %llu",
+                                           number(all.front()));
         int named = 0; // those that differ from rank 0
         for (std::size_t rank = 0; rank < all.size(); ++rank)
             if (all[rank] != all.front() && ++named <= 8)
-                text += ", rank " + std::to_string(rank) + " of format " + std::to_string(all[rank]);
+                text += detail::printed(", rank %zu of format %llu", rank, number(all[rank]));
         if (named > 8)
-            text += ", and " + std::to_string(named - 8) + " more of others than rank 0";
+            text += detail::printed(", and %d more of others than rank 0", named - 8);
         throw TransportError(std::move(text), other);
     }
 
@@ -459,8 +462,7 @@ private:
     }
 
     // `action()`, or false if it failed.
-    template <class Action>
-    bool guarded(const Action& action)
+    bool guarded(detail::FunctionRef<bool()> action)
     {
         try {
             return action();
@@ -691,9 +693,9 @@ private:
                     Peer& peer = peers_[static_cast<std::size_t>(source)];
                     Buffer message = peer.itsMemory ? peer.itsMemory->borrow(record.tag, record.byteCount) : Buffer();
                     if (message.empty())
-                        throw TransportError("rank " + std::to_string(source)
-                                                 + " has lent a block that is not in the memory of this node",
-                                             rank_);
+                        throw TransportError(
+                            detail::printed("rank %d has lent a block that is not in the memory of this node", source),
+                            rank_);
                     deliver(source, std::move(message));
                 } else if (record.kind == Record::Failure) {
                     failAsTold(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
@@ -705,7 +707,7 @@ private:
                 }
             });
         if (!isPacket)
-            throw TransportError("a packet from rank " + std::to_string(source) + " is malformed", rank_);
+            throw TransportError(detail::printed("a packet from rank %d is malformed", source), rank_);
     }
 
     bool receiveBodies()
@@ -720,7 +722,7 @@ private:
         return testSome(receives_, [this](Transfer& body, const MPI_Status& status) {
             if (byteCountOf(status) != static_cast<std::size_t>(body.count()))
                 throw TransportError(
-                    "a message from rank " + std::to_string(body.peer) + " is not as long as it was announced", rank_);
+                    detail::printed("a message from rank %d is not as long as it was announced", body.peer), rank_);
             body.offset += static_cast<std::size_t>(body.count());
             if (body.offset < body.data.size())
                 return startReceive(body);
@@ -774,8 +776,7 @@ private:
 
     // Calls `next(item, status)` for each that has completed, which returns the request of its next chunk or that it
     // was the last; removes those. True if there were any.
-    template <class Next>
-    bool testSome(Transfers& transfers, const Next& next)
+    bool testSome(Transfers& transfers, detail::FunctionRef<MPI_Request(Transfer&, const MPI_Status&)> next)
     {
         auto& [requests, items] = transfers;
         if (requests.empty())
@@ -805,8 +806,7 @@ private:
     // --- the end
 
     // False if the handler has failed: then what it waits for may never be.
-    template <class Done>
-    bool moveUntil(const Done& done)
+    bool moveUntil(detail::FunctionRef<bool()> done)
     {
         for (detail::Patience patience; !done();) {
             if (handler_)
@@ -853,8 +853,7 @@ private:
     }
 
     // Calls `came(slot, byteCount)` for the receives that have got something.
-    template <class Came>
-    void cancelPackets(const Came& came)
+    void cancelPackets(detail::FunctionRef<void(int, std::size_t)> came)
     {
         for (MPI_Request& request : packetRequests_)
             if (request != MPI_REQUEST_NULL)

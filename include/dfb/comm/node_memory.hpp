@@ -14,13 +14,13 @@
 #include <cstring>
 #include <memory>
 #include <mutex>
-#include <random>
 #include <string>
 #include <utility>
 
 #if defined(__linux__)
 #include <fcntl.h>
 #include <sys/mman.h>
+#include <sys/random.h>
 #include <sys/stat.h>
 #include <unistd.h>
 #endif
@@ -53,9 +53,10 @@ public:
             return nullptr;
         }
         std::shared_ptr<NodeMemory> memory(new NodeMemory(base, file));
-        std::random_device random;
+        if (getrandom(memory->address_.secret, sizeof memory->address_.secret, 0) < 0)
+            return nullptr;
         for (std::uint64_t& word : memory->address_.secret)
-            word = (std::uint64_t{random()} << 32 | random()) | 1;
+            word |= 1;
         memory->address_.process = getpid();
         memory->address_.file = file;
         std::memcpy(base, memory->address_.secret, sizeof memory->address_.secret);

@@ -49,18 +49,19 @@ public:
         Agreement mine;
         try {
             if (config_.displayRank < 0 || config_.displayRank >= size())
-                throw InvalidArgument("the display rank is " + std::to_string(config_.displayRank) + " of "
-                                      + std::to_string(size()));
+                failArgument("the display rank is %d of %d", config_.displayRank, size());
             if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
-                throw InvalidArgument("there can not be " + std::to_string(config_.framesInFlight)
-                                      + " frames in flight: 1 or more, and only 1 if the tile operation keeps state");
+                failArgument(
+                    "there can not be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
+                    config_.framesInFlight);
             if (config_.aux & ~(traits().channels & imageAuxChannels))
-                throw InvalidArgument("the image is to have auxiliary channels (mask " + std::to_string(config_.aux)
-                                      + ") that the inputs of this tile operation do not have");
+                failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
+                             "do not have",
+                             config_.aux);
             if (const int ms = mailbox_->connection().options().peerTimeoutMs; ms != 0 && ms < 100)
-                throw InvalidArgument("a time-out for peers of " + std::to_string(ms) + " ms: 0, or 100 and more");
+                failArgument("a time-out for peers of %d ms: 0, or 100 and more", ms);
             if (config_.quietMs < 1)
-                throw InvalidArgument("quietMs is " + std::to_string(config_.quietMs) + ": it must be 1 or more");
+                failArgument("quietMs is %d: it must be 1 or more", config_.quietMs);
             checkWire();
             pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), mailbox_->address(),
                                                        [this](Buffer&& message) { sendToDisplay(std::move(message)); });
@@ -76,10 +77,9 @@ public:
         } catch (const OutOfMemory& e) {
             const bool several = config_.framesInFlight > 1;
             mine = {false,
-                    e.what()
-                        + (several ? "; there is one for each of " + std::to_string(config_.framesInFlight)
-                                         + " frames in flight"
-                                   : ""),
+                    several
+                        ? printed("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight)
+                        : e.what(),
                     rank()};
         } catch (const std::exception& e) {
             // No memory, or out of the owner map: the others must not wait for this rank.
@@ -116,14 +116,14 @@ public:
     void begin(const FrameParams& params) override
     {
         if (isOpen())
-            throw InvalidArgument("begin() while a frame is open: end() it first");
+            failArgument("begin() while a frame is open: end() it first");
         if (params.passes < 1)
-            throw InvalidArgument("a frame has at least 1 pass, not " + std::to_string(params.passes));
+            failArgument("a frame has at least 1 pass, not %d", params.passes);
         if (params.maxLayers < 0)
-            throw InvalidArgument("at most " + std::to_string(params.maxLayers) + " layers");
+            failArgument("at most %d layers", params.maxLayers);
         checkSamples(params);
         if (params.timeoutMs < 0)
-            throw InvalidArgument("a time-out of " + std::to_string(params.timeoutMs) + " ms");
+            failArgument("a time-out of %d ms", params.timeoutMs);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         params_ = params;
@@ -200,7 +200,7 @@ public:
     void hide(int tile, int generation, int other) override
     {
         if (!pipeline_->opaqueHides(tile))
-            throw InvalidArgument("hide() with a tile operation or a frame to which everything counts");
+            failArgument("hide() with a tile operation or a frame to which everything counts");
         if (other == rank())
             hidden_.hide(tile, generation);
         else
@@ -232,13 +232,12 @@ public:
     void declare(const std::vector<TileInput>& inputs) override
     {
         if (!params_.declared)
-            throw InvalidArgument("declare() in a frame that was not begun with declared inputs");
+            failArgument("declare() in a frame that was not begun with declared inputs");
         if (declarations_.declared())
-            throw InvalidArgument("declare() a second time in a frame");
+            failArgument("declare() a second time in a frame");
         for (const TileInput& input : inputs)
             if (input.tile < 0 || input.tile >= layout().tileCount())
-                throw InvalidArgument("declare() of tile " + std::to_string(input.tile) + " of an image of "
-                                      + std::to_string(layout().tileCount()) + " tiles");
+                failArgument("declare() of tile %d of an image of %d tiles", input.tile, layout().tileCount());
         if (outcome_->failed())
             return;
         const bool isWaiting = declarations_.declare(
@@ -669,10 +668,9 @@ private:
     {
         const WirePrecision& w = config_.wire;
         if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
-            throw InvalidArgument("an error budget of " + std::to_string(w.budget) + ", colours up to "
-                                  + std::to_string(w.maxColor));
+            failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
         if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
-            throw InvalidArgument("a least transmittance of " + std::to_string(config_.minTransmittance));
+            failArgument("a least transmittance of %f", config_.minTransmittance);
     }
 
     // Whether what the last frame left behind is of use.
@@ -692,22 +690,21 @@ private:
     {
         if (!params.samples) {
             if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
-                throw InvalidArgument("a tile can not have " + std::to_string(params.passes) + " samples from "
-                                      + std::to_string(firstSampleOf(params)) + " on: take another accumulationId");
+                failArgument("a tile can not have %d samples from %d on: take another accumulationId", params.passes,
+                             firstSampleOf(params));
             return;
         }
         if (params.samples->size() != static_cast<std::size_t>(layout().tileCount()))
-            throw InvalidArgument("a plan of the samples of " + std::to_string(params.samples->size())
-                                  + " tiles for an image of " + std::to_string(layout().tileCount()));
+            failArgument("a plan of the samples of %zu tiles for an image of %d", params.samples->size(),
+                         layout().tileCount());
         for (const TileSamples& t : *params.samples) {
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
-                throw InvalidArgument("a tile can not have " + std::to_string(t.count) + " samples from "
-                                      + std::to_string(t.first) + " on");
+                failArgument("a tile can not have %d samples from %d on", t.count, t.first);
             if (!traits().keepsState && (t.count == 0 || t.first > 0))
-                throw InvalidArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
+                failArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
             if ((t.first > 0 || t.count == 0) && !accumulates(params))
-                throw InvalidArgument("what was accumulated is of no use, as the last frame failed or had another "
-                                      "accumulationId: begin again with sample 0 of each tile");
+                failArgument("what was accumulated is of no use, as the last frame failed or had another "
+                             "accumulationId: begin again with sample 0 of each tile");
         }
     }
 

@@ -57,37 +57,46 @@ struct FrameTerms {
     // The first field that is not the same in both, with its values and ranks; "" if they are alike.
     std::string difference(const FrameTerms& o) const
     {
+        FrameTerms its = o;
+        its.rank = rank;
+        if (std::memcmp(this, &its, sizeof its) == 0) // as nearly always
+            return {};
         std::string text;
-        const auto compare = [&](const char* name, const auto& mine, const auto& its, const auto& textOf) {
-            if (text.empty() && mine != its)
-                text = std::string("FrameParams::") + name + " is " + textOf(*this) + " on rank " + std::to_string(rank)
-                       + " and " + textOf(o) + " on rank " + std::to_string(o.rank);
+        const auto compare = [&](const char* name, bool differs, const std::string& here, const std::string& there) {
+            if (text.empty() && differs)
+                text = printed("FrameParams::%s is %s on rank %d and %s on rank %d", name, here.c_str(), rank,
+                               there.c_str(), o.rank);
         };
-        const auto number = [&](const char* name, auto member) {
-            compare(name, this->*member, o.*member, [&](const FrameTerms& t) { return std::to_string(t.*member); });
+        const auto number = [&](const char* name, std::uint64_t here, std::uint64_t there) {
+            compare(name, here != there, numberText(here), numberText(there));
         };
-        const auto flag = [&](const char* name, std::int32_t FrameTerms::*member) {
-            compare(name, this->*member, o.*member, [&](const FrameTerms& t) { return t.*member ? "true" : "false"; });
+        const auto flag = [&](const char* name, std::int32_t here, std::int32_t there) {
+            compare(name, here != there, here ? "true" : "false", there ? "true" : "false");
         };
-        compare("background", background, o.background, backgroundText);
-        number("passes", &FrameTerms::passes);
-        compare("samples", samplesHash, o.samplesHash, [&](const FrameTerms& t) {
+        const auto planText = [&](const FrameTerms& t) {
             if (t.samplesHash == 0)
                 return std::string("null");
-            std::string plan = "a plan of " + std::to_string(t.sampleCount) + " samples";
+            std::string plan = "a plan of " + numberText(static_cast<std::uint64_t>(t.sampleCount)) + " samples";
             if (sampleCount == o.sampleCount) // else that tells them apart
-                plan += " with hash " + std::to_string(t.samplesHash);
+                plan += " with hash " + numberText(t.samplesHash);
             return plan;
-        });
-        number("maxLayers", &FrameTerms::maxLayers);
-        number("accumulationId", &FrameTerms::accumulationId);
-        flag("declared", &FrameTerms::declared);
-        number("timeoutMs", &FrameTerms::timeoutMs);
-        flag("allowPartial", &FrameTerms::allowPartial);
+        };
+        compare("background", background != o.background, backgroundText(*this), backgroundText(o));
+        number("passes", static_cast<std::uint64_t>(passes), static_cast<std::uint64_t>(o.passes));
+        compare("samples", samplesHash != o.samplesHash, planText(*this), planText(o));
+        number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
+        number("accumulationId", accumulationId, o.accumulationId);
+        flag("declared", declared, o.declared);
+        number("timeoutMs", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
+        flag("allowPartial", allowPartial, o.allowPartial);
         return text;
     }
 
 private:
+    static std::string numberText(std::uint64_t value)
+    {
+        return printed("%llu", static_cast<unsigned long long>(value)); // all are 0 or more
+    }
     static std::string backgroundText(const FrameTerms& t)
     {
         std::array<float, 4> c{};

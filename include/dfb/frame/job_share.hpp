@@ -135,7 +135,7 @@ public:
                 ErrorInfo info;
                 info.kind = ErrorKind::TimedOut;
                 info.from = server_;
-                info.message = "no word of rank " + std::to_string(server_) + " on what there is to render";
+                info.message = printed("no word of rank %d on what there is to render", server_);
                 outcome_.fail(std::make_exception_ptr(Error(std::move(info))));
             }
             range = take(count);

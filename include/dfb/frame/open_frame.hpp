@@ -62,7 +62,7 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (state_ != FrameState::Closed)
-            throw InvalidArgument("begin() while a frame is open: end() it first");
+            failArgument("begin() while a frame is open: end() it first");
         number_ += step_;
         state_ = FrameState::Rendering;
         error_.reset();

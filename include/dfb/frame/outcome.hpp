@@ -2,6 +2,7 @@
 // ranks learn the same verdict.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/quiescence.hpp>
 #include <dfb/frame/open_frame.hpp>
@@ -59,8 +60,7 @@ public:
 
     // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then, `source` whose
     // message it was about, or -1. False if it did throw.
-    template <class Body>
-    bool guarded(const Body& body, const ErrorInfo& where = {}, int source = -1)
+    bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {}, int source = -1)
     {
         try {
             body();
@@ -421,11 +421,11 @@ private:
         const auto missing = mailbox_.reductions().missing(key);
         std::string text;
         for (const auto& part : missing) {
-            text += (text.empty() ? std::string(what) + " rank " : ", rank ") + std::to_string(part.rank);
+            text += printed("%s rank %d", text.empty() ? what : ",", part.rank);
             if (part.rank < mailbox_.rank())
                 text += ", through which the result comes";
             else if (part.last > part.rank)
-                text += " or another up to " + std::to_string(part.last) + ", whose part comes with that one's";
+                text += printed(" or another up to %d, whose part comes with that one's", part.last);
         }
         if (missing.size() == 1 && missing.front().rank > mailbox_.rank()
             && missing.front().last == missing.front().rank)
@@ -438,7 +438,7 @@ private:
     {
         ErrorInfo info = placed({});
         info.kind = ErrorKind::Transport;
-        info.message = "no verdict after " + std::to_string(after.count()) + " ms";
+        info.message = printed("no verdict after %lld ms", static_cast<long long>(after.count()));
         addWaitedFor(info, "no verdict from", verdictKey());
         if (const std::string lost = mailbox_.connection().lost(); !lost.empty())
             info.message += "; " + lost;

@@ -102,12 +102,10 @@ public:
         if (!planes.at[Color])
             return;
         if (tile.stride < static_cast<std::size_t>(tile.region.width()))
-            throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " with rows of "
-                                  + std::to_string(tile.stride) + " pixels");
+            failArgument("a view of tile %d with rows of %zu pixels", tile.tile, tile.stride);
         for (std::size_t c = 0; c < channelCount; ++c)
             if (!planes.at[c] && hasChannel(sent_, c))
-                throw InvalidArgument("a view of tile " + std::to_string(tile.tile) + " without its " + channelNames[c]
-                                      + ", which is needed");
+                failArgument("a view of tile %d without its %s, which is needed", tile.tile, channelNames[c]);
     }
 
     // Whether inputs of a tile are hidden by an opaque one.
@@ -122,11 +120,10 @@ public:
     {
         const TileInfo& frame = table_.frameInfo();
         if (index < 0 || index >= table_.layout().tileCount())
-            throw InvalidArgument("tile " + std::to_string(index) + " of an image of "
-                                  + std::to_string(table_.layout().tileCount()) + " tiles");
+            failArgument("tile %d of an image of %d tiles", index, table_.layout().tileCount());
         const TileSamples samples = table_.samples(index);
         if (pass < 0 || pass >= samples.count)
-            throw InvalidArgument("pass " + std::to_string(pass) + " of a tile of " + std::to_string(samples.count));
+            failArgument("pass %d of a tile of %d", pass, samples.count);
         TileHeader header;
         header.frame = frame.frame;
         header.tile = index;

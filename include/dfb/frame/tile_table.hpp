@@ -33,17 +33,17 @@ void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo&
 {
     std::string wrong;
     if (tile.frame != frame.frame)
-        wrong = "a tile of frame " + std::to_string(tile.frame) + " (prepare tiles with Frame::start)";
+        wrong = printed("a tile of frame %lld (prepare tiles with Frame::start)", static_cast<long long>(tile.frame));
     else if (tile.tile < 0 || tile.tile >= layout.tileCount())
-        wrong = "outside the image, which has " + std::to_string(layout.tileCount()) + " tiles";
+        wrong = printed("outside the image, which has %d tiles", layout.tileCount());
     else if (tile.region != layout.region(tile.tile))
         wrong = "its region is not that of the tile";
     else if (tile.pass < 0 || tile.pass >= passesOf(tile.tile))
-        wrong = "the tile has " + std::to_string(passesOf(tile.tile)) + " passes";
+        wrong = printed("the tile has %d passes", passesOf(tile.tile));
     else if (tile.generation < 0 || tile.generation >= DependencyTracker::maxGenerations)
-        wrong = "the generation must be in [0, " + std::to_string(DependencyTracker::maxGenerations) + ")";
+        wrong = printed("the generation must be in [0, %d)", DependencyTracker::maxGenerations);
     else if (tile.children < 0)
-        wrong = "it announces " + std::to_string(tile.children) + " children";
+        wrong = printed("it announces %d children", tile.children);
     else
         return;
     ErrorInfo info;
@@ -67,8 +67,7 @@ public:
         for (int tile = 0; tile < layout.tileCount(); ++tile) {
             const int owner = ownerMap(tile, layout, rankCount);
             if (owner < 0 || owner >= rankCount)
-                throw InvalidArgument("the owner map gives tile " + std::to_string(tile) + " to rank "
-                                      + std::to_string(owner) + " of " + std::to_string(rankCount));
+                failArgument("the owner map gives tile %d to rank %d of %d", tile, owner, rankCount);
             owners_[static_cast<std::size_t>(tile)] = owner;
             if (owner == rank) {
                 slotOf_[static_cast<std::size_t>(tile)] = static_cast<int>(owned_.size());
@@ -278,15 +277,18 @@ public:
                     first->expected = m->expected;
                     first->got = m->got;
                 }
-                if (++tiles <= mostTiles)
-                    text += (tiles > 1 ? "; tile " : "tile ") + std::to_string(tile)
-                            + (samples(tile).count > 1 ? " pass " + std::to_string(pass) : "") + ": " + m->text()
-                            + namesOf(*m, inputs);
+                if (++tiles <= mostTiles) {
+                    text +=
+                        printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
+                                tile, pass);
+                    text += m->text();
+                    text += namesOf(*m, inputs);
+                }
                 break;
             }
         }
         if (tiles > mostTiles)
-            text += "; and " + std::to_string(tiles - mostTiles) + " more tiles";
+            text += printed("; and %d more tiles", tiles - mostTiles);
         if (first)
             first->message = std::move(text);
         return first;
@@ -416,24 +418,24 @@ private:
     {
         std::string text;
         for (const auto& [source, part] : missing.inputs) {
-            text += (text.empty() ? "; missing source " : ", ") + std::to_string(source);
+            text += printed(text.empty() ? "; missing source %u" : ", %u", source);
             if (part > 0)
-                text += " part " + std::to_string(part);
+                text += printed(" part %d", part);
             for (const ExpectedInput& input : expected)
                 if (input.source == source && input.part == part)
-                    text += " of rank " + std::to_string(input.rank);
+                    text += printed(" of rank %d", input.rank);
         }
-        return text + listOf("; announced by", missing.announcers) + listOf("; here are", missing.arrived);
+        return text + listOf("; announced by source ", missing.announcers)
+               + listOf("; here are source ", missing.arrived);
     }
     static std::string listOf(const char* what, const std::vector<DependencyTracker::Missing::Known>& inputs)
     {
         constexpr std::size_t most = 8;
         std::string text;
         for (std::size_t i = 0; i < std::min(most, inputs.size()); ++i)
-            text += (i == 0 ? std::string(what) + " source " : ", ") + std::to_string(inputs[i].source) + " of rank "
-                    + std::to_string(inputs[i].rank);
+            text += printed("%s%u of rank %d", i == 0 ? what : ", ", inputs[i].source, inputs[i].rank);
         if (inputs.size() > most)
-            text += " and " + std::to_string(inputs.size() - most) + " more";
+            text += printed(" and %zu more", inputs.size() - most);
         return text;
     }
 

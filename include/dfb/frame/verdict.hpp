@@ -248,7 +248,7 @@ struct Verdict {
         ErrorInfo info = second ? b : a;
         const ErrorInfo& other = second ? a : b;
         if (weight(a) == 3 && weight(b) == 3 && a.rank != b.rank && info.message.size() < mostText)
-            info.message += "; on rank " + std::to_string(other.rank) + ": " + other.message;
+            info.message += printed("; on rank %d: %s", other.rank, other.message.c_str());
         return info;
     }
 
@@ -271,7 +271,8 @@ struct Verdict {
         a.tileErrors = merged(a.tileErrors, b.tileErrors);
         a.figures = merged(a.figures, b.figures);
         a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
-        a.incomplete.insert(a.incomplete.end(), b.incomplete.begin(), b.incomplete.end()); // each tile has one owner
+        for (const std::int32_t tile : b.incomplete) // each tile has one owner
+            a.incomplete.push_back(tile);
         return a.bytes();
     }
 };
@@ -285,10 +286,19 @@ struct Agreement {
     // Names and values, a line each.
     class Settings {
     public:
+        void add(const char* name, const char* value) { text_ += printed("%s%c%s\n", name, separator, value); }
+        void add(const char* name, const std::string& value) { add(name, value.c_str()); }
         template <class Value>
-        void add(const char* name, const Value& value)
+        void add(const char* name, Value value)
         {
-            text_ += std::string(name) + separator + textOf(value) + '\n';
+            if constexpr (std::is_same_v<Value, bool>)
+                add(name, value ? "true" : "false");
+            else if constexpr (std::is_floating_point_v<Value>)
+                add(name, digitsOf(value));
+            else if constexpr (std::is_unsigned_v<Value>)
+                add(name, printed("%llu", static_cast<unsigned long long>(value)));
+            else
+                add(name, printed("%lld", static_cast<long long>(value)));
         }
         const std::string& text() const noexcept { return text_; }
 
@@ -306,7 +316,7 @@ struct Agreement {
         for (int tile = 0; tile < tileCount; ++tile)
             owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
         Settings s;
-        s.add("the version of dfb", std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR));
+        s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
         s.add(tileOperation, operations.tileOp);
         s.add(pixelOperation, operations.pixelOp);
         s.add("the size of tiles", operations.tileSize);
@@ -379,25 +389,18 @@ private:
     static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
     static constexpr char separator = '=';
 
-    static std::string textOf(const std::string& value) { return value; }
-    static std::string textOf(const char* value) { return value; }
+    // As few digits as tell it from all others.
     template <class Value>
-    static std::string textOf(Value value)
+    static std::string digitsOf(Value value)
     {
-        if constexpr (std::is_same_v<Value, bool>) {
-            return value ? "true" : "false";
-        } else if constexpr (std::is_floating_point_v<Value>) {
-            char digits[40]; // as few as tell it from all others
-            const int most = std::numeric_limits<Value>::max_digits10;
-            for (int count = 1; count <= most; ++count) {
-                std::snprintf(digits, sizeof digits, "%.*g", count, static_cast<double>(value));
-                if (static_cast<Value>(std::strtod(digits, nullptr)) == value)
-                    break;
-            }
-            return digits;
-        } else {
-            return std::to_string(value);
+        char digits[40];
+        const int most = std::numeric_limits<Value>::max_digits10;
+        for (int count = 1; count <= most; ++count) {
+            std::snprintf(digits, sizeof digits, "%.*g", count, static_cast<double>(value));
+            if (static_cast<Value>(std::strtod(digits, nullptr)) == value)
+                break;
         }
+        return digits;
     }
 
     // Types are compared by the names that all compilers have for them, and shown as they are written.
@@ -414,7 +417,7 @@ private:
     static std::string difference(const Agreement& a, const Agreement& b)
     {
         const auto as = settingsOf(a.text), bs = settingsOf(b.text);
-        const std::string ranks[] = {" on rank " + std::to_string(a.rank), " on rank " + std::to_string(b.rank)};
+        const std::string ranks[] = {printed(" on rank %d", a.rank), printed(" on rank %d", b.rank)};
         std::string differing;
         for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
             if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name != ownerMap || differing.empty()))
@@ -431,7 +434,7 @@ private:
             const std::size_t end = std::min(text.find('\n', at), text.size());
             const std::string line = text.substr(at, end - at);
             const std::size_t middle = std::min(line.find(separator), line.size());
-            settings.emplace_back(line.substr(0, middle), line.substr(std::min(middle + 1, line.size())));
+            settings.push_back({line.substr(0, middle), line.substr(std::min(middle + 1, line.size()))});
             at = end + 1;
         }
         return settings;

@@ -21,7 +21,6 @@
 #include <mutex>
 #include <new>
 #include <optional>
-#include <set>
 #include <string>
 #include <utility>
 #include <vector>
@@ -403,9 +402,9 @@ public:
             if (!isMissing(r))
                 continue;
             const TilesOf& its = tilesOf_[r];
-            text += (text.empty() ? "finished tiles have not come from rank " : ", rank ") + std::to_string(r) + " ("
-                    + std::to_string(its.received.tiles) + " of "
-                    + (its.announced ? std::to_string(its.announced->tiles) : "all") + ")";
+            text += text.empty() ? "finished tiles have not come from rank " : ", rank ";
+            text += its.announced ? printed("%zu (%d of %d)", r, its.received.tiles, its.announced->tiles)
+                                  : printed("%zu (%d of all)", r, its.received.tiles);
         }
         return text;
     }
@@ -457,20 +456,23 @@ public:
         return isMissing(static_cast<std::size_t>(owner))
                && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
-    // The same: the tile of a frame that is over is not to be seen.
+    // The same: the tile of a frame that is over is not to be seen. Called in the order of tiles.
     void setIncomplete(int tile)
     {
         if (tile < 0 || tile >= static_cast<int>(state_.size()))
             return;
         state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
-        incomplete_.insert(tile);
+        incomplete_.push_back(tile);
     }
     // The same: nothing has come for it in this frame.
     bool hasNothing(int tile) const
     {
         return isDisplay() && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
-    bool isComplete(int tile) const { return imageFrame_ >= 0 && incomplete_.count(tile) == 0; }
+    bool isComplete(int tile) const
+    {
+        return imageFrame_ >= 0 && !std::binary_search(incomplete_.begin(), incomplete_.end(), tile);
+    }
 
     // The frame has failed: nothing in the image can be relied on.
     void invalidate()
@@ -658,7 +660,7 @@ private:
     ImageGate* imageGate_ = nullptr; // in gateMemory_, if other ranks see the image
     std::array<float, 4> background_{}, lastBackground_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
-    std::set<int> incomplete_;                  // of the last frame
+    std::vector<std::int32_t> incomplete_;      // of the last frame
     std::vector<TilesOf> tilesOf_;              // per rank, on the display rank; under mutex_
     std::atomic<int> ranksComplete_{0};         // of those that send
 };

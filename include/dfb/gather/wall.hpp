@@ -115,7 +115,7 @@ public:
     {
         const auto found = shown_.find(display);
         if (found == shown_.end())
-            throw InvalidArgument("display " + std::to_string(display) + " is not driven by this rank");
+            failArgument("display %d is not driven by this rank", display);
         return found->second;
     }
 

@@ -17,10 +17,9 @@ public:
     void add(Fragment&& fragment)
     {
         if (fragment.header().generation != 0 || fragment.header().children != 0)
-            throw InvalidArgument("an image-parallel tile is of generation 0 and has no children, this one is of "
-                                  "generation "
-                                  + std::to_string(fragment.header().generation) + " and has "
-                                  + std::to_string(fragment.header().children));
+            detail::failArgument("an image-parallel tile is of generation 0 and has no children, this one is of "
+                                 "generation %d and has %d",
+                                 fragment.header().generation, fragment.header().children);
         this->store_.add(std::move(fragment));
     }
 };

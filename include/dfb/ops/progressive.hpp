@@ -9,7 +9,6 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <limits>
 #include <string>
 #include <type_traits>
@@ -100,9 +99,8 @@ public:
             m2_.assign(pixelCount(), 0.0); // also of those, which are all alike
         }
         if (info.passes > 0 && info.firstSample != samples_)
-            throw InvalidArgument("the tile has accumulated " + std::to_string(samples_)
-                                  + " samples, the frame gives it those from " + std::to_string(info.firstSample)
-                                  + " on");
+            detail::failArgument("the tile has accumulated %lld samples, the frame gives it those from %d on",
+                                 static_cast<long long>(samples_), info.firstSample);
     }
 
     void add(Fragment&& fragment) { base_.add(std::move(fragment)); }
@@ -116,7 +114,7 @@ public:
                 m2_[first + x] += Moments::growth(samples_ + pass, sums_.rgba(first + x), 1, row.rgba.data() + 4 * x);
             sums_.add(first, row);
         };
-        base_.compositePasses(std::ref(passDone)); // so that nothing is allocated
+        base_.compositePasses(passDone);
         samples_ += info_.passes;
         for (int y = 0; y < out.height(); ++y)
             sums_.write(out, y, static_cast<std::size_t>(y) * width, std::max<std::int64_t>(1, samples_));

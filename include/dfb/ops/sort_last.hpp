@@ -2,6 +2,7 @@
 // the paper), OrderedBlend is told their order, DepthComposite keeps the nearest.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/blend/fragment_compositor.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/tile_op.hpp>
@@ -11,7 +12,6 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <functional>
 #include <limits>
 #include <string>
 #include <tuple>
@@ -139,7 +139,7 @@ public:
     void removeBehind(int generation);
 
     // Called with (y, pass, row).
-    using PassDone = std::function<void(int, int, const CompositeRow&)>;
+    using PassDone = FunctionRef<void(int, int, const CompositeRow&)>;
 
     // Calls passDone for each row and pass, row by row, with the background below.
     void compositePasses(const PassDone& passDone);
@@ -181,6 +181,9 @@ private:
     BlendRule rule_;
     TileInfo info_;
     ChannelMask tracked_ = 0;
+    // All of them, in their order.
+    void sort(std::vector<const Fragment*>& pointers) const;
+
     std::vector<Fragment> fragments_;
     std::int64_t undefinedPixels_ = 0;
 };
@@ -248,14 +251,13 @@ public:
     void add(Fragment&& fragment)
     {
         if (fragment.header().children > 1)
-            throw InvalidArgument("inputs in order form a list: at most 1 child each, not "
-                                  + std::to_string(fragment.header().children));
+            detail::failArgument("inputs in order form a list: at most 1 child each, not %d",
+                                 fragment.header().children);
         const int generation = fragment.header().generation;
         const bool hides = opaqueHides(this->store_.info());
         // Else the tracker says so in the end; here the tile may not wait for that.
         if (hides && std::find(generations_.begin(), generations_.end(), generation) != generations_.end())
-            throw InvalidArgument("inputs in order form a list: there can not be two of generation "
-                                  + std::to_string(generation));
+            detail::failArgument("inputs in order form a list: there can not be two of generation %d", generation);
         generations_.push_back(generation);
         if (generation > opaque_)
             return;
@@ -352,28 +354,36 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
         if (pass == last)
             roundExactly(out, y, sums.write(out, y, 0, info_.passes));
     };
-    compositePasses(std::ref(passDone)); // so that nothing is allocated
+    compositePasses(passDone);
 }
 
-// Brings the fragments into their order, and a compositor for each pass to their first row.
-DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
+DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointers) const
 {
-    auto& scratch = this->scratch<Scratch>();
-    std::sort(fragments_.begin(), fragments_.end(), [this](const Fragment& a, const Fragment& b) {
-        const TileHeader &x = a.header(), &y = b.header();
+    pointers.clear();
+    for (const Fragment& fragment : fragments_)
+        pointers.push_back(&fragment);
+    std::sort(pointers.begin(), pointers.end(), [this](const Fragment* a, const Fragment* b) {
+        const TileHeader &x = a->header(), &y = b->header();
         if (rule_ == BlendRule::InOrder)
             return std::tie(x.pass, x.generation) < std::tie(y.pass, y.generation);
         return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
     });
+}
+
+// Brings a compositor for each pass to the first row of its fragments.
+DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
+{
+    auto& scratch = this->scratch<Scratch>();
+    sort(scratch.pointers);
     const std::size_t passes = static_cast<std::size_t>(info_.passes);
     while (scratch.compositors.size() < passes)
-        scratch.compositors.emplace_back(rule_);
-    std::size_t next = 0;
+        scratch.compositors.push_back(FragmentCompositor(rule_));
+    auto next = scratch.pointers.begin();
     for (std::size_t pass = 0; pass < passes; ++pass) {
-        scratch.pointers.clear();
-        for (; next < fragments_.size() && static_cast<std::size_t>(fragments_[next].header().pass) == pass; ++next)
-            scratch.pointers.push_back(&fragments_[next]);
-        scratch.compositors[pass].start(scratch.pointers.begin(), scratch.pointers.end());
+        const auto first = next;
+        while (next != scratch.pointers.end() && static_cast<std::size_t>((*next)->header().pass) == pass)
+            ++next;
+        scratch.compositors[pass].start(first, next);
     }
     scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
     scratch.row.wantsGaps = scratch.row.wantsSingles = true;
@@ -434,16 +444,17 @@ DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y
     const int width = info_.region.width();
     auto& [mean, row, pointers, compositors] = scratch<Exact>();
     if (compositors.empty())
-        compositors.emplace_back(rule_);
+        compositors.push_back(FragmentCompositor(rule_));
     FragmentCompositor& compositor = compositors.front();
     mean.assign(4 * static_cast<std::size_t>(width), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);
+    sort(pointers);
+    auto next = pointers.begin();
     for (int pass = 0; pass < info_.passes; ++pass) {
-        pointers.clear();
-        for (const Fragment& fragment : fragments_)
-            if (fragment.header().pass == pass)
-                pointers.push_back(&fragment);
-        compositor.start(pointers.begin(), pointers.end());
+        const auto first = next;
+        while (next != pointers.end() && (*next)->header().pass == pass)
+            ++next;
+        compositor.start(first, next);
         compositor.skipRows(y);
         row.resize(width, 0, true);
         compositor.nextRow(row);

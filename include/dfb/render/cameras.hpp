@@ -40,7 +40,7 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 {
     const Point3 v = pointOf(view), side = cross(v, pointOf(up));
     if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
-        throw InvalidArgument("the camera's view or up vector is degenerate");
+        detail::failArgument("the camera's view or up vector is degenerate");
     Pose pose;
     pose.eye = pointOf(eye);
     pose.forward = normalized(v);
@@ -52,7 +52,7 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 inline double tanHalf(float fovY)
 {
     if (!(fovY > 0 && fovY < 180))
-        throw InvalidArgument("the camera's angle of view must be in (0, 180) degrees");
+        detail::failArgument("the camera's angle of view must be in (0, 180) degrees");
     return std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
 }
 
@@ -69,7 +69,7 @@ public:
           radius_(static_cast<double>(apertureRadius)), focus_(static_cast<double>(focusDistance))
     {
         if (!(radius_ >= 0) || !(focus_ > 0))
-            throw InvalidArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
+            detail::failArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
     }
 
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
@@ -107,7 +107,7 @@ public:
           separation_(static_cast<double>(separation)), convergence_(static_cast<double>(convergence))
     {
         if (!(separation_ >= 0) || !(convergence_ > 0))
-            throw InvalidArgument("eyes are 0 or more apart and converge at a distance above 0");
+            detail::failArgument("eyes are 0 or more apart and converge at a distance above 0");
     }
 
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
@@ -150,7 +150,7 @@ public:
         : pose_(detail::poseOf(eye, view, up)), border_(0.5 * static_cast<double>(angle) * detail::pi / 180)
     {
         if (!(angle > 0 && angle <= 360))
-            throw InvalidArgument("a dome covers an angle in (0, 360] degrees");
+            detail::failArgument("a dome covers an angle in (0, 360] degrees");
     }
 
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
@@ -209,7 +209,7 @@ public:
           axis_(detail::pointOf(axis)), angle_(static_cast<double>(degrees) * detail::pi / 180)
     {
         if (!(detail::length(axis_) > 0) || !(std::fabs(angle_) <= 2 * detail::pi))
-            throw InvalidArgument("the camera turns around an axis, by a full turn at most");
+            detail::failArgument("the camera turns around an axis, by a full turn at most");
         axis_ = detail::normalized(axis_);
     }
 

@@ -174,7 +174,7 @@ public:
         : fb_(fb), world_(world), maxSegments_(maxSegments)
     {
         if (maxSegments < 1 || maxSegments > 65535)
-            throw InvalidArgument("a pixel has 1 to 65535 segments");
+            detail::failArgument("a pixel has 1 to 65535 segments");
     }
 
     // As DataParallelLoop::start(), but `renderBrick(brick, deep)` adds the segments of the pixels of

@@ -70,7 +70,7 @@ public:
         }
         if (alike)
             return;
-        firstJob_.resize(itemCount + 1, 0);
+        firstJob_.resize(itemCount + 1);
         for (std::size_t i = 0; i < itemCount; ++i)
             firstJob_[i + 1] = firstJob_[i] + passesOf(i);
     }

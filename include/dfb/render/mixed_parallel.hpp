@@ -205,9 +205,9 @@ struct MixedWork {
             for (int pass = 0; pass < passes[p]; ++pass) {
                 const int rank = owner(brick, pairs[p].tile, pass);
                 if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
-                    throw InvalidArgument("the tile-brick owner gives tile " + std::to_string(pairs[p].tile)
-                                          + " of brick " + std::to_string(brick.brick.id) + " to rank "
-                                          + std::to_string(rank) + ", which does not hold it");
+                    detail::failArgument(
+                        "the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
+                        pairs[p].tile, brick.brick.id, rank);
                 if (rank == world.rank())
                     jobs.push_back({p, pass});
             }
@@ -231,7 +231,7 @@ struct OrderedWork : MixedWork {
             if (const auto brick = static_cast<std::size_t>(order[i]); brick < place.size())
                 place[brick] = static_cast<int>(i);
         if (order.size() != place.size() || std::count(place.begin(), place.end(), -1) > 0)
-            throw InvalidArgument("the order does not have each brick once");
+            detail::failArgument("the order does not have each brick once");
         std::sort(pairs.begin(), pairs.end(), [&](const BrickInTile& a, const BrickInTile& b) {
             return a.tile != b.tile
                        ? a.tile < b.tile

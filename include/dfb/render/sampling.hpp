@@ -39,8 +39,8 @@ public:
     {
         if (settings.firstSamples < 2 || settings.maxSamples < settings.firstSamples || settings.frameSamples < 1
             || !(settings.maxError >= 0))
-            throw InvalidArgument("sampling goes from 2 first samples or more up to as many at least, "
-                                  "in frames of 1 or more");
+            detail::failArgument(
+                "sampling goes from 2 first samples or more up to as many at least, in frames of 1 or more");
         reset();
     }
 

@@ -37,14 +37,12 @@ public:
         std::vector<std::pair<Record, int>> held;
         for (std::size_t rank = 0; rank < all.size(); ++rank) {
             if (all[rank].size() % sizeof(Record) != 0)
-                throw InvalidArgument("the bricks of rank " + std::to_string(rank) + " have "
-                                      + std::to_string(all[rank].size()) + " bytes");
+                detail::failArgument("the bricks of rank %zu have %zu bytes", rank, all[rank].size());
             for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Record)) {
                 Record record;
                 std::memcpy(&record, all[rank].data() + at, sizeof record);
                 if (!detail::isBox(record.bounds))
-                    throw InvalidArgument("the bounds of brick " + std::to_string(record.id) + " of rank "
-                                          + std::to_string(rank) + " are not a box");
+                    detail::failArgument("the bounds of brick %u of rank %zu are not a box", record.id, rank);
                 held.emplace_back(record, static_cast<int>(rank));
             }
         }
@@ -59,12 +57,10 @@ public:
                 bricks_.push_back(std::move(shared));
             }
             if (std::memcmp(&bricks_.back().brick.bounds, &record.bounds, sizeof record.bounds) != 0)
-                throw InvalidArgument("brick " + std::to_string(record.id) + " has other bounds on rank "
-                                      + std::to_string(rank) + " than on rank "
-                                      + std::to_string(bricks_.back().ranks.front()));
+                detail::failArgument("brick %u has other bounds on rank %d than on rank %d", record.id, rank,
+                                     bricks_.back().ranks.front());
             if (!bricks_.back().ranks.empty() && bricks_.back().ranks.back() == rank)
-                throw InvalidArgument("brick " + std::to_string(record.id) + " comes twice from rank "
-                                      + std::to_string(rank));
+                detail::failArgument("brick %u comes twice from rank %d", record.id, rank);
             bricks_.back().ranks.push_back(rank);
         }
     }
@@ -133,7 +129,7 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
         alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
         alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
         if (!apart)
-            throw InvalidArgument("two bricks overlap: there is no order in which they could be blended");
+            detail::failArgument("two bricks overlap: there is no order in which they could be blended");
         return first == second ? Before::Either : first ? Before::First : Before::Second;
     };
     std::vector<std::vector<int>> behind(n);
@@ -156,7 +152,7 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
             if (--inFront[static_cast<std::size_t>(next)] == 0)
                 order.push_back(next);
     if (order.size() != n)
-        throw InvalidArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
+        detail::failArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
     return order;
 }
 

@@ -233,7 +233,7 @@ private:
     {
         const Vec3 right = cross(along.view, up);
         if (!(dot(along.view, along.view) > 0.0f) || !(dot(right, right) > 0.0f) || !(fovY > 0.0f && fovY < 180.0f))
-            throw InvalidArgument("the camera's view, up vector or angle is degenerate");
+            detail::failArgument("the camera's view, up vector or angle is degenerate");
         forward_ = normalize(along.view);
         right_ = normalize(right);
         up_ = cross(right_, forward_);

@@ -92,13 +92,13 @@ private:
     {
         const Box3& b = brick.bounds;
         if (!detail::isBox(b))
-            throw InvalidArgument("the bounds of brick " + std::to_string(brick.id) + " are not a box");
+            detail::failArgument("the bounds of brick %u are not a box", brick.id);
         const Box3& d = brick.data();
         if (!(d.lower.x <= b.lower.x && d.lower.y <= b.lower.y && d.lower.z <= b.lower.z && d.upper.x >= b.upper.x
               && d.upper.y >= b.upper.y && d.upper.z >= b.upper.z))
-            throw InvalidArgument("the data of brick " + std::to_string(brick.id) + " do not fill its bounds");
+            detail::failArgument("the data of brick %u do not fill its bounds", brick.id);
         if (!ids_.insert(brick.id).second)
-            throw InvalidArgument("brick " + std::to_string(brick.id) + " was added twice");
+            detail::failArgument("brick %u was added twice", brick.id);
     }
 
     std::vector<Brick> bricks_, ghosts_;
