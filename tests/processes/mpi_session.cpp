@@ -5,7 +5,8 @@
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
 //   mpirun -n 3 mpi_session give_up      rank 1 can not go on, and the others neither: the same
-// Returns 0 if all is well.
+// With a file as second argument, the last two append to it what each rank caught: a launcher may drop what a rank
+// prints just before its job ends. Returns 0 if all is well.
 #include <dfb/dfb.hpp>
 
 #include <chrono>
@@ -102,6 +103,17 @@ void wholeLife(int& argc, char**& argv, int level)
     check(has(after, "transport failure") && has(after, "finalised"), "a session after the end", after);
 }
 
+void sayCaught(const std::exception& e, const char* file)
+{
+    const std::string line = std::string("caught: ") + e.what() + '\n';
+    std::fputs(line.c_str(), stdout);
+    std::fflush(stdout);
+    if (std::FILE* out = file ? std::fopen(file, "a") : nullptr) {
+        std::fputs(line.c_str(), out);
+        std::fclose(out);
+    }
+}
+
 void emptyFrame(dfb::DistributedFrameBuffer<dfb::AlphaBlend>& fb)
 {
     dfb::FrameParams params;
@@ -133,7 +145,7 @@ void leaveWithException(int& argc, char**& argv)
 }
 
 // Nobody's exception leaves the life of the session.
-void giveUp(int& argc, char**& argv)
+void giveUp(int& argc, char**& argv, const char* file)
 {
     dfb::MpiSession mpi(argc, argv);
     try {
@@ -145,8 +157,7 @@ void giveUp(int& argc, char**& argv)
         std::fprintf(stderr, "mpi_session: the job goes on without rank 1\n");
     } catch (const std::exception& e) {
         mpi.giveUp();
-        std::printf("mpi_session: caught: %s\n", e.what());
-        std::fflush(stdout);
+        sayCaught(e, file);
     }
 }
 
@@ -160,6 +171,7 @@ extern "C" int MPI_Init_thread(int* argc, char*** argv, int required, int* provi
 int main(int argc, char** argv)
 {
     const std::string what = argc > 1 ? argv[1] : "multiple";
+    const char* file = argc > 2 ? argv[2] : nullptr;
     if (what == "multiple" || what == "funneled") {
         wholeLife(argc, argv, what == "multiple" ? MPI_THREAD_MULTIPLE : MPI_THREAD_FUNNELED);
     } else if (what == "highest") {
@@ -181,11 +193,10 @@ int main(int argc, char** argv)
             (what == "exception" ? leaveWithException : leaveFrameBuffer)(argc, argv);
         } catch (const std::exception& e) {
             check(!isFinalized(), "MPI is finalised");
-            std::printf("mpi_session: caught: %s\n", e.what());
-            std::fflush(stdout);
+            sayCaught(e, file);
         }
     } else if (what == "give_up") {
-        giveUp(argc, argv);
+        giveUp(argc, argv, file);
         check(!isFinalized(), "MPI is finalised");
     } else {
         check(false, "no such run", what);

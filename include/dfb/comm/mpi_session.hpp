@@ -78,8 +78,8 @@ private:
         }
     }
 
-    // Where one rank's exception is another's, the ranks come here together: waits a moment, so that all can have said
-    // why, the first of all.
+    // Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
+    // second at most. Then waits for the launcher: it may drop what a rank has written just before MPI_Abort.
     static void abortJob()
     {
         int finalized = 0, done = 0;
@@ -93,6 +93,7 @@ private:
              MPI_Test(&request, &done, MPI_STATUS_IGNORE) == MPI_SUCCESS && !done
              && std::chrono::steady_clock::now() < limit;)
             patience.nap();
+        std::this_thread::sleep_for(std::chrono::milliseconds(50));
         MPI_Abort(MPI_COMM_WORLD, 1);
     }
 
