@@ -98,8 +98,8 @@ int main(int argc, char** argv)
     dfb::MpiSession mpi(argc, argv);
     using FrameBuffer = dfb::DistributedFrameBuffer<FinestLevel>;
     FrameBuffer fb(mpi.communicator(), {width, height, dfb::OutputFormat::SRGBA8});
-    dfb::FrameParams params;
-    params.timeoutMs = 10000; // a patch that was announced and does not come is an error then
+    dfb::FrameConfig params;
+    params.timeout = std::chrono::milliseconds(10000); // a patch that was announced and does not come is an error then
     auto frame = fb.begin(params);
     const auto tile = std::make_unique<FrameBuffer::Tile>();
     frame.guard([&] { // an exception comes out of end(), on all ranks

@@ -345,7 +345,7 @@ std::string run(MPI_Comm comm, const Options& options)
         const Vec3 middle = 0.5f * float(n - 1) * Vec3{1, 1, 1}, outward = dfb::normalize(Vec3{c, 0.5f, s});
         const dfb::PerspectiveCamera camera(middle + 2.4f * float(n) * outward, middle, {0, 1, 0}, 32);
         const Vec3 light = dfb::normalize(outward + Vec3{0.6f * s, 0.7f, -0.6f * c}); // from above, to the left
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         params.background = {0.004f, 0.006f, 0.012f, 1};
         const auto renderBrick = [&](const dfb::Brick& brick, FrameBuffer::Tile& tile) {
             renderSlab(simulation, camera, light, brick.bounds, tile);

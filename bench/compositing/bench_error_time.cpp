@@ -118,9 +118,9 @@ public:
             }
         };
         dfb::FrameBufferConfig c;
-        c.width = width;
-        c.height = height;
-        c.format = dfb::OutputFormat::RGBA32F;
+        c.image.width = width;
+        c.image.height = height;
+        c.image.format = dfb::OutputFormat::RGBA32F;
         c.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<Op> fb(comm_, c);
         dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
@@ -146,7 +146,7 @@ public:
                     bytes->second += report.messagesSent;
                     return report;
                 };
-                dfb::FrameParams params;
+                dfb::FrameConfig params;
                 params.accumulationId = ++accumulation;
                 if (threshold > 0) {
                     dfb::AdaptiveSampler sampler(fb.layout(), {threshold, 8, samples, 64});

@@ -117,7 +117,7 @@ template <class TileOp>
 inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
 struct DfbSettings {
-    dfb::WirePrecision wire{};
+    dfb::Precision wire{};
     std::shared_ptr<const dfb::Codec> codec{};
     float minTransmittance = 0;
     bool isDefault = false;
@@ -128,7 +128,7 @@ struct DfbSettings {
 // Without `hasThreads` what each rank does is done by one thread, as with the other systems.
 inline std::shared_ptr<Connection> makeConnection(MPI_Comm comm, bool hasThreads)
 {
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.progress = hasThreads ? dfb::Progress::Thread : dfb::Progress::Caller;
     return dfb::connect<dfb::MpiTransport>(comm, options);
 }
@@ -156,12 +156,12 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
     };
     for (const bool toBytes : {false, true}) {
         dfb::FrameBufferConfig c;
-        c.width = inputs.image.width;
-        c.height = inputs.image.height;
-        c.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
-        c.wire = settings.wire;
-        c.codec = settings.codec;
-        c.compression = settings.compression;
+        c.image.width = inputs.image.width;
+        c.image.height = inputs.image.height;
+        c.image.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
+        c.precision = settings.wire;
+        c.messages.codec = settings.codec;
+        c.messages.compression = settings.compression;
         c.minTransmittance = settings.minTransmittance;
         System s;
         s.name = "dfb";
@@ -195,7 +195,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
                                 places.push_back(static_cast<int>(i));
                     r->report = r->orderedLoop.render(PixelCamera(), places, renderBrick);
                 } else {
-                    dfb::FrameParams params;
+                    dfb::FrameConfig params;
                     params.maxLayers = r->fb.size();
                     r->report = r->loop.render(PixelCamera(), renderBrick, params);
                 }

@@ -41,14 +41,14 @@ struct Options {
     dfb::FrameBufferConfig config(int width, int height) const
     {
         dfb::FrameBufferConfig c;
-        c.width = width;
-        c.height = height;
+        c.image.width = width;
+        c.image.height = height;
         c.executor = std::make_shared<dfb::ThreadExecutor>(threads);
 #if defined(DFB_HAS_SNAPPY)
         if (compress != "never")
-            c.codec = std::make_shared<dfb::SnappyCodec>();
+            c.messages.codec = std::make_shared<dfb::SnappyCodec>();
 #endif
-        c.compression = compress == "auto" ? dfb::CompressionMode::Auto : dfb::CompressionMode::Always;
+        c.messages.compression = compress == "auto" ? dfb::CompressionMode::Auto : dfb::CompressionMode::Always;
         return c;
     }
 };

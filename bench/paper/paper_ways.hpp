@@ -27,7 +27,7 @@ public:
     // The communicator remains the caller's; `config` has all but the format.
     PaperStage(MPI_Comm comm, PaperScene scene, dfb::FrameBufferConfig config, int views)
         : scene_(std::move(scene)), connection_(dfb::connect<dfb::MpiTransport>(comm)), config_(std::move(config)),
-          cameras_(orbitOf(views, unit, 1.5f)), width_(config_.width), height_(config_.height), grid_(sizeOf(comm)),
+          cameras_(orbitOf(views, unit, 1.5f)), width_(config_.image.width), height_(config_.image.height), grid_(sizeOf(comm)),
           ranks_(sizeOf(comm))
     {
         MPI_Comm_rank(comm, &rank_);
@@ -153,7 +153,7 @@ private:
     PaperWay wayOf(const std::string& system, const std::string& name, dfb::OutputFormat format, const LoopOf& loopOf)
     {
         dfb::FrameBufferConfig config = config_;
-        config.format = format;
+        config.image.format = format;
         const auto fb = std::make_shared<FrameBuffer>(connection_, config);
         const auto report = std::make_shared<dfb::FrameReport>();
         PaperWay way;

@@ -86,7 +86,7 @@ private:
 class GathervImage {
 public:
     GathervImage(const FrameBuffer& fb, MPI_Comm comm)
-        : comm_(comm), layout_(fb.layout()), format_(fb.config().format), own_(fb.ownedTiles()), tilesOf_(fb.size()),
+        : comm_(comm), layout_(fb.layout()), format_(fb.config().image.format), own_(fb.ownedTiles()), tilesOf_(fb.size()),
           display_(fb.isDisplayRank())
     {
         int offset = 0;
@@ -94,7 +94,7 @@ public:
             tilesOf_[static_cast<std::size_t>(fb.tileOwner(tile))].push_back(tile);
         for (std::size_t rank = 0; rank < tilesOf_.size(); ++rank) {
             std::size_t bytes = 0;
-            if (static_cast<int>(rank) != fb.config().displayRank)
+            if (static_cast<int>(rank) != fb.config().image.displayRank)
                 for (const int tile : tilesOf_[rank])
                     bytes += bytesOf(tile);
             counts_.push_back(static_cast<int>(bytes));
@@ -216,8 +216,8 @@ public:
         const auto connection = dfb::connect<dfb::MpiTransport>(comm_);
         const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer::Config config;
-        config.width = config.height = c.side;
-        config.format = c.format;
+        config.image.width = config.image.height = c.side;
+        config.image.format = c.format;
         config.executor = executor;
         FrameBuffer fb(connection, config);
         dfb::ImageParallelLoop loop(fb);

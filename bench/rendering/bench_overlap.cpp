@@ -38,8 +38,8 @@ public:
     void run(int width, int height)
     {
         dfb::FrameBufferConfig config;
-        config.width = width;
-        config.height = height;
+        config.image.width = width;
+        config.image.height = height;
         config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
         bench::MarchedBricks bricks(comm_, config, o_.views, false);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};

@@ -281,8 +281,8 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         const auto connection =
             dfb::connect<bench::CountedTransport>(bench::CountedTransport::Communicator{communicator, counters});
         dfb::FrameBufferConfig config;
-        config.width = width;
-        config.height = height;
+        config.image.width = width;
+        config.image.height = height;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(connection, config);
         dfb::World world;
@@ -528,7 +528,7 @@ private:
                 inputs.push_back(inputsOf(image, layout));
             }
             const std::vector<Expected> expected =
-                expectedOf(inputs, layout, dfb::FrameBufferConfig().messagePoolBytes);
+                expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
             const Measured m = measure(images, width(), height(), std::max(2, o_.frames));
             MessageCount all, formula, credits;
             std::int64_t mostCredits = 0;
@@ -616,7 +616,7 @@ private:
                 viewports.push_back(image.viewport);
             }
             const std::vector<Expected> expected =
-                expectedOf(inputs, layout, dfb::FrameBufferConfig().messagePoolBytes);
+                expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
             for (std::size_t n = 0; n < networks.size(); ++n) {
                 std::vector<double> ms{dfbMs(networks[n], expected, o_.costs)};
                 for (const int most : {2, 4, 8})

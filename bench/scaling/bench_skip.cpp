@@ -153,9 +153,9 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         const int rank = communicator.rank();
         dfb::FrameBufferConfig config;
-        config.width = s.width;
-        config.height = s.height;
-        config.aux = s.aux;
+        config.image.width = s.width;
+        config.image.height = s.height;
+        config.image.aux = s.aux;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
@@ -184,7 +184,7 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
             }
             counters->meet();
             const double start = bench::now();
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.maxLayers = ranks;
             if constexpr (TileOp::rule == dfb::BlendRule::InOrder)
                 orderedLoop->render(PixelCamera(), order, find, params);
@@ -276,8 +276,8 @@ Sampling sample(int width, int height)
     Sampling result;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = width;
-        config.height = height;
+        config.image.width = width;
+        config.image.height = height;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(fb.rank(), {0, 0, width, height});
@@ -303,7 +303,7 @@ Sampling sample(int width, int height)
                 renders = convergedRenders = 0;
             }
             counters->meet();
-            dfb::FrameParams params = sampler.next();
+            dfb::FrameConfig params = sampler.next();
             plan = params.samples;
             sampler.update(loop.render(PixelCamera(), render, params));
             counters->meet();

@@ -51,7 +51,7 @@ struct Options {
     int threads = 0;  // per rank; 0: its part of the processors
     Compression compression = Compression::None;
     bool sharedMemory = true;
-    int peerTimeout = dfb::defaultPeerTimeoutMs / 1000; // seconds; 0: off
+    int peerTimeout = static_cast<int>(dfb::defaultPeerTimeout.count() / 1000); // seconds; 0: off
     OwnerMap ownerMap = OwnerMap::Lattice;
 
     int width = 1024, height = 1024;

@@ -62,25 +62,26 @@ inline bool wantsFloat(const Options& o)
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
 {
     dfb::FrameBufferConfig config;
-    config.width = o.width;
-    config.height = o.height;
-    config.format = wantsFloat(o)                                                         ? dfb::OutputFormat::RGBA32F
-                    : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify ? dfb::OutputFormat::SRGBA8
-                                                                                          : dfb::OutputFormat::None;
-    config.dither = o.dither;
-    config.depth = !o.depth.empty();
-    config.wire = o.errorBudget > 0 ? dfb::WirePrecision(dfb::ErrorBudget{o.errorBudget}) : dfb::WirePrecision(o.wire);
+    config.image.width = o.width;
+    config.image.height = o.height;
+    config.image.format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F
+                          : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify
+                              ? dfb::OutputFormat::SRGBA8
+                              : dfb::OutputFormat::None;
+    config.image.dither = o.dither;
+    config.image.depth = !o.depth.empty();
+    config.precision = o.errorBudget > 0 ? dfb::Precision(dfb::ErrorBudget{o.errorBudget}) : dfb::Precision(o.wire);
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
-    config.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
-    config.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
-                      : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
-                                                     : dfb::latticeOwner;
+    config.image.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
+    config.image.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
+                            : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
+                                                           : dfb::latticeOwner;
     if (o.compression == Compression::Auto)
-        config.compression = dfb::CompressionMode::Auto;
+        config.messages.compression = dfb::CompressionMode::Auto;
     if (o.compression != Compression::None) {
 #if defined(DFB_HAS_SNAPPY)
-        config.codec = std::make_shared<dfb::SnappyCodec>();
+        config.messages.codec = std::make_shared<dfb::SnappyCodec>();
 #else
         throw std::runtime_error("this dfb_render was built without Snappy");
 #endif
@@ -93,11 +94,11 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     return config;
 }
 
-inline dfb::ConnectionOptions connectionOptionsOf(const Options& o)
+inline dfb::NetworkConfig networkOf(const Options& o)
 {
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.sharedMemory = o.sharedMemory;
-    options.peerTimeoutMs = 1000 * o.peerTimeout;
+    options.peerTimeout = std::chrono::seconds(o.peerTimeout);
     return options;
 }
 
@@ -178,7 +179,7 @@ public:
                 pixelOp.wall = wall_.get();
             else
                 pixelOp.second.wall = wall_.get();
-            config.format = dfb::OutputFormat::None;
+            config.image.format = dfb::OutputFormat::None;
         }
         try {
             fb_ = std::make_unique<FrameBuffer>(connection_, config, pixelOp);
@@ -359,7 +360,7 @@ private:
             endFirst(open);
     }
 
-    typename FrameBuffer::Frame start(int frame, const dfb::World& world, const dfb::FrameParams& params,
+    typename FrameBuffer::Frame start(int frame, const dfb::World& world, const dfb::FrameConfig& params,
                                       ProgressLine& progress)
     {
         clock_.enter(Phase::Render);
@@ -391,7 +392,7 @@ private:
     }
 
     // Renders what this rank has to.
-    typename FrameBuffer::Frame startFrame(int frame, const dfb::World& world, const dfb::FrameParams& params,
+    typename FrameBuffer::Frame startFrame(int frame, const dfb::World& world, const dfb::FrameConfig& params,
                                            ProgressLine& progress)
     {
         const FrameCamera camera = frameCamera(scene_->info, settings_, frame);
@@ -634,7 +635,7 @@ private:
     std::unique_ptr<FrameBuffer> fb_;
     std::unique_ptr<RankScene> scene_;
     RenderSettings settings_;
-    dfb::FrameParams params_;
+    dfb::FrameConfig params_;
     std::optional<dfb::SharedWorld> shared_;
     dfb::MeasuredCostBricks byCost_;
     dfb::RoundRobinBricks inTurn_;
@@ -654,30 +655,12 @@ private:
     std::vector<dfb::FrameReport> reports_;
 };
 
-// Picks the operations that the options ask for.
-inline int runOver(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
+// Runs with these operations.
+template <class TileOp, class PixelOp>
+int runWith(TileOp, PixelOp, std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o,
+            int threads)
 {
-    const auto run = [&](auto tileOp, auto pixelOp) {
-        return RankRun<decltype(tileOp), decltype(pixelOp)>(std::move(connection), transport, o, threads).run();
-    };
-    if (o.deep > 0 || o.interleave > 1)
-        return run(dfb::DeepBlend(), dfb::NoPixelOp());
-    if (o.verify)
-        return o.mode == Mode::Image ? run(VerifiedSingle(), dfb::NoPixelOp()) : run(VerifiedBlend(), dfb::NoPixelOp());
-    if (o.blend == Blending::Order)
-        return run(Ordered(), dfb::NoPixelOp());
-    if (o.blend == Blending::Nearest)
-        return run(Nearest(), dfb::NoPixelOp());
-    const bool isImage = o.mode == Mode::Image;
-    if (o.adaptive > 0)
-        return isImage ? run(AdaptiveSingle(), dfb::NoPixelOp()) : run(AdaptiveBlend(), dfb::NoPixelOp());
-    if (o.wallColumns > 0 && o.exposure > 0)
-        return isImage ? run(Single(), ToneMapToWall()) : run(Blend(), ToneMapToWall());
-    if (o.wallColumns > 0)
-        return isImage ? run(Single(), dfb::ToWall()) : run(Blend(), dfb::ToWall());
-    if (o.exposure > 0)
-        return isImage ? run(Single(), dfb::ToneMap()) : run(Blend(), dfb::ToneMap());
-    return isImage ? run(Single(), dfb::NoPixelOp()) : run(Blend(), dfb::NoPixelOp());
+    return RankRun<TileOp, PixelOp>(std::move(connection), transport, o, threads).run();
 }
 
 } // namespace example

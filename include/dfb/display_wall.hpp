@@ -58,19 +58,19 @@ public:
     FrameBufferConfig frameBufferConfig() const
     {
         FrameBufferConfig config;
-        config.width = layout_.width();
-        config.height = layout_.height();
-        config.format = OutputFormat::None;
+        config.image.width = layout_.width();
+        config.image.height = layout_.height();
+        config.image.format = OutputFormat::None;
         return config;
     }
 
     // Collective, after the frame of that number has ended on all ranks: returns when all displays have it, which is
     // the moment to show it on all of them. Throws Error, the same on all ranks, if some display has not got all of it
-    // within `timeoutMs` (TimedOut; 0: no limit), if no rank has sent all of it, as of a frame that ended partial or
+    // within `timeout` (TimedOut; 0: no limit), if no rank has sent all of it, as of a frame that ended partial or
     // failed (MissingInput), or if a part of it, or of a later frame, was not to be believed (MalformedMessage). What
     // the displays show stays. Whatever the limit, waits for all ranks to call it, as
     // allReduce() does. Throws TransportError.
-    void finish(std::int64_t frame, int timeoutMs = 0);
+    void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // What this rank's display shows: the last frame that was finished well, which stays until the next one is. Empty
     // before the first. Throws InvalidArgument if another rank drives it. By the thread that calls finish(), as the
@@ -110,7 +110,7 @@ DFB_COMPILED_ONCE DisplayWall::DisplayWall(std::shared_ptr<Connection> connectio
 }
 DFB_COMPILED_ONCE DisplayWall::~DisplayWall() = default;
 
-DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, int timeoutMs) { wall_->finish(frame, timeoutMs); }
+DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::milliseconds timeout) { wall_->finish(frame, timeout); }
 DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
 DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }

@@ -13,6 +13,7 @@
 #include <cstdint>
 #include <exception>
 #include <memory>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -92,7 +93,7 @@ public:
         // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
 
-        // Only with FrameParams::declared: each rank says once in each frame which inputs of generation 1 it will send,
+        // Only with FrameConfig::declared: each rank says once in each frame which inputs of generation 1 it will send,
         // in each pass; children that these announce need no declaration; it may say so after it sent some. A rank
         // without any calls it with none. An input that turns out empty must be sent all the same; it costs a header.
         // A rank that declares what it declared last sends nothing for it, but for its part of a reduction; otherwise
@@ -101,7 +102,7 @@ public:
         // frame that was not begun so; without it, the frame fails in end().
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-        // As FrameParams::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
+        // As FrameConfig::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
         // How many samples a tile gets in this frame, and which.
@@ -134,7 +135,7 @@ public:
         {
             return guardAbout(body, nullptr);
         }
-        // The same for body() that renders `tile`: the error names it, and with FrameParams::allowPartial the frame
+        // The same for body() that renders `tile`: the error names it, and with FrameConfig::allowPartial the frame
         // goes on without it alone. Its number is looked at when there is an exception.
         template <class Body>
         bool guard(const Body& body, const TileHeader& tile)
@@ -142,7 +143,7 @@ public:
             return guardAbout(body, &tile);
         }
 
-        // Makes the frame fail on all ranks, with the text of this exception; with FrameParams::allowPartial it goes on
+        // Makes the frame fail on all ranks, with the text of this exception; with FrameConfig::allowPartial it goes on
         // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
         // will name it. From any thread.
         void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(reason, tileIndex); }
@@ -168,6 +169,20 @@ public:
             return report;
         }
 
+        // Whether end() would return without waiting for other ranks: the frame is complete everywhere, or has failed.
+        // For programs that have something else to do meanwhile, such as a window: call it again and again, then end().
+        // Waits for nobody. The first call begins the end of the frame on this rank, as end() does: this rank's last
+        // setTile() must have returned. Moves messages where no thread does, and keeps FrameConfig::timeout. A frame
+        // that timed out or is partial may still take a moment in end(). Throws InvalidArgument as end() does.
+        bool isDone()
+        {
+            engine_->requireProgress();
+            return engine_->isDone();
+        }
+
+        // end() if isDone(), otherwise nothing. Throws what end() throws.
+        std::optional<FrameReport> tryEnd() { return isDone() ? std::optional<FrameReport>(end()) : std::nullopt; }
+
     private:
         template <class Body>
         bool guardAbout(const Body& body, const TileHeader* tile)
@@ -192,35 +207,32 @@ public:
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
     // TransportError if the transport can not be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
-        : DistributedFrameBuffer(communicator, std::move(config), ConnectionOptions(), std::move(pixelOp))
+        : DistributedFrameBuffer(communicator, std::move(config), NetworkConfig(), std::move(pixelOp))
     {
     }
 
-    // The same with a connection made with these options, for this framebuffer alone.
-    DistributedFrameBuffer(const Communicator& communicator, Config config, ConnectionOptions options,
-                           PixelOp pixelOp = {})
-        : DistributedFrameBuffer(connect<Transport>(communicator, std::move(options)), std::move(config),
+    // The same with a network configuration, for the connection of this framebuffer alone.
+    DistributedFrameBuffer(const Communicator& communicator, Config config, NetworkConfig network, PixelOp pixelOp = {})
+        : DistributedFrameBuffer(connect<Transport>(communicator, std::move(network)), std::move(config),
                                  std::move(pixelOp))
     {
     }
 
     // The same over a connection that several framebuffers share; they are made in the same order on all ranks.
     DistributedFrameBuffer(std::shared_ptr<Connection> connection, Config config, PixelOp pixelOp = {})
+        : connection_(std::move(connection))
     {
         if (!config.executor)
-            config.executor = detail::makeThreads(*connection);
+            config.executor = detail::makeThreads(*connection_);
+        for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
+            operations_.push_back(std::make_unique<Operations>(pixelOp));
         try {
-            for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot) {
-                operations_.push_back(std::make_unique<Operations>(pixelOp));
-                engines_.push_back(detail::makeEngine(connection, config, *operations_.back(), slot));
-            }
+            makeEngines(config);
         } catch (const InvalidArgument&) {
             // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
-            engines_.clear();
-            connection.reset();
+            connection_.reset();
             throw;
         }
-        lastEnded_ = engines_.front().get();
     }
 
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
@@ -231,7 +243,7 @@ public:
 
     int rank() const noexcept { return engine().rank(); }
     int size() const noexcept { return engine().size(); }
-    bool isDisplayRank() const noexcept { return rank() == config().displayRank; }
+    bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
     const Config& config() const noexcept { return engine().config(); }
     const TileLayout& layout() const noexcept { return engine().layout(); }
     int tileOwner(int tile) const noexcept { return engine().tileOwner(tile); }
@@ -248,7 +260,7 @@ public:
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
 
     // On the display rank: whether image() has that tile. It has all of a frame that ended well, see
-    // FrameParams::allowPartial.
+    // FrameConfig::allowPartial.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // With Progress::Caller, moves messages, unless on a thread that may not be in MPI; with an executor that has no
@@ -262,7 +274,7 @@ public:
     // and end in the same order on all ranks, and with several in flight also each begin() before or after the same
     // end(): setTile() may wait for room that a rank makes only when it has begun that frame, too. The oldest must end
     // before one too many begins.
-    Frame begin(const FrameParams& params = {}, const TileFrameData& tileData = {},
+    Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
         Engine& engine = *engines_[next_];
@@ -270,6 +282,20 @@ public:
         engine.begin(params);
         next_ = (next_ + 1) % engines_.size();
         return Frame(this, &engine);
+    }
+
+    // Collective, outside frames. Images have this size from now on; image() is empty until the next frame has ended.
+    // Operations begin anew, and frames are numbered from 1 again. Throws InvalidArgument, with nothing changed: on
+    // this rank if a frame is open, on all ranks if the size cannot be or differs.
+    void resize(int width, int height)
+    {
+        for (const auto& engine : engines_)
+            if (engine->isOpen())
+                detail::failArgument("resize() while a frame is open: end() it first");
+        Config config = this->config();
+        config.image.width = width;
+        config.image.height = height;
+        makeEngines(config);
     }
 
     using Reduce = dfb::Reduce;
@@ -292,6 +318,22 @@ private:
     Engine& engine() noexcept { return *engines_.front(); }
     const Engine& engine() const noexcept { return *engines_.front(); }
 
+    void makeEngines(const Config& config)
+    {
+        std::vector<std::unique_ptr<Engine>> engines;
+        try {
+            for (std::size_t slot = 0; slot < operations_.size(); ++slot)
+                engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
+        } catch (...) {
+            engines.clear(); // in order, before the exception passes
+            throw;
+        }
+        engines_ = std::move(engines);
+        next_ = 0;
+        lastEnded_ = engines_.front().get();
+    }
+
+    std::shared_ptr<Connection> connection_;
     // Each pair has one frame at a time; they take turns.
     std::vector<std::unique_ptr<Operations>> operations_;
     std::vector<std::unique_ptr<Engine>> engines_;

@@ -10,6 +10,7 @@
 #include <dfb/wire/wire_format.hpp>
 
 #include <array>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
@@ -18,44 +19,61 @@
 
 namespace dfb {
 
-// Where a codec is used, if there is one.
-enum class CompressionMode : std::uint8_t {
-    Always,
-    Auto // between nodes, in frames in which that has turned out to be faster: a few frames with and without, then the
-         // better, and now and then a few of the other again, the same on all ranks; and then to those ranks for which
-         // messages become smaller by it, as each rank finds out by itself
+// The image that the display rank gets. All ranks must give the same; the constructor checks it.
+struct ImageConfig {
+    int width = 0, height = 0;                 // pixels, 1 to 65536
+    OutputFormat format = OutputFormat::RGBA8; // of the colour
+    bool depth = false;                        // whether the image has depth; a float more per pixel
+    ChannelMask aux = 0;                       // its auxiliary channels, which the tile operation must have
+    bool dither = false;                       // dithers 8-bit colour instead of rounding it: see ditherPixels()
+    int displayRank = 0;                       // the rank that gets the image
+    OwnerMap ownerMap = latticeOwner;          // which rank owns which tile; null: latticeOwner
 };
 
-// What a framebuffer is made with; how its messages travel is said by the ConnectionOptions. Everything but the
-// executor and quietMs must be the same on all ranks, as must the types of its operations, which is checked when it is
-// made.
-struct FrameBufferConfig {
-    int width = 0, height = 0;                 // pixels, 1 to 65536
-    OutputFormat format = OutputFormat::RGBA8; // of the image on the display rank
-    bool depth = false;                        // the image has depth as well
-    ChannelMask aux = 0;                       // and these of imageAuxChannels, which the tile operation must have
-    bool dither = false;                       // colour of 8 bits is dithered, not rounded: see ditherPixels()
-    int displayRank = 0;
-    int framesInFlight = 1;               // the most that may be open at once; memory grows with it
-    OwnerMap ownerMap = latticeOwner;     // null: latticeOwner
-    std::shared_ptr<const Codec> codec{}; // null: messages are not compressed
+// The messages of one framebuffer. All ranks must give the same; the constructor checks it.
+struct MessageConfig {
+    std::shared_ptr<const Codec> codec{}; // compresses messages; null: none are compressed
     CompressionMode compression = CompressionMode::Always;
-    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or all of it; what else they have travels
-    // as it is. Finished tiles travel in `format`.
-    WirePrecision wire{};
-    // Above 0: a pixel whose layers let less than this part of the light through counts as opaque: what is behind it is
-    // left out. That changes it by no more than this times the largest colour.
+    // The most that inputs and finished tiles take up in a rank's inbox and on the way to it, and the most that a rank
+    // has under way to others before setTile() waits. Raised to 4 times the largest possible message.
+    std::size_t poolBytes = std::size_t{64} << 20;
+};
+
+// What a framebuffer is made with. How its messages travel is the NetworkConfig of its connection.
+struct FrameBufferConfig {
+    FrameBufferConfig() = default;
+    FrameBufferConfig(int width, int height, OutputFormat format = OutputFormat::RGBA8, bool depth = false)
+    {
+        image.width = width;
+        image.height = height;
+        image.format = format;
+        image.depth = depth;
+    }
+
+    ImageConfig image;
+    MessageConfig messages;
+    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or a Precision. The default is exact.
+    // Other channels always travel exactly, and finished tiles in image.format. The same on all ranks.
+    Precision precision{};
+    // For AlphaBlend, OrderedBlend and DeepBlend. Above 0: a pixel whose layers let less than this part of the light
+    // through counts as opaque, and layers behind are left out. The pixel changes by no more than this times the
+    // largest colour. 0 (exact) to below 1; the same on all ranks.
     float minTransmittance = 0;
-    // The most that inputs and finished tiles may take up in a rank's inbox and on the way to it, and the most that a
-    // rank may have under way to others before setTile() waits. Raised to 4 times the largest possible message.
-    std::size_t messagePoolBytes = std::size_t{64} << 20;
-    // Null: a ThreadExecutor with as many threads as this rank has processors for itself, see
-    // Connection::threadShare(). A CallerExecutor makes no threads.
+    // How many frames may be open at once, 1 or more; the same on all ranks. Memory grows with it. Operations that keep
+    // state allow one.
+    int framesInFlight = 1;
+    // Runs rendering and compositing on this rank. Null: a ThreadExecutor with Connection::threadShare() threads. A
+    // CallerExecutor makes no threads. Ranks may differ.
     std::shared_ptr<Executor> executor{};
-    // So long a rank waits in end() until it looks whether anything is still under way on any rank; then it does so
-    // more and more seldom. A frame that nothing can complete any more is found by that: see ErrorKind::MissingInput. 1
-    // or more.
-    int quietMs = 2000;
+    // Called on the display rank for each tile that had an input, when its pixels are in the image of the open frame:
+    // tile index, pixels, image. For windows that show a frame as it comes. From worker threads, the progress thread or
+    // a thread in end(), several at once for different tiles; other pixels of the image are being written meanwhile.
+    // It must be quick. An exception makes the frame fail. Tiles of ranks on the same node may all come at the end.
+    TileCallback onTile{};
+    // end() waits this long before it looks whether any rank still has something under way; then it looks again, more
+    // and more seldom. This is how a frame fails that nothing can complete: see ErrorKind::MissingInput. 1 ms or more;
+    // ranks may differ. A short time costs a few messages in each slow frame.
+    std::chrono::milliseconds quiet{2000};
 };
 
 // The samples that a tile gets in a frame: [first, first + count) of all that it may ever get.
@@ -65,7 +83,7 @@ struct TileSamples {
 using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 
 // What a frame begins with; the same on all ranks, which is checked in the verdict.
-struct FrameParams {
+struct FrameConfig {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
     // Samples a pixel, each a pass. With a tile operation that keepsState they are those that follow the last frame's,
     // see accumulationId; with any other, from 0 on.
@@ -84,15 +102,14 @@ struct FrameParams {
     // False: the inputs of generation 0 say what follows, as in the paper; every owned tile needs one per pass.
     // True: each rank says with Frame::declare() what it will send, and owners count on that. Loops set it themselves.
     bool declared = false;
-    // Not 0: when a frame is not complete so many ms after this rank called end(), it fails with ErrorKind::TimedOut,
-    // which says what is missing and from whom; after twice that, when not even the verdict has come, end() throws
-    // TransportError. setTile() makes it fail too when there has been no room for so long. The same on all ranks. Not
-    // needed for inputs that are never sent: when all ranks are in end() and nothing is under way any more, the frame
-    // fails with ErrorKind::MissingInput, some seconds after the last of them.
-    int timeoutMs = 0;
+    // 0: no limit. Otherwise a frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called
+    // end(); the error says what is missing and from whom. If not even the verdict comes within twice the time, end()
+    // throws TransportError. setTile() makes the frame fail if it waits this long for room. Inputs that are never sent
+    // need no time-out: the frame fails with ErrorKind::MissingInput some seconds after all ranks are in end().
+    std::chrono::milliseconds timeout{0};
     // A frame that fails has the tiles that were finished by then: end() throws nothing but says so in
     // FrameReport::failure. An exception of a renderer or an operation, or inputs at odds, cost no more than their
-    // tiles; what misses an input is given up when nothing is under way any more, or after timeoutMs. Without that a
+    // tiles; what misses an input is given up when nothing is under way any more, or after `timeout`. Without that a
     // message that could not be read ends the frame at once, with the tiles that are finished. Ranks that disagree fail
     // it all the same. See also DistributedFrameBuffer::isComplete().
     bool allowPartial = false;
@@ -133,7 +150,7 @@ struct Figure {
 // each rank entered the verdict; the others are this rank's own.
 struct FrameReport {
     std::int64_t frame = 0;
-    std::optional<ErrorInfo> failure; // all: with FrameParams::allowPartial, why there are tiles missing, if there are
+    std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why there are tiles missing, if there are
     // All: tiles that were not finished; the display rank's has those, too, that have not come. They show the
     // background.
     std::int64_t tilesIncomplete = 0;
@@ -157,7 +174,7 @@ struct FrameReport {
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: from how many ranks to how many, counted in pairs, it gained
-    // All: how far colour and alpha of a pixel may be off for WirePrecision and minTransmittance, from what came.
+    // All: how far colour and alpha of a pixel may be off for Precision and minTransmittance, from what came.
     // Neither changes depth, positions and ids.
     double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how much merging segments may have changed a pixel, see DeepTile

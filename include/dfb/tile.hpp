@@ -114,13 +114,13 @@ struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
     }
 };
 
-// Looks at no more pixels than it must.
-template <class AnyTile>
-bool isOpaque(const AnyTile& tile) noexcept
+// Whether isOpaqueAt(i) holds for all pixels of the region. Looks at no more of them than it must.
+template <class IsOpaqueAt>
+bool isOpaque(const Region& region, std::ptrdiff_t stride, const IsOpaqueAt& isOpaqueAt) noexcept
 {
-    for (int y = 0; y < tile.region.height(); ++y)
-        for (int x = 0; x < tile.region.width(); ++x)
-            if (tile.pixel(x, y)[3] != 1.0f)
+    for (int y = 0; y < region.height(); ++y)
+        for (int x = 0; x < region.width(); ++x)
+            if (!isOpaqueAt(y * stride + x))
                 return false;
     return true;
 }
@@ -198,19 +198,25 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
     // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region.
-    bool isOpaque() const noexcept { return detail::isOpaque(*this); }
+    bool isOpaque() const noexcept
+    {
+        return detail::isOpaque(region, Size, [this](std::ptrdiff_t i) { return color[4 * i + 3] == 1.0f; });
+    }
 };
 
-// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself: they are read there, and
-// are as those of a Tile. All pointers are to the first pixel of the region; what is not read may be null: channels
-// that neither the operation nor the image needs. Without colour there is nothing in the tile.
+// A tile whose pixels lie elsewhere, such as in an image that a renderer has made by itself. They are read there and
+// mean what those of a Tile mean. All pointers point to the first pixel of the region; channels that neither the
+// operation nor the image needs may be null. A tile without colour is empty.
 template <ChannelMask Channels, int Size>
 struct TileView : TileHeader {
     static constexpr int size = Size;
     static constexpr ChannelMask channels = Channels;
 
-    std::size_t stride = 0; // from a row to the next, in pixels
+    std::ptrdiff_t stride = 0; // from a row to the next, in pixels; negative where rows lie bottom-up
     const float *color = nullptr, *depth = nullptr, *normal = nullptr, *albedo = nullptr, *position = nullptr;
+    // In place of `color`: premultiplied linear RGBA of 8 bits a channel, level / 255. It is sent as it is, a byte a
+    // channel, and composited exactly.
+    const std::uint8_t* color8 = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
     // Pixels of the image outside of it have nothing, and are not read: for a renderer that knows where its data
@@ -221,18 +227,21 @@ struct TileView : TileHeader {
 
     detail::ConstPlanes planes() const noexcept
     {
-        const void* const all[detail::channelCount] = {color,    depth,       normal,     albedo,
+        const void* const pixels = color ? static_cast<const void*>(color) : color8;
+        const void* const all[detail::channelCount] = {pixels,   depth,       normal,     albedo,
                                                        position, primitiveId, instanceId, farDepth};
         detail::ConstPlanes p;
         for (std::size_t c = 0; c < detail::channelCount; ++c)
             p.at[c] = static_cast<const std::byte*>(all[c]);
         return p;
     }
-    const float* pixel(int x, int y) const noexcept
+    bool isOpaque() const noexcept
     {
-        return color + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
+        if (!(color || color8) || validRegion() != region)
+            return false;
+        return color ? detail::isOpaque(region, stride, [this](std::ptrdiff_t i) { return color[4 * i + 3] == 1.0f; })
+                     : detail::isOpaque(region, stride, [this](std::ptrdiff_t i) { return color8[4 * i + 3] == 255; });
     }
-    bool isOpaque() const noexcept { return color && validRegion() == region && detail::isOpaque(*this); }
 };
 
 namespace detail {
@@ -247,20 +256,28 @@ struct InputPixels : TileHeader {
     }
     template <ChannelMask Channels, int Size>
     InputPixels(const TileView<Channels, Size>& from)
-        : TileHeader(from), channels(Channels), at(from.planes()), stride(from.stride), valid(from.validRegion())
+        : TileHeader(from), channels(Channels), at(from.planes()), stride(from.stride), valid(from.validRegion()),
+          hasBytes(!from.color && from.color8)
     {
     }
 
     const ConstPlanes& planes() const noexcept { return at; }
-    const float* pixel(int x, int y) const noexcept
+    // Bytes of a pixel in a channel.
+    std::size_t pixelBytes(std::size_t channel) const noexcept
     {
-        return floatsOf(at.at[Color]) + 4 * (static_cast<std::ptrdiff_t>(y) * static_cast<std::ptrdiff_t>(stride) + x);
+        return channel == Color && hasBytes ? 4 : 4 * static_cast<std::size_t>(channelWords[channel]);
+    }
+    // The colour of a pixel, counted from the first of the region.
+    const std::byte* colorAt(int x, int y) const noexcept
+    {
+        return at.at[Color] + static_cast<std::ptrdiff_t>(pixelBytes(Color)) * (y * stride + x);
     }
 
     ChannelMask channels;
-    ConstPlanes at;     // to the first pixel of the region; null: not there
-    std::size_t stride; // from a row to the next, in pixels
-    Region valid;       // of the region; pixels outside of it have nothing, and are not read
+    ConstPlanes at;        // to the first pixel of the region; null: not there
+    std::ptrdiff_t stride; // from a row to the next, in pixels
+    Region valid;          // of the region; pixels outside of it have nothing, and are not read
+    bool hasBytes = false; // the colour has 8 bits a channel
 };
 
 } // namespace detail

@@ -68,6 +68,9 @@ private:
 // tile when the framebuffer is made.
 using OwnerMap = std::function<int(int tile, const TileLayout& layout, int rankCount)>;
 
+// See FrameBufferConfig::onTile.
+using TileCallback = std::function<void(int tile, const Region& pixels, const Image& image)>;
+
 // The default: each tile row is the one above it shifted by about 0.62 of the rank count, so that neighbours in
 // both directions belong to different ranks (tile mod ranks gives vertical stripes where the two divide).
 inline int latticeOwner(int tile, const TileLayout& layout, int rankCount)

@@ -96,11 +96,11 @@ struct Run {
 dfb::FrameBufferConfig configOf(const example::RenderSettings& settings, const Run& run)
 {
     dfb::FrameBufferConfig config;
-    config.width = settings.width;
-    config.height = settings.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.ownerMap = run.ownerMap;
+    config.image.width = settings.width;
+    config.image.height = settings.height;
+    config.image.format = dfb::OutputFormat::RGBA32F;
+    config.image.depth = true;
+    config.image.ownerMap = run.ownerMap;
     config.executor = std::make_shared<dfb::ThreadExecutor>(run.threads);
     return config;
 }
@@ -117,7 +117,7 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
         picture.depth.assign(image.depth(), image.depth() + image.pixelCount());
         picture.report = report;
     };
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.passes = settings.passes;
     const example::SceneInfo info(scene);
     dfb::runRanks(run.ranks, [&](dfb::InprocCommunicator communicator) {

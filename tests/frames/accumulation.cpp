@@ -32,7 +32,7 @@ inline bool isImageParallel(Loop loop)
 // has anything to render.
 template <class FrameBuffer>
 dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const dfb::World& world,
-                        const dfb::SharedWorld& shared, dfb::FrameParams params, bool fails = false)
+                        const dfb::SharedWorld& shared, dfb::FrameConfig params, bool fails = false)
 {
     using Tile = typename FrameBuffer::Tile;
     const auto renderBrick = [&](const dfb::Brick& b, auto& tile) {
@@ -143,8 +143,8 @@ struct NextSamples {
             dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, configOf(s, 2));
             const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
             const dfb::SharedWorld shared(fb, world);
-            dfb::FrameParams params = paramsOf(s);
-            params.timeoutMs = 20000; // nothing waits for it
+            dfb::FrameConfig params = paramsOf(s);
+            params.timeout = std::chrono::milliseconds(20000); // nothing waits for it
             // Renders the next samples, after which there must be `all`, or none if the frame fails.
             const auto frame = [&](int passes, int all) {
                 params.passes = passes;
@@ -231,8 +231,8 @@ struct MovingSamples {
                     s.bricks.clear();
                 const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
                 const dfb::SharedWorld shared(fb, world);
-                dfb::FrameParams params = paramsOf(s);
-                params.timeoutMs = 20000; // nothing waits for it
+                dfb::FrameConfig params = paramsOf(s);
+                params.timeout = std::chrono::milliseconds(20000); // nothing waits for it
                 params.accumulationId = 1;
                 params.passes = 1 + number % 2;
                 const std::string what =

@@ -52,14 +52,14 @@ inline std::string valuesText(int odd, const std::string& usual, const std::stri
 struct BlamedParams {
     struct Case {
         const char* name;
-        std::function<void(dfb::FrameParams&)> change; // on the odd rank
+        std::function<void(dfb::FrameConfig&)> change; // on the odd rank
         const char *usual, *its;
     };
 
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
-        using Params = dfb::FrameParams;
+        using Params = dfb::FrameConfig;
         const std::vector<Case> cases{
             {"background", [](Params& p) { p.background[2] = 0.75f; }, "(0.125, 0.25, 0.5, 1)",
              "(0.125, 0.25, 0.75, 1)"},
@@ -71,7 +71,7 @@ struct BlamedParams {
              "null", "a plan of 56 samples"},
             {"maxLayers", [](Params& p) { p.maxLayers = 9; }, "4", "9"},
             {"accumulationId", [](Params& p) { p.accumulationId = 77; }, "5", "77"},
-            {"timeoutMs", [](Params& p) { p.timeoutMs = 31000; }, "30000", "31000"},
+            {"timeout", [](Params& p) { p.timeout = std::chrono::milliseconds(31000); }, "30000", "31000"},
             {"allowPartial", [](Params& p) { p.allowPartial = true; }, "false", "true"}};
         const scene::Scene s = scene::makeScene(3);
         Result result;
@@ -86,7 +86,7 @@ struct BlamedParams {
                     params.maxLayers = 4;
                     params.accumulationId = 5;
                     params.declared = true;
-                    params.timeoutMs = 30000;
+                    params.timeout = std::chrono::milliseconds(30000);
                     if (fb.rank() == odd)
                         c.change(params);
                     auto frame = fb.begin(params);
@@ -97,7 +97,7 @@ struct BlamedParams {
                 const std::string what = std::string(c.name) + " of rank " + std::to_string(odd);
                 expectText(result, what, text,
                            {"FrameError: dfb: ranks disagree: frame " + std::to_string(number),
-                            std::string("FrameParams::") + c.name + " is ", valuesText(odd, c.usual, c.its),
+                            std::string("FrameConfig::") + c.name + " is ", valuesText(odd, c.usual, c.its),
                             std::string(c.usual) + " on rank ", "it must be the same on all ranks"});
                 expectGoodFrame(result, fb, s, what);
             }
@@ -117,30 +117,30 @@ struct BlamedConfig {
             const char *usual, *its;
         };
         const std::vector<Different> differences{
-            {"width", [](Config& c) { c.width = 98; }, "97", "98"},
-            {"height", [](Config& c) { c.height = 192; }, "61", "192"},
-            {"format", [](Config& c) { c.format = dfb::OutputFormat::SRGBA8; }, "RGBA32F", "SRGBA8"},
-            {"depth", [](Config& c) { c.depth = false; }, "true", "false"},
-            {"dither", [](Config& c) { c.dither = true; }, "false", "true"},
+            {"width", [](Config& c) { c.image.width = 98; }, "97", "98"},
+            {"height", [](Config& c) { c.image.height = 192; }, "61", "192"},
+            {"format", [](Config& c) { c.image.format = dfb::OutputFormat::SRGBA8; }, "RGBA32F", "SRGBA8"},
+            {"depth", [](Config& c) { c.image.depth = false; }, "true", "false"},
+            {"dither", [](Config& c) { c.image.dither = true; }, "false", "true"},
             {"framesInFlight", [](Config& c) { c.framesInFlight = 2; }, "1", "2"},
-            {"compression", [](Config& c) { c.compression = dfb::CompressionMode::Auto; }, "Always", "Auto"},
-            {"messagePoolBytes", [](Config& c) { c.messagePoolBytes = 1 << 28; }, "67108864", "268435456"},
+            {"messages.compression", [](Config& c) { c.messages.compression = dfb::CompressionMode::Auto; }, "Always", "Auto"},
+            {"messages.poolBytes", [](Config& c) { c.messages.poolBytes = 1 << 28; }, "67108864", "268435456"},
             {"minTransmittance", [](Config& c) { c.minTransmittance = 0.5f; }, "0", "0.5"},
-            {"wire.color", [](Config& c) { c.wire = dfb::WireFormat::Float16; }, "float32", "float16"}};
+            {"precision.color", [](Config& c) { c.precision = dfb::WireFormat::Float16; }, "float32", "float16"}};
         struct Wrong {
             std::function<void(Config&)> change;
             const char* text;
         };
         const std::vector<Wrong> wrongs{
-            {[](Config& c) { c.width = 0; }, "the image size is 0x61"},
-            {[](Config& c) { c.displayRank = 99; }, "the display rank is 99 of "},
+            {[](Config& c) { c.image.width = 0; }, "the image size is 0x61"},
+            {[](Config& c) { c.image.displayRank = 99; }, "the display rank is 99 of "},
             {[](Config& c) { c.framesInFlight = 0; }, "0 frames in flight"},
             {[](Config& c) { c.minTransmittance = 2; }, "a least transmittance of 2"},
-            {[](Config& c) { c.aux = dfb::normalChannel; }, "auxiliary channels"},
-            {[](Config& c) { c.ownerMap = [](int, const dfb::TileLayout&, int) { return 99; }; },
+            {[](Config& c) { c.image.aux = dfb::normalChannel; }, "auxiliary channels"},
+            {[](Config& c) { c.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 99; }; },
              "the owner map gives tile 0 to rank 99 of "},
             {[](Config& c) {
-                 c.ownerMap = [](int, const dfb::TileLayout&, int) -> int { throw std::runtime_error("no such map"); };
+                 c.image.ownerMap = [](int, const dfb::TileLayout&, int) -> int { throw std::runtime_error("no such map"); };
              },
              "no such map"}};
         const scene::Scene s = scene::makeScene(3);
@@ -168,7 +168,7 @@ struct BlamedConfig {
         }
         for (const int odd : oddRanks(size)) {
             const auto makeWall = [&](bool checksums, int bezel, int displays) {
-                dfb::ConnectionOptions options;
+                dfb::NetworkConfig options;
                 options.checksums = checksums;
                 dfb::WallLayout layout;
                 layout.columns = displays;
@@ -186,12 +186,12 @@ struct BlamedConfig {
                 return scene::outcomeOf([&] {
                     const auto connection = dfb::connect<Transport>(communicator);
                     Config config = configOf(s);
-                    config.width = width;
+                    config.image.width = width;
                     BlameFrameBuffer<Transport> fb(connection, config);
                 });
             };
             const std::string sums = scene::outcomeOf([&] {
-                dfb::ConnectionOptions options;
+                dfb::NetworkConfig options;
                 options.checksums = rank == odd;
                 BlameFrameBuffer<Transport> fb(communicator, configOf(s), options);
             });
@@ -234,8 +234,8 @@ struct BlamedTree {
         const auto tile = std::make_unique<typename Fb::Tile>();
         {
             // The owner announces what never comes.
-            dfb::FrameParams params;
-            params.timeoutMs = 300;
+            dfb::FrameConfig params;
+            params.timeout = std::chrono::milliseconds(300);
             std::string text;
             dfb::ErrorInfo error;
             try {

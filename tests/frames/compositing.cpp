@@ -24,7 +24,7 @@ struct AuxChannels {
         for (const int passes : {1, 3}) {
             const scene::Scene s = scene::makeScene(7, 5, 61, 47, passes);
             auto config = configOf(s, 2);
-            config.aux = dfb::imageAuxChannels;
+            config.image.aux = dfb::imageAuxChannels;
             dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
             const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
             dfb::DataParallelLoop loop(fb, world);
@@ -64,7 +64,7 @@ struct AuxImageParallel {
         scene::Scene s = scene::makeScene(1, 3, 61, 47, 2);
         s.bricks[0].bounds = {{0, 0, 0}, {61, 47, 1}};
         auto config = configOf(s, 2);
-        config.aux = dfb::imageAuxChannels;
+        config.image.aux = dfb::imageAuxChannels;
         std::atomic<std::int64_t> seen{0};
         dfb::DistributedFrameBuffer<Op, SeeAux, Transport> fb(communicator, config, {&seen});
         dfb::ImageParallelLoop(fb).render([&](auto& tile) { renderWithAux(s, s.bricks[0], tile); }, paramsOf(s));
@@ -209,8 +209,8 @@ struct BlackInFront {
         for (const std::uint32_t id : {front, back})
             s.bricks.push_back({id, {{0, 0, 0}, {width, height, 1}}});
         auto config = configOf(s, 1);
-        config.wire = format;
-        config.aux = dfb::imageAuxChannels;
+        config.precision = format;
+        config.image.aux = dfb::imageAuxChannels;
         dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(connection, config);
         dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
             .render(scene::FlatCamera(), renderBrick, paramsOf(s));

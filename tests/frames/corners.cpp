@@ -330,7 +330,7 @@ private:
     {
         std::vector<std::byte> bytes(sizeof value);
         std::memcpy(bytes.data(), &value, sizeof value);
-        std::memcpy(&value, fb_.allGather(bytes)[static_cast<std::size_t>(fb_.config().displayRank)].data(),
+        std::memcpy(&value, fb_.allGather(bytes)[static_cast<std::size_t>(fb_.config().image.displayRank)].data(),
                     sizeof value);
         return value;
     }
@@ -387,8 +387,8 @@ private:
     {
         const bool mine = fault.culprit == fb_.rank();
         trap_.set(mine && fault.kind < Sites ? fault.kind : -1, fault.call);
-        dfb::FrameParams params = paramsOf(s);
-        params.timeoutMs = timeoutMs;
+        dfb::FrameConfig params = paramsOf(s);
+        params.timeout = std::chrono::milliseconds(timeoutMs);
         params.allowPartial = fault.partial;
         params.accumulationId = ++accumulation_;
         if (mine && fault.kind == OtherBackground)
@@ -425,7 +425,7 @@ private:
         return ending;
     }
 
-    Frame begin(const dfb::FrameParams& params)
+    Frame begin(const dfb::FrameConfig& params)
     {
         if constexpr (std::is_same_v<PixelOp, dfb::NoPixelOp>)
             return fb_.begin(params, TrapData(&trap_));
@@ -434,7 +434,7 @@ private:
     }
 
     // Renders all that this rank has; the fault is its own.
-    Frame start(const scene::Scene& s, const dfb::FrameParams& params, const Fault& fault)
+    Frame start(const scene::Scene& s, const dfb::FrameConfig& params, const Fault& fault)
     {
         const TrapData data(&trap_);
         typename FrameBuffer::PixelFrameData pixelData{};
@@ -470,7 +470,7 @@ private:
     }
 
     template <class PixelData>
-    Frame startDeep(const scene::Scene& s, const dfb::FrameParams& params, const TrapData& data,
+    Frame startDeep(const scene::Scene& s, const dfb::FrameConfig& params, const TrapData& data,
                     const PixelData& pixelData)
     {
         if constexpr ((TileOp::channels & dfb::farChannel) != 0) {
@@ -493,7 +493,7 @@ private:
     }
 
     // Listing 3 of the paper.
-    Frame byHand(const scene::Scene& s, const dfb::FrameParams& params, const Fault& fault)
+    Frame byHand(const scene::Scene& s, const dfb::FrameConfig& params, const Fault& fault)
     {
         struct Input {
             int tile;
@@ -752,7 +752,7 @@ private:
     {
         for (const corners::Loop loop : loops) {
             dfb::FrameBufferConfig config = configOf(corners::sceneFor(loop, rule, 0), count.loops % 3);
-            config.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
+            config.image.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
             corners::Corner<TileOp, PixelOp, Transport> corner(connection, config, loop, rule, result);
             count.faults += corner.run();
             ++count.loops;

@@ -114,7 +114,7 @@ struct Deep {
         size.width = scene.width, size.height = scene.height;
         DeepFrameBuffer<Transport> fb(communicator, configOf(size, 2));
         const dfb::World world = scene.world(fb.rank(), fb.size());
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         params.background = scene.background;
         const auto largestError = [&](const std::vector<dfb::testing::Pixel>& expected) {
             double largest = 0;

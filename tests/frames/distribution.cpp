@@ -170,7 +170,7 @@ struct Unbalanced {
     static int communicatorSize(const typename Transport::Communicator& communicator)
     {
         dfb::FrameBufferConfig config;
-        config.width = config.height = 1;
+        config.image.width = config.image.height = 1;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         return BlendFrameBuffer<Transport>(communicator, config).size();
     }
@@ -216,9 +216,9 @@ struct Ordered {
         const dfb::Vec3 eye{0.7f, 0.8f, 6.5f}, target{1.1f, 1.0f, 0};
         const dfb::PerspectiveCamera camera(eye, target, {0, 1, 0}, 50);
         dfb::FrameBufferConfig config;
-        config.width = 97;
-        config.height = 61;
-        config.format = dfb::OutputFormat::RGBA32F;
+        config.image.width = 97;
+        config.image.height = 61;
+        config.image.format = dfb::OutputFormat::RGBA32F;
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
         dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
         const dfb::SharedWorld world(fb, replicated(boxes(), fb.rank(), fb.size(), copies));
@@ -252,7 +252,7 @@ struct Ordered {
             view.color = &images.at(b.id).rgba[4 * first];
             view.depth = &images.at(b.id).depth[first];
         });
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         params.passes = 2;
         params.background = {0.1f, 0.2f, 0.3f, 1};
         dfb::RoundRobinBricks owner{copies > 1};
@@ -306,7 +306,7 @@ struct WrongOwner {
     {
         Result result;
         scene::Scene s = scene::makeScene(3, 6);
-        s.timeoutMs = 5000; // nothing waits for it
+        s.timeout = std::chrono::milliseconds(5000); // nothing waits for it
         BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
         dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport> inOrder(communicator,
                                                                                                    configOf(s, 1));

@@ -18,10 +18,10 @@ struct Hidden {
     static dfb::FrameBufferConfig config(bool depth)
     {
         dfb::FrameBufferConfig c;
-        c.width = 90;
-        c.height = 70;
-        c.format = dfb::OutputFormat::RGBA32F;
-        c.depth = depth;
+        c.image.width = 90;
+        c.image.height = 70;
+        c.image.format = dfb::OutputFormat::RGBA32F;
+        c.image.depth = depth;
         c.executor = std::make_shared<dfb::ThreadExecutor>(2);
         return c;
     }

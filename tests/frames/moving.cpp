@@ -37,8 +37,8 @@ struct MovingBricks {
                     Result& result)
     {
         dfb::FrameBufferConfig config = configOf(sceneOf(0), threads);
-        config.format = format;
-        config.depth = format == dfb::OutputFormat::RGBA32F;
+        config.image.format = format;
+        config.image.depth = format == dfb::OutputFormat::RGBA32F;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, Transport> fb(communicator, config);
         for (int frame = 0; frame < 40; ++frame) {
             scene::Scene s = sceneOf(frame);
@@ -181,8 +181,8 @@ struct ChangingDeclarations {
             for (int i = 0; i < tile.size * tile.size; ++i)
                 tile.farDepth[i] = tile.depth[i];
         };
-        dfb::FrameParams params = paramsOf(s);
-        params.timeoutMs = 20000; // nothing waits for it
+        dfb::FrameConfig params = paramsOf(s);
+        params.timeout = std::chrono::milliseconds(20000); // nothing waits for it
         if (loop == Deep)
             return dfb::DeepParallelLoop(fb, world, 1)
                 .start(

@@ -70,7 +70,7 @@ struct PartialFrames {
     {
         Result result;
         for (const bool shared : {true, false}) {
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.sharedMemory = shared;
             const scene::Scene s = scene::makeScene(5, 3);
             auto config = configOf(s, 2);
@@ -88,7 +88,7 @@ struct PartialFrames {
             const dfb::World world(mine);
             dfb::DataParallelLoop loop(fb, world);
             const auto frame = [&](int timeoutMs, const auto& render, const FailsAt& fails) {
-                params.timeoutMs = timeoutMs;
+                params.timeout = std::chrono::milliseconds(timeoutMs);
                 return loop.render(scene::FlatCamera(), render, params, fails);
             };
             const auto renderAll = [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); };
@@ -123,7 +123,7 @@ struct PartialFrames {
             isFine("after an operation");
             {
                 // Inputs that are announced and never come.
-                params.timeoutMs = soon;
+                params.timeout = std::chrono::milliseconds(soon);
                 auto open = fb.begin(params);
                 const auto tile = std::make_unique<typename FrameBuffer::Tile>();
                 if (fb.tileOwner(lost) == fb.rank()) {
@@ -152,7 +152,7 @@ struct PartialFrames {
                       "a missing input");
             }
             {
-                params.timeoutMs = never;
+                params.timeout = std::chrono::milliseconds(never);
                 auto open = fb.begin(params);
                 sendAll(fb, open, s, false);
                 if (fb.rank() == fb.size() / 2)
@@ -261,7 +261,7 @@ struct ImageOfFrame {
             }
             last = isThere("the next");
             auto wrong = paramsOf(s);
-            wrong.timeoutMs = -1;
+            wrong.timeout = std::chrono::milliseconds(-1);
             result.expect(scene::has(scene::outcomeOf([&] { fb.begin(wrong); }), "InvalidArgument"), "no begin()");
             expect(last, "after a begin() that was refused");
             {
@@ -270,7 +270,7 @@ struct ImageOfFrame {
             }
             expect(isAlone ? -1 : last, "after one that was left");
             auto partial = paramsOf(s);
-            partial.timeoutMs = 20000;
+            partial.timeout = std::chrono::milliseconds(20000);
             partial.allowPartial = true;
             auto frame = fb.begin(partial);
             sendAll(fb, frame, s, false);

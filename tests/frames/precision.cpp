@@ -30,10 +30,10 @@ struct Precision {
         Result result;
         const scene::Scene s = scene::makeScene(5, 11);
         const auto connection = dfb::connect<Transport>(communicator);
-        const auto frame = [&](const dfb::WirePrecision& wire, float minTransmittance, int maxLayers,
+        const auto frame = [&](const dfb::Precision& wire, float minTransmittance, int maxLayers,
                                bool inRange) -> std::pair<std::vector<float>, dfb::FrameReport> {
             auto config = configOf(s, 1);
-            config.wire = wire;
+            config.precision = wire;
             config.minTransmittance = minTransmittance;
             dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(connection, config);
             auto params = paramsOf(s);
@@ -114,8 +114,8 @@ struct OtherChannels {
         for (const auto format :
              {dfb::WireFormat::Float32, dfb::WireFormat::Float16, dfb::WireFormat::Unorm16, dfb::WireFormat::Unorm8}) {
             auto config = configOf(s, 1);
-            config.wire = format;
-            config.aux = dfb::imageAuxChannels;
+            config.precision = format;
+            config.image.aux = dfb::imageAuxChannels;
             dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(connection, config);
             dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
                 .render(
@@ -184,13 +184,13 @@ struct NoPrecision {
             });
             result.expect(scene::has(outcome, "InvalidArgument") && scene::has(outcome, what), outcome);
         };
-        refuses("error budget", [&](auto& c) { c.wire.budget = -1e-3; });
-        refuses("error budget", [&](auto& c) { c.wire.maxColor = nan; });
+        refuses("error budget", [&](auto& c) { c.precision.budget = -1e-3; });
+        refuses("error budget", [&](auto& c) { c.precision.maxColor = nan; });
         refuses("least transmittance", [&](auto& c) { c.minTransmittance = nan; });
         if (size > 1)
-            refuses("wire.color is float32 on rank 0 and float16 on rank 1", [&, rank = rank](auto& c) {
+            refuses("precision.color is float32 on rank 0 and float16 on rank 1", [&, rank = rank](auto& c) {
                 if (rank == 1)
-                    c.wire.color = dfb::WireFormat::Float16;
+                    c.precision.color = dfb::WireFormat::Float16;
             });
         return result;
     }

@@ -18,14 +18,14 @@ namespace frame_cases {
 inline dfb::FrameBufferConfig quickConfig(const scene::Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config = configOf(s, threads);
-    config.quietMs = 5;
+    config.quiet = std::chrono::milliseconds(5);
     return config;
 }
 
 // With no threads the ranks' own ones move messages, too.
-inline dfb::ConnectionOptions optionsOf(int threads)
+inline dfb::NetworkConfig optionsOf(int threads)
 {
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.progress = threads > 0 ? dfb::Progress::Thread : dfb::Progress::Caller;
     return options;
 }
@@ -92,7 +92,7 @@ struct MissingInputs {
                                       Case{"declared", "missing source 72 of rank ", 1, true}}) {
                     const std::string what = std::string(c.name) + (allowPartial ? ", partial" : "") + ", "
                                              + std::to_string(threads) + " threads";
-                    dfb::FrameParams params = paramsOf(s);
+                    dfb::FrameConfig params = paramsOf(s);
                     params.declared = c.declared;
                     params.allowPartial = allowPartial;
                     {
@@ -190,7 +190,7 @@ struct QuietOthers {
         }
         for (const int threads : {0, 1}) { // the last rank renders while the others look a hundred times
             config = quickConfig(s, threads);
-            config.quietMs = 1;
+            config.quiet = std::chrono::milliseconds(1);
             FrameBuffer fb(communicator, config, optionsOf(threads));
             const bool isSlow = fb.rank() == fb.size() - 1;
             auto frame = fb.begin(paramsOf(s));
@@ -217,10 +217,10 @@ struct QuietWall {
         dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8, executor);
         auto config = wall.frameBufferConfig();
         config.executor = executor;
-        config.quietMs = 5;
+        config.quiet = std::chrono::milliseconds(5);
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::ToWall, Transport> fb(connection, config, {&wall});
         const auto frame = [&](int tiles, bool allowPartial) {
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.allowPartial = allowPartial;
             auto open = fb.begin(params);
             for (const int tile : fb.ownedTiles())

@@ -135,7 +135,7 @@ struct Accumulation {
                     plan->push_back({had, target - had});
                     had = target;
                 }
-                dfb::FrameParams params = paramsOf(s);
+                dfb::FrameConfig params = paramsOf(s);
                 params.passes = 1;
                 params.samples = plan;
                 params.accumulationId = id;
@@ -189,7 +189,7 @@ struct Reset {
             sampler.reset();
         const std::string outcome = scene::outcomeOf(render);
         if (fb.size() > 1) {
-            result.expect(scene::has(outcome, "FrameParams::samples"), "the rank was not found: " + outcome);
+            result.expect(scene::has(outcome, "FrameConfig::samples"), "the rank was not found: " + outcome);
             if (fb.rank() != 0) {
                 const std::string goingOn = scene::outcomeOf(render);
                 result.expect(scene::has(goingOn, "begin again with sample 0"), "goes on after a failure: " + goingOn);
@@ -253,9 +253,9 @@ using NoisyFrameBuffer =
 inline dfb::FrameBufferConfig configOf(const NoisyScene& s)
 {
     dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
+    config.image.width = s.width;
+    config.image.height = s.height;
+    config.image.format = dfb::OutputFormat::RGBA32F;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
     return config;
 }

@@ -22,7 +22,7 @@ struct Wall {
         dfb::FrameBufferConfig config = wall.frameBufferConfig();
         config.executor = executor;
         FrameBufferOf<TileOp, dfb::ToWall, Transport> toWall(connection, config, {&wall});
-        config.format = format;
+        config.image.format = format;
         FrameBufferOf<TileOp, dfb::NoPixelOp, Transport> single(connection, config);
         result.expect(wall.imageFrame() == -1, name + ": a frame before the first");
         for (int d = 0; d < layout.displayCount(); ++d)
@@ -77,13 +77,13 @@ struct Wall {
             return layout;
         };
         const auto paramsOfFrame = [](int frame) {
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.background = {0.25f * static_cast<float>(frame), 0.5f, 0, 1}; // tiles without bricks change as well
             return params;
         };
         const auto data = [&](auto& fb, int frame) {
             const scene::Scene s =
-                scene::makeScene(3, static_cast<std::uint64_t>(frame + 4), fb.config().width, fb.config().height);
+                scene::makeScene(3, static_cast<std::uint64_t>(frame + 4), fb.config().image.width, fb.config().image.height);
             return dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
                 .render(
                     scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); },
@@ -91,7 +91,7 @@ struct Wall {
         };
         const auto image = [&](auto& fb, int frame) {
             const scene::Scene s =
-                scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().width, fb.config().height);
+                scene::makeScene(1, static_cast<std::uint64_t>(frame + 2), fb.config().image.width, fb.config().image.height);
             return dfb::ImageParallelLoop(fb, dfb::WorkDistribution::RoundRobin)
                 .render([&](auto& tile) { renderBrick(s, s.bricks[0], tile); }, paramsOfFrame(frame));
         };
@@ -142,7 +142,7 @@ struct WallProgressive {
                 },
                 sampler.next());
             sampler.update(report);
-            wall.finish(report.frame, 20000);
+            wall.finish(report.frame, std::chrono::seconds(20));
         };
         render(false);
         const auto pixels = [&] {

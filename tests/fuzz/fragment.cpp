@@ -35,7 +35,7 @@ const dfb::Codec* codec()
 
 d::WireCoder coderFor(std::uint8_t flags)
 {
-    dfb::WirePrecision precision;
+    dfb::Precision precision;
     precision.maxColor = flags & LargeColors ? 40.0f : 1.0f;
     return d::WireCoder(precision, (flags & ByDepth) != 0);
 }
@@ -132,6 +132,22 @@ bool isSame(const dfb::TileHeader& a, const dfb::TileHeader& b)
            && a.generation == b.generation && a.children == b.children && a.source == b.source && a.part == b.part;
 }
 
+// The message of a tile; with WireFormat::Bytes, of an 8-bit image of it.
+dfb::Buffer encode(dfb::MemoryPool& pool, const Tile& tile, dfb::ChannelMask channels, const dfb::Codec* with,
+                   const d::WireCoder& coder, dfb::WireFormat color)
+{
+    d::InputFaults faults;
+    if (color != dfb::WireFormat::Bytes)
+        return d::encodeFragment(pool, tile, channels, 0, with, coder, color, faults);
+    std::vector<std::uint8_t> levels(4 * side * side);
+    for (std::size_t i = 0; i < levels.size(); ++i)
+        levels[i] = static_cast<std::uint8_t>(std::lround(255 * tile.color[i]));
+    d::InputPixels bytes(tile);
+    bytes.at.at[d::Color] = reinterpret_cast<const std::byte*>(levels.data());
+    bytes.hasBytes = true;
+    return d::encodeFragment(pool, bytes, channels, 0, with, coder, dfb::WireFormat::Float32, faults);
+}
+
 // Returns whether it is an input of a tile.
 bool take(fuzz::Input in)
 {
@@ -175,9 +191,7 @@ bool take(fuzz::Input in)
     if (coder.activeByDepth() && !(fragment.channels() & dfb::depthChannel))
         return true; // is refused for its channels
 
-    d::InputFaults faults;
-    dfb::Buffer again =
-        d::encodeFragment(*pool, *tile, fragment.channels(), 0, with, coder, fragment.colorFormat(), faults);
+    dfb::Buffer again = encode(*pool, *tile, fragment.channels(), with, coder, fragment.colorFormat());
     const dfb::Fragment second = decode(*pool, std::move(again), with, coder);
     fuzz::require(isSame(header, second.header()), "the header comes back");
     fuzz::require(fragment.channels() == second.channels(), "the channels come back");
@@ -199,9 +213,8 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     std::vector<std::pair<std::string, std::string>> all;
     const auto add = [&](const std::string& name, const Tile& tile, dfb::ChannelMask channels, dfb::WireFormat color,
                          std::uint8_t flags) {
-        d::InputFaults faults;
         const dfb::Codec* with = (flags & HasCodec) && !(flags & Compress) ? codec() : nullptr;
-        const dfb::Buffer message = d::encodeFragment(*pool, tile, channels, 0, with, coderFor(flags), color, faults);
+        const dfb::Buffer message = encode(*pool, tile, channels, with, coderFor(flags), color);
         const std::size_t prefix = sizeof(d::MessageHeader);
         std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
         all.emplace_back(name, fuzz::Output().put(flags).text(body).bytes());
@@ -251,6 +264,10 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("compressed", *dots, colorAndDepth, Format::Float32, HasCodec);
     add("compressed_half", *dense, colorAndDepth, Format::Float16, HasCodec);
     add("compressed_here", *runs, dfb::allChannels, Format::Unorm8, HasCodec | Compress);
+    add("bytes", *dots, colorAndDepth, Format::Bytes, 0);
+    add("bytes_constant", *constant, colorAndDepth, Format::Bytes, 0);
+    add("bytes_by_depth", *black, colorAndDepth, Format::Bytes, ByDepth);
+    add("bytes_compressed", *runs, dfb::allChannels, Format::Bytes, HasCodec);
     add("compressed_dense", *dense, colorAndDepth, Format::Float32, HasCodec | Compress);
     return all;
 }

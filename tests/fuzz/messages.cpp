@@ -204,29 +204,29 @@ std::string wallText(bool checksums)
 dfb::FrameBufferConfig configFor(Way way)
 {
     dfb::FrameBufferConfig config;
-    config.width = width;
-    config.height = height;
-    config.depth = !way.has(Ordered) && !way.has(Wall);
-    config.displayRank = way.has(DisplayElsewhere) ? 1 : 0;
-    config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return ownerOf(tile); };
+    config.image.width = width;
+    config.image.height = height;
+    config.image.depth = !way.has(Ordered) && !way.has(Wall);
+    config.image.displayRank = way.has(DisplayElsewhere) ? 1 : 0;
+    config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return ownerOf(tile); };
 #if defined(DFB_HAS_SNAPPY)
     if (way.has(HasCodec))
-        config.codec = std::make_shared<dfb::SnappyCodec>();
+        config.messages.codec = std::make_shared<dfb::SnappyCodec>();
 #endif
     if (way.has(Rounded))
-        config.wire = dfb::WireFormat::Unorm16;
+        config.precision = dfb::WireFormat::Unorm16;
     config.framesInFlight = static_cast<int>(way.engineCount());
     if (way.has(Wall))
-        config.format = dfb::OutputFormat::None;
+        config.image.format = dfb::OutputFormat::None;
     return config;
 }
 
-dfb::FrameParams paramsFor(Way way)
+dfb::FrameConfig paramsFor(Way way)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = way.has(Declared);
     params.allowPartial = way.has(Partial);
-    params.timeoutMs = way.has(Partial) ? partialMs : 0;
+    params.timeout = std::chrono::milliseconds(way.has(Partial) ? partialMs : 0);
     return params;
 }
 
@@ -326,7 +326,7 @@ private:
     {
         auto config = configFor(way_);
         config.executor = peer_->tasks;
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.progress = dfb::Progress::Caller;
         options.sharedMemory = false;
         options.checksums = way_.has(Checksums);
@@ -487,7 +487,7 @@ std::string inputFor(Way way, int index, bool isDense)
     d::InputFaults faults;
     const dfb::Buffer message = d::encodeFragment(
         *pool, *tile, d::TilePipeline::travelling(d::OperationTraits::of<TileOp, dfb::NoPixelOp>(), config), 0,
-        config.codec.get(), d::WireCoder(config.wire), config.wire.color, faults);
+        config.messages.codec.get(), d::WireCoder(config.precision), config.precision.color, faults);
     const std::size_t prefix = sizeof(d::MessageHeader);
     return fuzz::textOf(message.data() + prefix, message.size() - prefix);
 }
@@ -516,21 +516,21 @@ std::pair<std::string, std::string> finished(Way way)
     const auto pool = dfb::MemoryPool::create(false);
     std::vector<std::string> bodies;
     d::GatherSettings settings;
-    settings.format = config.format;
-    settings.channels = config.depth ? dfb::depthChannel : 0;
-    settings.codec = config.codec;
+    settings.format = config.image.format;
+    settings.channels = config.image.depth ? dfb::depthChannel : 0;
+    settings.codec = config.messages.codec;
     const dfb::TileLayout layout(width, height, side);
     d::FinalGather gather(pool, layout, settings, 0, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });
-    gather.newFrame(1, config.codec != nullptr, {});
+    gather.newFrame(1, config.messages.codec != nullptr, {});
     for (const int tile : {1, 3, 5}) {
         auto place = gather.reserve(tile);
         const dfb::Region region = layout.region(tile);
         for (int i = 0; i < region.width() * region.height(); ++i)
             for (const auto c : {d::Color, d::Depth})
-                if (c == d::Color || config.depth)
+                if (c == d::Color || config.image.depth)
                     std::memset(place.planes.at[c] + 4 * i, i % 5 == 2 ? 9 : 1, 4);
         gather.commit(tile, std::move(place), region.width() * region.height());
     }

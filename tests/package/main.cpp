@@ -42,10 +42,10 @@ bool frameIsRight(const std::shared_ptr<dfb::Executor>& executor, const std::sha
     bool right = true;
     dfb::runRanks(2, [&](const dfb::InprocCommunicator& communicator) {
         FrameBuffer::Config config;
-        config.width = 100;
-        config.height = 70;
+        config.image.width = 100;
+        config.image.height = 70;
         config.executor = executor;
-        config.codec = codec;
+        config.messages.codec = codec;
         FrameBuffer fb(communicator, config);
         auto frame = fb.begin();
         FrameBuffer::Tile tile;

@@ -170,8 +170,8 @@ void checkPicture(const FrameBuffer& fb, const std::string& what, const std::vec
 dfb::FrameBufferConfig smallConfig()
 {
     dfb::FrameBufferConfig config;
-    config.width = 200;
-    config.height = 150;
+    config.image.width = 200;
+    config.image.height = 150;
     config.executor = std::make_shared<dfb::ThreadExecutor>(2);
     return config;
 }
@@ -180,7 +180,7 @@ dfb::FrameBufferConfig smallConfig()
 void renderAll(MPI_Comm communicator, dfb::Progress progress)
 {
     const std::string name = progress == dfb::Progress::Thread ? "with a thread" : "without a thread";
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.progress = progress;
     {
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>> fb(communicator, smallConfig(), options);

@@ -84,7 +84,7 @@ void die(const Run& run)
 void emptyFrame(
     FrameBuffer& fb, const std::function<void()>& render = [] {})
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = true;
     auto frame = fb.begin(params);
     frame.declare({});
@@ -124,8 +124,8 @@ void runRank(const Run& run, int& argc, char**& argv)
     const bool isVictim = mpi.rank() == run.victim;
     std::atomic<bool> handlerCalled{false};
     std::string text, lateText;
-    dfb::ConnectionOptions options;
-    options.peerTimeoutMs = timeoutMs;
+    dfb::NetworkConfig options;
+    options.peerTimeout = std::chrono::milliseconds(timeoutMs);
     if (run.reaction == "handler")
         options.onPeerLost = [&](const dfb::ErrorInfo& error) {
             handlerCalled = true;
@@ -140,8 +140,8 @@ void runRank(const Run& run, int& argc, char**& argv)
             const auto make = [&] {
                 dfb::FrameBufferConfig config{256, 256};
                 if (run.where == "pixels") {
-                    config.width = config.height = 2048;
-                    config.messagePoolBytes = 0; // as small as can be: who sends waits for who takes
+                    config.image.width = config.image.height = 2048;
+                    config.messages.poolBytes = 0; // as small as can be: who sends waits for who takes
                 }
                 return std::make_unique<FrameBuffer>(connection, config);
             };

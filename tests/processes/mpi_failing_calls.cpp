@@ -151,7 +151,7 @@ int main(int argc, char** argv)
         if (everywhere || mpi.rank() == last)
             failing = call;
         const std::string text = transportErrorOf(what, [&] {
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.sharedMemory = shared;
             FrameBuffer fb(mpi.communicator(), config, options);
         });
@@ -187,7 +187,7 @@ int main(int argc, char** argv)
         const std::string text = transportErrorOf(what, [&] {
             FrameBuffer fb(mpi.communicator(), config);
             for (int i = 0; i < 2; ++i) {
-                dfb::FrameParams params;
+                dfb::FrameConfig params;
                 params.declared = true;
                 auto frame = fb.begin(params);
                 frame.declare({});

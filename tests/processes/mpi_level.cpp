@@ -44,8 +44,8 @@ void noteCall() { callsElsewhere += std::this_thread::get_id() != mainThread; }
 dfb::FrameBufferConfig smallConfig()
 {
     dfb::FrameBufferConfig config;
-    config.width = 50;
-    config.height = 40;
+    config.image.width = 50;
+    config.image.height = 40;
     config.executor = std::make_shared<dfb::ThreadExecutor>(2); // other threads, also where there is one core
     return config;
 }
@@ -53,7 +53,7 @@ dfb::FrameBufferConfig smallConfig()
 std::string transportErrorOf(dfb::Progress progress)
 {
     try {
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.progress = progress;
         dfb::connect(MPI_COMM_WORLD, options);
     } catch (const dfb::TransportError& e) {
@@ -120,8 +120,8 @@ void wallAndSharedWorld()
     dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::RGBA8);
     dfb::DistributedFrameBuffer<Single, dfb::ToWall> fb(connection, wall.frameBufferConfig(), {&wall});
     dfb::FrameBufferConfig config;
-    config.width = 64;
-    config.height = 32;
+    config.image.width = 64;
+    config.image.height = 32;
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> bricks(connection, config);
     const dfb::World both({{3, {{0, 0, 0}, {32, 32, 1}}}, {9, {{32, 0, 0}, {64, 32, 1}}}});
     const dfb::SharedWorld world(bricks, both);
@@ -190,8 +190,8 @@ void otherThread()
 void smallPool()
 {
     auto config = smallConfig();
-    config.messagePoolBytes = 1;
-    config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
+    config.messages.poolBytes = 1;
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
     FrameBuffer fb(MPI_COMM_WORLD, config);
     std::vector<int> mine;
     for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())

@@ -116,7 +116,7 @@ void sayCaught(const std::exception& e, const char* file)
 
 void emptyFrame(dfb::DistributedFrameBuffer<dfb::AlphaBlend>& fb)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = true;
     auto frame = fb.begin(params);
     frame.declare({});

@@ -58,7 +58,7 @@ inline FaultGroup faultGroup(std::uint64_t seed)
     g.faults.drop = pick(40, 3) == 1 ? lethal : 0;
     g.faults.corrupt = pick(40, 3) == 2 ? 2 * lethal : 0;
     g.harmless = g.faults.drop + g.faults.corrupt == 0;
-    g.scene.timeoutMs = g.harmless ? 20000 : 80;
+    g.scene.timeout = std::chrono::milliseconds(g.harmless ? 20000 : 80);
     g.scene.allowPartial = pick(54, 3) == 0;
     // Left alone is what makes the framebuffer, as no frame's time-out covers it; and the word of a rank that it gives
     // up, which a transport that still works at all delivers.
@@ -134,7 +134,7 @@ dfb::FrameReport faultFrame(FrameBuffer& fb, const FaultGroup& group, int frame)
             .render(
                 FlatCamera(), [&](const dfb::Brick& b, dfb::DeepTile& deep) { renderDeep(s, b, deep); }, paramsOf(s));
     } else if constexpr (op == Op::Accumulated) {
-        dfb::FrameParams params = paramsOf(s);
+        dfb::FrameConfig params = paramsOf(s);
         params.accumulationId = static_cast<std::uint64_t>(frame); // one that fails leaves tiles without samples
         return dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
             .render(FlatCamera(), renderOne, params);
@@ -159,13 +159,13 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
     using Transport = dfb::testing::FaultTransport<Base>;
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport>;
     dfb::FrameBufferConfig config;
-    config.width = group.scene.width;
-    config.height = group.scene.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
-    config.messagePoolBytes = group.seed % 3 ? std::size_t{64} << 20 : 0;
+    config.image.width = group.scene.width;
+    config.image.height = group.scene.height;
+    config.image.format = dfb::OutputFormat::RGBA32F;
+    config.image.depth = true;
+    config.messages.poolBytes = group.seed % 3 ? std::size_t{64} << 20 : 0;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1 + static_cast<int>(group.seed % 2));
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.checksums = true;
     std::vector<FaultEnding> endings;
     std::unique_ptr<FrameBuffer> made;

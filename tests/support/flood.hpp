@@ -84,9 +84,9 @@ inline std::size_t wrongSums(const dfb::Image& image, int ranks, int parts)
 inline dfb::FrameBufferConfig floodConfig(int pixels, std::shared_ptr<dfb::Executor> executor)
 {
     dfb::FrameBufferConfig config;
-    config.width = config.height = pixels;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.messagePoolBytes = 0;
+    config.image.width = config.image.height = pixels;
+    config.image.format = dfb::OutputFormat::RGBA32F;
+    config.messages.poolBytes = 0;
     config.executor = std::move(executor);
     return config;
 }
@@ -96,9 +96,9 @@ enum class From { Loop, Thread };
 template <class Fb, class Around>
 dfb::FrameReport floodFrame(Fb& fb, int parts, From from, const Around& around, int timeoutMs = 0)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = true;
-    params.timeoutMs = timeoutMs;
+    params.timeout = std::chrono::milliseconds(timeoutMs);
     auto frame = fb.begin(params);
     std::vector<dfb::TileInput> inputs;
     for (int part = 0; part < parts; ++part)

@@ -19,11 +19,11 @@ std::string largeImage(const typename Transport::Communicator& communicator, boo
         return static_cast<float>((h >> (8 * c)) & 0xff) / 256.0f;
     };
     dfb::FrameBufferConfig config;
-    config.width = config.height = side;
-    config.format = dfb::OutputFormat::RGBA32F;
+    config.image.width = config.image.height = side;
+    config.image.format = dfb::OutputFormat::RGBA32F;
     config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-    config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks > 1 ? 1 : 0; };
-    dfb::ConnectionOptions options;
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks > 1 ? 1 : 0; };
+    dfb::NetworkConfig options;
     options.sharedMemory = sharedMemory;
     dfb::DistributedFrameBuffer<dfb::BasicImageParallel<256>, dfb::NoPixelOp, Transport> fb(communicator, config,
                                                                                             options);

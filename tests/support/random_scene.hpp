@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <chrono>
 #include <cstdint>
 #include <cstring>
 #include <limits>
@@ -33,7 +34,7 @@ struct FlatCamera {
 struct Scene {
     int width = 97, height = 61; // primes
     int passes = 1;
-    int timeoutMs = 0;
+    std::chrono::milliseconds timeout{0};
     bool allowPartial = false;
     dfb::BlendRule rule = dfb::BlendRule::SortByDepth; // InOrder: of the bricks
     std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
@@ -101,12 +102,12 @@ void renderBrick(const Scene& s, const dfb::Brick& brick, Tile& tile)
             }
 }
 
-inline dfb::FrameParams paramsOf(const Scene& s)
+inline dfb::FrameConfig paramsOf(const Scene& s)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.background = s.background;
     params.passes = s.passes;
-    params.timeoutMs = s.timeoutMs;
+    params.timeout = s.timeout;
     params.allowPartial = s.allowPartial;
     return params;
 }
@@ -312,10 +313,10 @@ inline bool has(const std::string& text, const std::string& part) { return text.
 inline dfb::FrameBufferConfig configOf(const Scene& s, int threads = 1)
 {
     dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = dfb::OutputFormat::RGBA32F;
-    config.depth = true;
+    config.image.width = s.width;
+    config.image.height = s.height;
+    config.image.format = dfb::OutputFormat::RGBA32F;
+    config.image.depth = true;
     if (threads > 0)
         config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
     else

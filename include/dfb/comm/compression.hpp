@@ -31,6 +31,15 @@ public:
                             std::size_t rawByteCount) const = 0;
 };
 
+// When messages are compressed, if there is a codec.
+enum class CompressionMode : std::uint8_t {
+    Always,
+    // Between nodes, in frames where compressing has turned out to be faster. All ranks try a few frames with it and a
+    // few without, take the better, and try the other again now and then. Each rank leaves out the ranks for which its
+    // messages do not become smaller.
+    Auto
+};
+
 } // namespace dfb
 
 // CompressionGains: for which ranks the messages of this one become smaller by being compressed. What goes to one can

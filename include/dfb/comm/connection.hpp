@@ -28,23 +28,23 @@
 
 namespace dfb {
 
-// How messages travel: for all framebuffers and walls of a connection. Only `checksums` must be the same on all ranks.
-struct ConnectionOptions {
-    Progress progress = Progress::Auto;
-    // A CRC-32C in each message: whoever does not trust the network pays for it. The first object that is made on it
-    // says if it is not the same on all ranks.
+// How messages travel between ranks, for all framebuffers and walls of a connection. `checksums` must be the same on
+// all ranks; the first object that is made on the connection checks it.
+struct NetworkConfig {
+    Progress progress = Progress::Auto; // who moves messages
+    // True: each message carries a CRC-32C, for networks that are not trusted. Costs a pass over each message.
     bool checksums = false;
-    bool sharedMemory = true; // ranks of one node hand messages over in memory that both see; false: all through MPI
-    // On ranks with a progress thread: while messages are expected, in a frame or a call that waits for all ranks, a
-    // rank of which nothing has been heard for so long is lost: it has ended, is stopped or can not be reached. 0: this
-    // rank looks for no other and is not looked for. Else 100 or more; framebuffers refuse what is less.
-    // And how long, at most, is waited for what a message that could not be read may have been; in a frame without a
-    // time-out 0 is no limit.
-    int peerTimeoutMs = defaultPeerTimeoutMs;
-    // What a rank does that has found another one lost. Null: it ends the job if the transport can (MPI_Abort of
-    // MPI_COMM_WORLD, with the error on standard error), as MPI does not go on without a rank. Else all ranks get the
-    // error as TransportError, with the lost rank in ErrorInfo::rank, and this is called with it, once, by a thread of
-    // the library, where the loss was found: on one neighbour of that rank or several. It must be quick and not throw.
+    // True: ranks of one node hand messages over in memory that both see. False: all messages go through MPI.
+    bool sharedMemory = true;
+    // A rank is lost if nothing has been heard of it for this long while messages are expected: it has ended, is
+    // stopped or cannot be reached. Needs a progress thread on both ranks. 0: this rank neither looks for lost ranks
+    // nor is looked for. Otherwise 100 ms or more; framebuffers refuse less. It also limits the wait for what an
+    // unreadable message may have been; then 0 means no limit, unless the frame has a time-out.
+    std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
+    // Called on a rank that has found another one lost: on one neighbour of the lost rank, or on several, once each, by
+    // a thread of the library. It must be quick and must not throw. All ranks then get a TransportError with the lost
+    // rank in ErrorInfo::rank. Null: the job ends instead, with MPI_Abort and the error on standard error, as MPI does
+    // not go on without a rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
@@ -105,8 +105,8 @@ private:
 class Connection final : private TransportHandler {
 public:
     // See connect(). `pool`: the one that the link has.
-    Connection(ConnectionOptions options, std::shared_ptr<MemoryPool> pool, std::unique_ptr<Link> link)
-        : options_(std::move(options)), pool_(std::move(pool)), link_(std::move(link))
+    Connection(NetworkConfig config, std::shared_ptr<MemoryPool> pool, std::unique_ptr<Link> link)
+        : config_(std::move(config)), pool_(std::move(pool)), link_(std::move(link))
     {
         link_->start(*this);
         if (!hasOwnThread())
@@ -133,7 +133,7 @@ public:
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     // What it was made with, but for Progress::Auto, in place of which is what it has become.
-    const ConnectionOptions& options() const noexcept { return options_; }
+    const NetworkConfig& config() const noexcept { return config_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
     // How many threads this rank should render and composite with: the processors that the calling thread may run on,
@@ -185,7 +185,7 @@ public:
         }
         header.checksum = 0;
         std::memcpy(message.data(), &header, sizeof header);
-        if (options_.checksums) {
+        if (config_.checksums) {
             header.checksum = checksumOf(message);
             std::memcpy(message.data(), &header, sizeof header);
         }
@@ -331,7 +331,7 @@ private:
     void checkChecksum(detail::MessageHeader header, Buffer& message) const
     {
         const std::uint32_t got = header.checksum;
-        if ((got != 0) != options_.checksums && (isAlike_ || !isOfSetUp(header.kind)))
+        if ((got != 0) != config_.checksums && (isAlike_ || !isOfSetUp(header.kind)))
             detail::failMalformed(got != 0 ? "with a checksum; this rank uses none" : "without a checksum");
         if (got == 0)
             return;
@@ -428,12 +428,12 @@ private:
 
     // --- signs of life
 
-    bool hasOwnThread() const { return link_->needsPolling() && options_.progress == Progress::Thread; }
+    bool hasOwnThread() const { return link_->needsPolling() && config_.progress == Progress::Thread; }
 
     std::chrono::milliseconds peerTimeout() const
     {
-        const bool isOn = hasOwnThread() && options_.peerTimeoutMs >= 100;
-        return std::chrono::milliseconds(isOn ? options_.peerTimeoutMs : 0);
+        const bool isOn = hasOwnThread() && config_.peerTimeout >= std::chrono::milliseconds(100);
+        return isOn ? config_.peerTimeout : std::chrono::milliseconds(0);
     }
 
     // Short enough for questions to be answered in time.
@@ -482,12 +482,12 @@ private:
         error.kind = ErrorKind::Transport;
         error.rank = other;
         error.message = detail::printed("this rank is lost: it has ended, is stopped or can not be reached. Rank %d "
-                                        "has heard nothing of it for %d ms (peerTimeoutMs)",
-                                        rank(), options_.peerTimeoutMs);
-        if (link_->canAbort() && !options_.onPeerLost)
+                                        "has heard nothing of it for %lld ms (peerTimeout)",
+                                        rank(), static_cast<long long>(config_.peerTimeout.count()));
+        if (link_->canAbort() && !config_.onPeerLost)
             link_->abort(error.describe());
-        if (giveUp(error) && options_.onPeerLost)
-            options_.onPeerLost(error);
+        if (giveUp(error) && config_.onPeerLost)
+            config_.onPeerLost(error);
     }
 
     void waiting() override { beat(Clock::now(), true); }
@@ -499,7 +499,7 @@ private:
             receiver->connectionFailed();
     }
 
-    const ConnectionOptions options_;
+    const NetworkConfig config_;
     const int exceptions_ = std::uncaught_exceptions();
     std::shared_ptr<MemoryPool> pool_;
     std::unique_ptr<Link> link_;
@@ -533,13 +533,12 @@ private:
 
 // Collective, like the end of what it returns: connects the ranks of a communicator. Throws TransportError.
 template <class Transport = MpiTransport>
-std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator,
-                                    ConnectionOptions options = {})
+std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})
 {
-    options.progress = detail::resolved<Transport>(options.progress, communicator);
-    auto pool = MemoryPool::create(options.sharedMemory);
-    auto link = std::make_unique<detail::LinkOver<Transport>>(communicator, pool, options.progress);
-    return std::make_shared<Connection>(std::move(options), std::move(pool), std::move(link));
+    config.progress = detail::resolved<Transport>(config.progress, communicator);
+    auto pool = MemoryPool::create(config.sharedMemory);
+    auto link = std::make_unique<detail::LinkOver<Transport>>(communicator, pool, config.progress);
+    return std::make_shared<Connection>(std::move(config), std::move(pool), std::move(link));
 }
 
 } // namespace dfb

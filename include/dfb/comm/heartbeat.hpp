@@ -14,7 +14,7 @@ namespace dfb {
 
 // Minutes, as a rank may be held for a while and then go on: stopped by a batch system, by swapping, in a debugger. How
 // long it renders does not matter, since its progress thread answers meanwhile.
-inline constexpr int defaultPeerTimeoutMs = 300000;
+inline constexpr std::chrono::milliseconds defaultPeerTimeout{300000};
 
 namespace detail {
 

@@ -213,7 +213,7 @@ private:
 
 static_assert(is_transport_v<InprocTransport>);
 DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&,
-                                                                           ConnectionOptions));
+                                                                           NetworkConfig));
 
 // Calls `body(communicator)` on `rankCount` threads, one per rank, and waits for all. If a body throws, the ranks that
 // wait for it get a TransportError, and the first exception is rethrown. With `shuffleSeed` messages arrive in a

@@ -337,7 +337,7 @@ public:
     }
 
     // Collective: combines `own` over all ranks and waits for the result. Throws TransportError, also when a message
-    // could not be read that may have been a part of this: when there is no result after a second, or `peerTimeoutMs`
+    // could not be read that may have been a part of this: when there is no result after a second, or `peerTimeout`
     // if it came before this rank was here; InvalidArgument, see requireProgress().
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
@@ -427,7 +427,7 @@ private:
     void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
-        const std::chrono::milliseconds late(connection_->options().peerTimeoutMs);
+        const std::chrono::milliseconds late = connection_->config().peerTimeout;
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
         if (damage)

@@ -942,6 +942,6 @@ private:
 };
 
 static_assert(is_transport_v<MpiTransport>);
-DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<MpiTransport>(const MPI_Comm&, ConnectionOptions));
+DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<MpiTransport>(const MPI_Comm&, NetworkConfig));
 
 } // namespace dfb

@@ -36,7 +36,8 @@ public:
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;
     virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) = 0;
 
-    virtual void begin(const FrameParams& params) = 0;
+    virtual bool isOpen() const noexcept = 0;
+    virtual void begin(const FrameConfig& params) = 0;
     virtual std::int64_t frame() const noexcept = 0; // the number of the one that has begun last
     virtual TileHeader headerOf(int tile, int pass) const = 0;
     virtual ChannelMask sent() const noexcept = 0; // what of the inputs travels in this frame
@@ -54,6 +55,7 @@ public:
     virtual void abort(const std::exception_ptr& reason, int tile) = 0;
     virtual void cancel(std::int64_t frame) = 0;
     virtual void requireProgress() const = 0;
+    virtual bool isDone() = 0;
     virtual FrameReport end() = 0;
     virtual void leave() noexcept = 0; // in place of end(), by who throws
 };

@@ -40,36 +40,36 @@ public:
         : pool_(connection->pool()), config_(std::move(config)), operations_(operations),
           open_(slot + 1, std::max(1, config_.framesInFlight))
     {
-        config_.messagePoolBytes =
-            std::max(config_.messagePoolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
+        config_.messages.poolBytes =
+            std::max(config_.messages.poolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
         MailboxOwner& self = *this;
-        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messagePoolBytes, self);
-        gains_.emplace(config_.codec ? size() : 0);
+        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self);
+        gains_.emplace(config_.messages.codec ? size() : 0);
         mailbox_->start();
         Agreement mine;
         try {
-            if (config_.displayRank < 0 || config_.displayRank >= size())
-                failArgument("the display rank is %d of %d", config_.displayRank, size());
+            if (config_.image.displayRank < 0 || config_.image.displayRank >= size())
+                failArgument("the display rank is %d of %d", config_.image.displayRank, size());
             if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
                 failArgument(
                     "there can not be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
                     config_.framesInFlight);
-            if (config_.aux & ~(traits().channels & imageAuxChannels))
+            if (config_.image.aux & ~(traits().channels & imageAuxChannels))
                 failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
                              "do not have",
-                             config_.aux);
-            if (const int ms = mailbox_->connection().options().peerTimeoutMs; ms != 0 && ms < 100)
-                failArgument("a time-out for peers of %d ms: 0, or 100 and more", ms);
-            if (config_.quietMs < 1)
-                failArgument("quietMs is %d: it must be 1 or more", config_.quietMs);
+                             config_.image.aux);
+            if (const long long ms = mailbox_->connection().config().peerTimeout.count(); ms != 0 && ms < 100)
+                failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
+            if (const long long ms = config_.quiet.count(); ms < 1)
+                failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
             checkWire();
             pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), mailbox_->address(),
                                                        [this](Buffer&& message) { sendToDisplay(std::move(message)); });
             outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                       [this](Verdict& verdict) { addFigures(verdict); });
             // The rank after the display rank hands out jobs, as that one has enough to do.
-            jobs_.emplace(*mailbox_, open_, *outcome_, (config_.displayRank + 1) % size());
-            mine = Agreement::of(traits(), config_, mailbox_->connection().options().checksums, rank(),
+            jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
+            mine = Agreement::of(traits(), config_, mailbox_->connection().config().checksums, rank(),
                                  TilePipeline::travelling(traits(), config_), layout().tileCount(),
                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
@@ -110,10 +110,11 @@ public:
     const Image& image() const noexcept override { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
     std::int64_t imageFrame() const noexcept override { return pipeline_->gather().imageFrame(); }
     bool isComplete(int tile) const override { return pipeline_->gather().isComplete(tile); }
+    bool isOpen() const noexcept override { return open_.state() != FrameState::Closed; }
     std::int64_t frame() const noexcept override { return open_.number(); }
     bool failed() const noexcept override { return outcome_->failed(); }
 
-    void begin(const FrameParams& params) override
+    void begin(const FrameConfig& params) override
     {
         if (isOpen())
             failArgument("begin() while a frame is open: end() it first");
@@ -122,8 +123,8 @@ public:
         if (params.maxLayers < 0)
             failArgument("at most %d layers", params.maxLayers);
         checkSamples(params);
-        if (params.timeoutMs < 0)
-            failArgument("a time-out of %d ms", params.timeoutMs);
+        if (const long long ms = params.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
+            failArgument("a time-out of %lld ms", ms);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         params_ = params;
@@ -140,19 +141,19 @@ public:
         info.background = params.background;
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.displayRank) != nullptr);
+            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.image.displayRank) != nullptr);
         } catch (...) {
             userError = std::current_exception();
         }
         jobs_->newFrame();
         if (traits().opaqueHides)
             hidden_.newFrame(layout().tileCount());
-        outcome_->newFrame({terms_, params.declared, params.allowPartial, std::chrono::milliseconds(params.timeoutMs),
-                            std::chrono::milliseconds(config_.quietMs)});
+        outcome_->newFrame({terms_, params.declared, params.allowPartial, params.timeout, config_.quiet});
         inputsSent_ = 0;
         bytesBefore_ = mailbox_->bytesSent();
         messagesBefore_ = mailbox_->messagesSent();
         renderNs_ = 0;
+        isEnding_ = false;
         figures_.newFrame();
         std::int64_t rendered = 0;
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
@@ -213,14 +214,11 @@ public:
     void addFigure(std::uint64_t key, double value) override { figures_.add(key, value); }
     void noteMergeError(int tile, double bound) override { figures_.addMergeError(tile, bound / samples(tile).count); }
 
-    JobRange nextJobs(std::int64_t count) override
-    {
-        return jobs_->next(count, std::chrono::milliseconds(params_.timeoutMs));
-    }
+    JobRange nextJobs(std::int64_t count) override { return jobs_->next(count, params_.timeout); }
 
     void waitForRoom()
     {
-        const std::chrono::milliseconds limit(params_.timeoutMs);
+        const std::chrono::milliseconds limit = params_.timeout;
         if (mailbox_->waitForRoom([this] { return outcome_->failed(); }, limit))
             return;
         ErrorInfo info;
@@ -279,8 +277,12 @@ public:
 
     void requireProgress() const override { mailbox_->requireProgress(); }
 
-    FrameReport end() override
+    // The end() of this rank, as far as it waits for nobody.
+    void beginEnd()
     {
+        if (isEnding_)
+            return;
+        isEnding_ = true;
         if (params_.declared && !declarations_.declared() && !outcome_->failed()) {
             const auto reason = open_.reason(); // why declare() was not called, in a frame that may be partial
             outcome_->failWhole(reason ? std::make_exception_ptr(Error(*reason))
@@ -289,13 +291,31 @@ public:
         }
         if (pipeline_->gather().displays())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
-        const Verdict verdict = conclude();
+        renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+    }
+
+    bool isDone() override
+    {
+        try {
+            beginEnd();
+            outcome_->beginEnd();
+            poll();
+            return outcome_->isConcluded();
+        } catch (const TransportError&) {
+            return true; // end() throws it
+        }
+    }
+
+    FrameReport end() override
+    {
+        beginEnd();
+        const Verdict verdict = outcome_->conclude();
         if (verdict.error && !outcome_->isPartial(verdict))
             throw FrameError(*verdict.error);
         const bool compressed = compresses();
         pipeline_->fillBackground();
         if (!verdict.error) {
-            if (config_.codec)
+            if (config_.messages.codec)
                 compressionTrial_.took(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
             gains_->endFrame();
             lastAccumulationId_ = params_.accumulationId;
@@ -334,7 +354,7 @@ public:
             else
                 outcome_->failWhole(cancelled("the frame was left without end(). If by an exception: Frame::guard() "
                                               "around what throws tells all ranks its text"));
-            conclude();
+            outcome_->conclude();
         } catch (const TransportError&) {
             // begin() will say so.
         }
@@ -359,11 +379,10 @@ private:
 
     using Clock = std::chrono::steady_clock;
 
-    bool isOpen() const noexcept { return open_.state() != FrameState::Closed; }
-
     bool compresses() const
     {
-        return config_.codec && (config_.compression == CompressionMode::Always || compressionTrial_.compresses());
+        return config_.messages.codec
+               && (config_.messages.compression == CompressionMode::Always || compressionTrial_.compresses());
     }
 
     // What messages with pixels to that rank are compressed with in this frame, or null.
@@ -371,9 +390,9 @@ private:
     {
         if (other == rank() || !compresses())
             return nullptr;
-        const bool isLeftOut = config_.compression == CompressionMode::Auto
+        const bool isLeftOut = config_.messages.compression == CompressionMode::Auto
                                && (mailbox_->connection().isSeenBy(other) || !gains_->isWorthwhile(other));
-        return isLeftOut ? nullptr : config_.codec.get();
+        return isLeftOut ? nullptr : config_.messages.codec.get();
     }
 
     // Lets messages of the frame in. `tiles`: that this rank expects to finish, beside those of `withoutSamples`, of
@@ -433,17 +452,17 @@ private:
     {
         if (mailbox_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
             if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
-                gains_->add(config_.displayRank, raw, message.size());
-            mailbox_->sendWithCredit(config_.displayRank, std::move(message));
+                gains_->add(config_.image.displayRank, raw, message.size());
+            mailbox_->sendWithCredit(config_.image.displayRank, std::move(message));
         } else
-            mailbox_->send(config_.displayRank, std::move(message));
+            mailbox_->send(config_.image.displayRank, std::move(message));
     }
 
     // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
     // not heard of it by the end of the first frame goes on sending tiles.
     void tellImagePlace()
     {
-        if (rank() != config_.displayRank)
+        if (rank() != config_.image.displayRank)
             return;
         Connection& connection = mailbox_->connection();
         std::vector<int> seers;
@@ -625,13 +644,6 @@ private:
         return info;
     }
 
-    // See FrameOutcome::conclude().
-    Verdict conclude()
-    {
-        renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
-        return outcome_->conclude();
-    }
-
     // What this rank has counted in the frame.
     void addFigures(Verdict& v)
     {
@@ -666,27 +678,29 @@ private:
 
     void checkWire() const
     {
-        const WirePrecision& w = config_.wire;
+        const Precision& w = config_.precision;
         if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
             failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
+        if (w.color == WireFormat::Bytes)
+            failArgument("the format bytes is that of inputs of 8 bits, and cannot be asked for");
         if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
             failArgument("a least transmittance of %f", config_.minTransmittance);
     }
 
     // Whether what the last frame left behind is of use.
-    bool accumulates(const FrameParams& params) const
+    bool accumulates(const FrameConfig& params) const
     {
         return traits().keepsState && !outcome_->lastFailed() && params.accumulationId == lastAccumulationId_;
     }
 
     // Without a plan: of each tile.
-    int firstSampleOf(const FrameParams& params) const
+    int firstSampleOf(const FrameConfig& params) const
     {
         return !params.samples && accumulates(params) ? nextSample_ : 0;
     }
 
     // Throws InvalidArgument for samples that this framebuffer can not take.
-    void checkSamples(const FrameParams& params) const
+    void checkSamples(const FrameConfig& params) const
     {
         if (!params.samples) {
             if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
@@ -720,7 +734,7 @@ private:
     OpenFrame open_;
     std::unique_ptr<FrameOutcome> outcome_;
     std::optional<JobExchange> jobs_;
-    FrameParams params_;
+    FrameConfig params_;
     FrameTerms terms_; // of params_
     std::uint64_t lastAccumulationId_ = 0;
     int nextSample_ = 0; // of each tile, if the next frame has no plan and accumulates
@@ -729,6 +743,7 @@ private:
     std::optional<CompressionGains> gains_;   // per rank that this one sends to
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{0};
+    bool isEnding_ = false; // beginEnd() was called
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()

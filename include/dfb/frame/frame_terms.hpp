@@ -22,7 +22,7 @@ private:
     std::uint64_t value_ = 1469598103934665603u;
 };
 
-// The fields of FrameParams; travels with each verdict as it is.
+// The fields of FrameConfig; travels with each verdict as it is.
 struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan
@@ -32,7 +32,7 @@ struct FrameTerms {
     std::int32_t declared = 0, allowPartial = 0;
     std::int32_t rank = 0; // whose; the lowest of those that are alike
 
-    static FrameTerms of(const FrameParams& p, int rank)
+    static FrameTerms of(const FrameConfig& p, int rank)
     {
         FrameTerms t;
         if (p.samples) {
@@ -47,7 +47,7 @@ struct FrameTerms {
         std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
         t.passes = p.passes;
         t.maxLayers = p.maxLayers;
-        t.timeoutMs = p.timeoutMs;
+        t.timeoutMs = static_cast<std::int32_t>(p.timeout.count());
         t.declared = p.declared;
         t.allowPartial = p.allowPartial;
         t.rank = rank;
@@ -64,7 +64,7 @@ struct FrameTerms {
         std::string text;
         const auto compare = [&](const char* name, bool differs, const std::string& here, const std::string& there) {
             if (text.empty() && differs)
-                text = printed("FrameParams::%s is %s on rank %d and %s on rank %d", name, here.c_str(), rank,
+                text = printed("FrameConfig::%s is %s on rank %d and %s on rank %d", name, here.c_str(), rank,
                                there.c_str(), o.rank);
         };
         const auto number = [&](const char* name, std::uint64_t here, std::uint64_t there) {
@@ -87,7 +87,7 @@ struct FrameTerms {
         number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
         number("accumulationId", accumulationId, o.accumulationId);
         flag("declared", declared, o.declared);
-        number("timeoutMs", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
+        number("timeout", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
         flag("allowPartial", allowPartial, o.allowPartial);
         return text;
     }

@@ -48,6 +48,7 @@ public:
     {
         terms_ = terms;
         verdict_.reset();
+        isEnding_ = false;
         quiescence_.newFrame(terms.quiet);
     }
 
@@ -143,16 +144,39 @@ public:
         });
     }
 
-    // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError. Of the thread that
-    // is in end().
+    // This rank has set its last tile: from now on it votes as soon as it can. Of the thread that is in end(), as the
+    // next two.
+    void beginEnd()
+    {
+        if (isEnding_)
+            return;
+        isEnding_ = true;
+        frame_.finish();
+        endedAt_ = Clock::now();
+        nextLook_ = endedAt_ + quiescence_.interval();
+        tryVote();
+    }
+
+    // Whether conclude() need not wait for the verdict. Does what has to be done while it is waited for.
+    bool isConcluded()
+    {
+        const auto now = Clock::now();
+        const bool isDecided = frame_.state() == FrameState::Decided || mailbox_.failed();
+        if (!isDecided)
+            lookInTime(now);
+        const bool isLate = terms_.timeout.count() > 0 && now >= endedAt_ + terms_.timeout;
+        if (!isDecided && isLate && !failed())
+            fail(std::make_exception_ptr(Error(missing(ErrorKind::TimedOut))));
+        return isDecided || (isLate && now >= endedAt_ + 2 * terms_.timeout);
+    }
+
+    // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
     Verdict conclude()
     {
-        frame_.finish();
-        nextLook_ = Clock::now() + quiescence_.interval();
         std::exception_ptr transportError;
         Verdict verdict;
         try {
-            tryVote();
+            beginEnd();
             verdict = terms_.timeout.count() > 0 ? waitInTime() : waitWithoutLimit();
             if (!verdict.error)
                 verdict.error = verdict.strayInputs();
@@ -285,12 +309,11 @@ private:
     // The verdict, or a frame that fails for what is missing, or, if even that cannot be agreed on, TransportError.
     Verdict waitInTime()
     {
-        const auto start = Clock::now();
-        if (const Verdict* verdict = waitAndLook(start + terms_.timeout))
+        if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout))
             return *verdict;
         if (!failed())
             fail(std::make_exception_ptr(Error(missing(ErrorKind::TimedOut))));
-        if (const Verdict* verdict = wait(start + 2 * terms_.timeout))
+        if (const Verdict* verdict = wait(endedAt_ + 2 * terms_.timeout))
             return *verdict;
         giveUpVerdict(2 * terms_.timeout);
     }
@@ -299,7 +322,7 @@ private:
     // the verdict, is it waited for no longer than for a rank of which nothing is heard.
     Verdict waitWithoutLimit()
     {
-        const auto limit = std::chrono::milliseconds(mailbox_.connection().options().peerTimeoutMs);
+        const auto limit = mailbox_.connection().config().peerTimeout;
         const auto step = limit.count() > 0 ? std::min(limit, untilAsked) : untilAsked;
         std::optional<Clock::time_point> deadline;
         for (;;) {
@@ -320,13 +343,17 @@ private:
             if (const Verdict* verdict = wait(std::min(deadline, nextLook_)))
                 return verdict;
             const auto now = Clock::now();
-            if (now >= nextLook_) {
-                nextLook_ = now + quiescence_.interval();
-                look();
-            }
+            lookInTime(now);
             if (now >= deadline)
                 return nullptr;
         }
+    }
+    void lookInTime(Clock::time_point now)
+    {
+        if (now < nextLook_)
+            return;
+        nextLook_ = now + quiescence_.interval();
+        look();
     }
 
     // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
@@ -454,6 +481,8 @@ private:
     bool lastFailed_ = false;
     std::optional<Verdict> verdict_; // set once, before the frame is Decided
     Quiescence quiescence_;
+    bool isEnding_ = false;      // beginEnd() was called
+    Clock::time_point endedAt_;  // then
     Clock::time_point nextLook_; // at it; of the thread that is in end()
 };
 

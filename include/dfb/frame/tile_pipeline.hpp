@@ -33,20 +33,22 @@ public:
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
                  int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
-          table_(TileLayout(config.width, config.height, traits().tileSize),
-                 config.ownerMap ? config.ownerMap : latticeOwner, rank, rankCount, operations),
+          table_(TileLayout(config.image.width, config.image.height, traits().tileSize),
+                 config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
-              pool_, table_.layout(), {config.format, imageChannels(config), address, config.codec, config.dither},
-              config.displayRank, rank, sendersTo(config.displayRank, rankCount),
+              pool_, table_.layout(),
+              {config.image.format, imageChannels(config), address, config.messages.codec, config.image.dither,
+               config.onTile},
+              config.image.displayRank, rank, sendersTo(config.image.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
-          coder_(config.wire, traits().activeByDepth)
+          coder_(config.precision, traits().activeByDepth)
     {
     }
 
     // What the image has beside the colour.
     static ChannelMask imageChannels(const FrameBufferConfig& config)
     {
-        return static_cast<ChannelMask>(config.aux | (config.depth ? depthChannel : 0));
+        return static_cast<ChannelMask>(config.image.aux | (config.image.depth ? depthChannel : 0));
     }
     // What of a tile is read at all: by the operation, for the image, or to tell in which of several passes what gives
     // position and ids is the nearest.
@@ -54,7 +56,7 @@ public:
                                   bool comparesPasses = true)
     {
         const bool comparesDepths =
-            comparesPasses && (config.aux & (positionChannel | primitiveIdChannel | instanceIdChannel)) != 0;
+            comparesPasses && (config.image.aux & (positionChannel | primitiveIdChannel | instanceIdChannel)) != 0;
         return static_cast<ChannelMask>(
             traits.channels & (traits.neededChannels | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
     }
@@ -64,7 +66,7 @@ public:
     {
         const int size = traits.tileSize;
         return std::max(largestFragment(size, size, travelling(traits, config)),
-                        FinalGather::largestMessage(size, config.format, imageChannels(config)));
+                        FinalGather::largestMessage(size, config.image.format, imageChannels(config)));
     }
 
     TileTable& table() noexcept { return table_; }
@@ -87,7 +89,7 @@ public:
         background_ = info.background;
         backgroundIsFine_ = true;
         table_.newFrame(info, plan);
-        losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.wire.maxColor, largestBackground(),
+        losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(maxLayers);
         operations_.newFrame();
@@ -101,8 +103,8 @@ public:
         const ConstPlanes& planes = tile.planes();
         if (!planes.at[Color])
             return;
-        if (tile.stride < static_cast<std::size_t>(tile.region.width()))
-            failArgument("a view of tile %d with rows of %zu pixels", tile.tile, tile.stride);
+        if (std::abs(tile.stride) < tile.region.width())
+            failArgument("a view of tile %d with rows of %lld pixels", tile.tile, static_cast<long long>(tile.stride));
         for (std::size_t c = 0; c < channelCount; ++c)
             if (!planes.at[c] && hasChannel(sent_, c))
                 failArgument("a view of tile %d without its %s, which is needed", tile.tile, channelNames[c]);
@@ -153,7 +155,7 @@ public:
     {
         Fragment fragment = decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
-            config_.codec.get(), coder_);
+            config_.messages.codec.get(), coder_);
         const TileHeader& h = fragment.header();
         const int tile = h.tile;
         where.tile = tile;
@@ -164,9 +166,10 @@ public:
             failMalformed("an input for a tile of another owner");
         if (const auto mine = static_cast<ChannelMask>(sent_ | colorChannel); fragment.channels() != mine)
             failMalformed("an input with other channels than this rank's", mine, fragment.channels());
-        if (fragment.colorFormat() != WireFormat::Float32 && fragment.colorFormat() != config_.wire.color
-            && config_.wire.budget == 0)
-            failMalformed("a colour in another format than this rank's", static_cast<std::int64_t>(config_.wire.color),
+        if (fragment.colorFormat() != WireFormat::Float32 && fragment.colorFormat() != WireFormat::Bytes
+            && fragment.colorFormat() != config_.precision.color && config_.precision.budget == 0)
+            failMalformed("a colour in another format than this rank's",
+                          static_cast<std::int64_t>(config_.precision.color),
                           static_cast<std::int64_t>(fragment.colorFormat()));
         if (isLossy())
             losses_.add(fragment, coder_);
@@ -200,10 +203,10 @@ public:
     void setLayers(int maxLayers)
     {
         const double largest = largestBackground();
-        WireFormat color = config_.wire.color;
-        if (config_.wire.budget > 0) {
-            const auto maxColor = static_cast<double>(config_.wire.maxColor);
-            const double left = config_.wire.budget
+        WireFormat color = config_.precision.color;
+        if (config_.precision.budget > 0) {
+            const auto maxColor = static_cast<double>(config_.precision.maxColor);
+            const double left = config_.precision.budget
                                 - static_cast<double>(config_.minTransmittance) * std::max({1.0, maxColor, largest});
             color = cheapestWithin(left, maxLayers, maxColor, largest);
         }
@@ -221,7 +224,7 @@ public:
         pixel.frame = table_.frameInfo().frame;
         pixel.region = {0, 0, 1, 1};
         pixel.color = background_.data();
-        pixel.depth = config_.depth ? &depth : nullptr;
+        pixel.depth = config_.image.depth ? &depth : nullptr;
         backgroundIsFine_ = false; // if it throws
         operations_.process(pixel);
         backgroundIsFine_ = true;
@@ -273,7 +276,7 @@ private:
         BackgroundPixels& background = table_.backgroundPixels(tile);
         auto place = gather_.reserve(tile);
         background.newFrame(region.width(), region.height(), place.imageEpoch);
-        FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither, &background);
+        FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither, &background);
         table_.finish(tile, out);
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
@@ -316,11 +319,11 @@ private:
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
         for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
             const float* row = floatsOf(planes.at[Color]) + 4 * width * y;
-            std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.format);
-            if (config_.dither)
-                ditherPixels(row, region.width(), config_.format, region.x0, region.y0 + static_cast<int>(y), to);
+            std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.image.format);
+            if (config_.image.dither)
+                ditherPixels(row, region.width(), config_.image.format, region.x0, region.y0 + static_cast<int>(y), to);
             else
-                convertPixels(row, region.width(), config_.format, to);
+                convertPixels(row, region.width(), config_.image.format, to);
             for (std::size_t c = Depth; c < channelCount; ++c) {
                 const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
                 if (place.planes.at[c])
@@ -341,7 +344,8 @@ private:
 
     bool isLossy() const noexcept
     {
-        return config_.wire.color != WireFormat::Float32 || config_.wire.budget > 0 || config_.minTransmittance > 0;
+        return config_.precision.color != WireFormat::Float32 || config_.precision.budget > 0
+               || config_.minTransmittance > 0;
     }
     double largestBackground() const
     {

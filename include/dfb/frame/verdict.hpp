@@ -306,7 +306,7 @@ struct Agreement {
         std::string text_;
     };
 
-    // `checksums`: see ConnectionOptions; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
+    // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
     // the owner map's answers.
     template <class OwnerOf>
     static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, int rank,
@@ -322,22 +322,22 @@ struct Agreement {
         s.add("the size of tiles", operations.tileSize);
         s.add("the mask of channels", operations.channels);
         s.add("the mask of channels that travel", sent);
-        s.add("width", c.width);
-        s.add("height", c.height);
-        s.add("format", nameOf(c.format));
-        s.add("depth", c.depth);
-        s.add("aux", c.aux);
-        s.add("dither", c.dither);
-        s.add("displayRank", c.displayRank);
+        s.add("width", c.image.width);
+        s.add("height", c.image.height);
+        s.add("format", nameOf(c.image.format));
+        s.add("depth", c.image.depth);
+        s.add("aux", c.image.aux);
+        s.add("dither", c.image.dither);
+        s.add("displayRank", c.image.displayRank);
         s.add("framesInFlight", c.framesInFlight);
         s.add(ownerMap, owners.value());
-        s.add("the id of codec", c.codec ? c.codec->id() : 0);
-        s.add("compression", c.compression == CompressionMode::Auto ? "Auto" : "Always");
-        s.add("wire.color", nameOf(c.wire.color));
-        s.add("wire.budget", c.wire.budget);
-        s.add("wire.maxColor", c.wire.maxColor);
+        s.add("the id of messages.codec", c.messages.codec ? c.messages.codec->id() : 0);
+        s.add("messages.compression", c.messages.compression == CompressionMode::Auto ? "Auto" : "Always");
+        s.add("precision.color", nameOf(c.precision.color));
+        s.add("precision.budget", c.precision.budget);
+        s.add("precision.maxColor", c.precision.maxColor);
         s.add("minTransmittance", c.minTransmittance);
-        s.add("messagePoolBytes", c.messagePoolBytes);
+        s.add("messages.poolBytes", c.messages.poolBytes);
         s.add("checksums", checksums);
         return {true, s.text(), rank};
     }

@@ -34,6 +34,7 @@ struct GatherSettings {
     std::uint32_t receiver = 0; // address of the framebuffer
     std::shared_ptr<const Codec> codec;
     bool dither = false;
+    TileCallback onTile{}; // see FrameBufferConfig::onTile
 };
 
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
@@ -231,6 +232,7 @@ public:
             return true;
         if (isDisplay()) {
             state_[static_cast<std::size_t>(tile)] = TileState::Received;
+            tellTile(tile);
             return true;
         }
         if (place.writer) {
@@ -350,11 +352,14 @@ public:
         }
         SentCount here{0, 1};
         while (left > 0) {
-            const std::size_t bytes = record_.read(in, left, layout_, [this, source](int tile, const Region& region) {
+            int tile = -1;
+            const std::size_t bytes = record_.read(in, left, layout_, [&](int its, const Region& region) {
+                tile = its;
                 checkOwner(tile, source);
                 receiveOnce(tile);
                 return inImage(image_.planesAt(0), region);
             });
+            tellTile(tile);
             in += bytes;
             left -= bytes;
             ++here.tiles;
@@ -378,6 +383,7 @@ public:
                 failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
             checkOwner(tile, source);
             receiveOnce(tile);
+            tellTile(tile);
         }
         const std::lock_guard<std::mutex> lock(mutex_);
         TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
@@ -579,6 +585,12 @@ private:
             info.message = "a finished tile came twice";
             throw Error(std::move(info));
         }
+    }
+
+    void tellTile(int tile) const
+    {
+        if (settings_.onTile)
+            settings_.onTile(tile, layout_.region(tile), image_);
     }
 
     // Under mutex_.

@@ -65,7 +65,7 @@ public:
 
     const WallLayout& layout() const noexcept { return layout_; }
 
-    void finish(std::int64_t frame, int timeoutMs)
+    void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
         mailbox_->requireProgress();
         mailbox_->connection().expectMessages(true);
@@ -73,8 +73,8 @@ public:
         std::string missing;
         try {
             std::optional<std::chrono::steady_clock::time_point> deadline;
-            if (timeoutMs > 0)
-                deadline = std::chrono::steady_clock::now() + std::chrono::milliseconds(timeoutMs);
+            if (timeout.count() > 0)
+                deadline = std::chrono::steady_clock::now() + timeout;
             tellSent(frame);
             mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
             missing = whatIsMissing(frame);
@@ -191,7 +191,7 @@ private:
         for (const int rank : layout_.ranks)
             ranks += (ranks.empty() ? "" : ", ") + text(rank);
         settings.add("the list of its displays' ranks", '{' + ranks + '}');
-        settings.add("checksums", mailbox_->connection().options().checksums);
+        settings.add("checksums", mailbox_->connection().config().checksums);
         return settings.text();
     }
 

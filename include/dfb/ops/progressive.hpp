@@ -62,7 +62,7 @@ struct Moments {
 };
 
 // `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The
-// image is the mean of all samples since FrameParams::accumulationId changed, a frame failed, or a tile began with
+// image is the mean of all samples since FrameConfig::accumulationId changed, a frame failed, or a tile began with
 // sample 0. "4 more samples a frame until the camera moves":
 //
 //   params.passes = 4;
@@ -71,7 +71,7 @@ struct Moments {
 //       loop.render(renderTile, params); // any loop; tile.sample is 0, 1, 2 and so on
 //   }
 //
-// With FrameParams::samples, a tile must get its samples in order, in each frame those that follow; a tile without
+// With FrameConfig::samples, a tile must get its samples in order, in each frame those that follow; a tile without
 // samples in a frame costs nothing and keeps its pixels. For each finished tile TileReport::error is the standard error
 // of its pixels' mean (root mean square over pixels and RGBA) in the worst of its blocks of 8x8 pixels, so that a
 // bright corner counts however dark the rest is; infinite before the second sample. Memory: 45 bytes a pixel of a tile

@@ -183,7 +183,7 @@ public:
     // costs what it costs without.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameParams params = {},
+                                                    FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -214,7 +214,7 @@ public:
 
     // Collective. The same, and ends the frame. Throws what Frame::end() throws.
     template <class Camera, class RenderBrick>
-    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
                        const typename FrameBuffer::PixelFrameData& pixelData = {})
     {

@@ -166,7 +166,7 @@ public:
     // it writes the pixels of tile.region into the cleared tile. Throws what FrameBuffer::begin() throws; an exception
     // of renderTile becomes a FrameError of Frame::end() on all ranks.
     template <class RenderTile>
-    [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameParams params = {},
+    [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -208,7 +208,7 @@ public:
 
     // Collective. The same, and ends the frame. Throws what Frame::end() throws.
     template <class RenderTile>
-    FrameReport render(const RenderTile& renderTile, const FrameParams& params = {},
+    FrameReport render(const RenderTile& renderTile, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
                        const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -273,7 +273,7 @@ public:
     // throws; an exception of renderBrick becomes a FrameError of Frame::end() on all ranks.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameParams params = {},
+                                                    FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -288,7 +288,7 @@ public:
 
     // Collective. The same, and ends the frame. Throws what Frame::end() throws.
     template <class Camera, class RenderBrick>
-    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
                        const typename FrameBuffer::PixelFrameData& pixelData = {})
     {

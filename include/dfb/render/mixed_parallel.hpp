@@ -334,7 +334,7 @@ public:
     // As DataParallelLoop::start(); `renderBrick(brick, tile)` may return what it has cost, a number in any unit.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameParams params = {},
+                                                    FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -368,7 +368,7 @@ public:
 
     // Collective. The same, and ends the frame. Throws what Frame::end() throws.
     template <class Camera, class RenderBrick>
-    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameParams& params = {},
+    FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
                        const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -399,7 +399,7 @@ public:
     // visibilityOrder().
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
-                                                    const RenderBrick& renderBrick, FrameParams params = {},
+                                                    const RenderBrick& renderBrick, FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
@@ -432,7 +432,7 @@ public:
     // Collective. The same, and ends the frame. Throws what Frame::end() throws.
     template <class Camera, class RenderBrick>
     FrameReport render(const Camera& camera, const std::vector<int>& order, const RenderBrick& renderBrick,
-                       const FrameParams& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
+                       const FrameConfig& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},
                        const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         return start(camera, order, renderBrick, params, tileData, pixelData).end();

@@ -60,7 +60,7 @@ public:
     }
 
     // What the next frame is to begin with; the rest is as in `params`.
-    FrameParams next(FrameParams params = {}) const
+    FrameConfig next(FrameConfig params = {}) const
     {
         params.samples = std::make_shared<const std::vector<TileSamples>>(plan_);
         params.accumulationId = accumulationId_;

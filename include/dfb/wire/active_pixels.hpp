@@ -57,6 +57,42 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
     return findActivePixels(rgba, count);
 }
 
+// The same of pixels of 8 bits a channel.
+DFB_INLINE std::uint64_t findActiveBytes(const std::byte* rgba, int count)
+{
+    std::uint64_t bits = 0;
+    for (int i = 0; i < count; ++i) {
+        std::uint32_t pixel = 0;
+        std::memcpy(&pixel, rgba + 4 * i, sizeof pixel);
+        bits |= std::uint64_t{pixel != 0} << i;
+    }
+    return bits;
+}
+
+#if defined(DFB_HAS_AVX2_CLONES)
+DFB_AVX2 inline std::uint64_t findActiveBytesAvx2(const std::byte* rgba, int count)
+{
+    const __m256i zero = _mm256_setzero_si256();
+    std::uint64_t bits = 0;
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        const __m256i pixels = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(rgba + 4 * i));
+        const int none = _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(pixels, zero)));
+        bits |= static_cast<std::uint64_t>(~none & 255) << i;
+    }
+    return i < count ? bits | findActiveBytes(rgba + 4 * i, count - i) << i : bits;
+}
+#endif
+
+inline std::uint64_t activeByteBits(const std::byte* rgba, int count)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        return findActiveBytesAvx2(rgba, count);
+#endif
+    return findActiveBytes(rgba, count);
+}
+
 // Of up to 64 pixels, bit by bit.
 struct DepthBits {
     std::uint64_t active = 0; // below +infinity
@@ -157,11 +193,16 @@ DFB_AVX2 inline bool copyAndCheckDepthsAvx2(const float* depth, int count, float
     return copyAndCheckDepths(depth, count, out);
 }
 
-// Copies `count` pixels of a channel, from place `first` of its plane on, as they travel. False if a colour is not
-// finite, an alpha not within [0, 1], or a depth NaN.
-inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::size_t first, int count, std::byte* out)
+// Copies `count` pixels of a channel, from place `first` of its plane on, as they travel; `hasBytes`: the colour has 8
+// bits a channel. False if a colour is not finite, an alpha not within [0, 1], or a depth NaN.
+inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t channel, std::ptrdiff_t first, int count,
+                         std::byte* out)
 {
     const bool fast = cpuHasAvx2();
+    if (channel == Color && hasBytes) {
+        std::memcpy(out, planes.at[Color] + 4 * first, 4 * static_cast<std::size_t>(count));
+        return true;
+    }
     if (channel == Color) {
         const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
         return fast ? copyAndCheckColorsAvx2(rgba, count, floatsOf(out))
@@ -172,8 +213,8 @@ inline bool copyAndCheck(const ConstPlanes& planes, std::size_t channel, std::si
         return fast ? copyAndCheckDepthsAvx2(depth, count, floatsOf(out))
                     : copyAndCheckDepths(depth, count, floatsOf(out));
     }
-    const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[channel]);
-    std::memcpy(out, planes.at[channel] + bytes * first, bytes * static_cast<std::size_t>(count));
+    const std::ptrdiff_t bytes = 4 * channelWords[channel];
+    std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));
     return true;
 }
 

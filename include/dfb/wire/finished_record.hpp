@@ -104,9 +104,10 @@ public:
         std::byte* const body = h.shape.isSplit ? plan.body_.data() : out;
         encodeSparse(format_, h.shape, plan.active_, body, [&](std::size_t c, std::byte* to, std::size_t) {
             const std::size_t each = pixelBytes(c);
-            plan.active_.forEachSpan(plan.from_.stride, [&](std::size_t first, int count) {
+            const auto stride = static_cast<std::ptrdiff_t>(plan.from_.stride);
+            plan.active_.forEachSpan(stride, [&](std::ptrdiff_t first, int count) {
                 const std::size_t bytes = each * static_cast<std::size_t>(count);
-                std::memcpy(to, plan.from_.planes.at[c] + each * first, bytes);
+                std::memcpy(to, plan.from_.planes.at[c] + each * static_cast<std::size_t>(first), bytes);
                 to += bytes;
             });
         });

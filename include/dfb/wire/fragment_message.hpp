@@ -83,11 +83,11 @@ inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const f
                 out[c] = in[c] * (rounded / alpha);
 }
 
-// Whether all pixels of the planes, of 4-byte words, are alike, bit for bit.
-inline bool areConstant(const ConstPlanes& planes, std::size_t pixels)
+// Whether all pixels of the planes are alike, bit for bit.
+inline bool areConstant(const InputPixels& tile, const ConstPlanes& planes, std::size_t pixels)
 {
     for (std::size_t c = 0; c < channelCount; ++c) {
-        const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
+        const std::size_t bytes = tile.pixelBytes(c);
         if (planes.at[c] && std::memcmp(planes.at[c], planes.at[c] + bytes, bytes * (pixels - 1)) != 0)
             return false;
     }
@@ -97,11 +97,11 @@ inline bool areConstant(const ConstPlanes& planes, std::size_t pixels)
 inline void countFaults(const ActivePixels& active, const InputPixels& tile, ChannelMask channels, InputFaults& faults)
 {
     faults.nonFinite += active.nanDepths();
-    if (!active.mayBeFaulty())
+    if (!active.mayBeFaulty() || tile.hasBytes)
         return;
     const float* rgba = floatsOf(tile.planes().at[Color]);
     const float* depth = hasChannel(channels, Depth) ? floatsOf(tile.planes().at[Depth]) : nullptr;
-    active.forEachSpan(tile.stride, [&](std::size_t first, int count) {
+    active.forEachSpan(tile.stride, [&](std::ptrdiff_t first, int count) {
         countFaults(rgba + 4 * first, depth ? depth + first : nullptr, count, faults);
     });
 }
@@ -146,22 +146,25 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const auto channels = static_cast<ChannelMask>((wanted & tile.channels) | colorChannel);
     const int width = tile.region.width(), height = tile.region.height();
     const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    const bool isRounded = color != WireFormat::Float32;
+    const bool isRounded = color != WireFormat::Float32 && !tile.hasBytes;
     // Colours that travel as they are go straight to their place in the message.
     Buffer message = pool.acquire(isRounded ? fragmentPrefix : largestFragment(width, height, channels));
     wide.resize(std::max(wide.size(), isRounded ? 4 * pixelCount : 0));
-    float* rgba = isRounded ? wide.data() : floatsOf(message.data() + fragmentPrefix);
-    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), rgba);
+    auto* colors = isRounded ? reinterpret_cast<std::byte*>(wide.data()) : message.data() + fragmentPrefix;
+    const float* rgba = floatsOf(colors);
+    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), colors);
     countFaults(active, tile, channels, faults);
 
     FragmentHeader h = fragmentHeader(tile, channels);
     h.shape = active.shapeIn(tile.region);
-    if (h.shape.encoding == FragmentEncoding::Dense && areConstant(planes, pixelCount))
+    if (h.shape.encoding == FragmentEncoding::Dense && areConstant(tile, planes, pixelCount))
         h.shape.encoding = FragmentEncoding::Constant;
     const std::size_t stored = h.shape.stored();
-    if (isRounded && coder.inRange(rgba, static_cast<int>(stored)))
+    if (tile.hasBytes)
+        h.colorFormat = WireFormat::Bytes;
+    else if (isRounded && coder.inRange(rgba, static_cast<int>(stored)))
         h.colorFormat = color;
-    const bool isFloat = h.colorFormat == WireFormat::Float32;
+    const bool isCopied = h.colorFormat == WireFormat::Float32 || tile.hasBytes;
     const PlaneFormat format = h.format();
     const std::size_t payload = format.bodyBytes(h.shape), size = fragmentPrefix + payload;
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
@@ -169,16 +172,16 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     // A block that it would not fill is soon needed again.
     if (4 * size < 3 * message.size() || message.size() < size) {
         Buffer smaller = pool.acquire(size);
-        if (isFloat)
-            std::memcpy(smaller.data() + fragmentPrefix, rgba, format.pixelBytes(Color) * stored);
+        if (isCopied)
+            std::memcpy(smaller.data() + fragmentPrefix, colors, format.pixelBytes(Color) * stored);
         message = std::move(smaller);
     }
     message.shrink(size);
     std::byte* const body = message.data() + fragmentPrefix;
     encodeSparse(format, h.shape, active, body, [&](std::size_t c, std::byte* out, std::size_t bytes) {
-        if (c == Color && !isFloat)
+        if (c == Color && !isCopied)
             coder.encodeColor(h.colorFormat, rgba, static_cast<int>(stored), out);
-        else if ((c == Normal || c == Albedo) && !isFloat)
+        else if ((c == Normal || c == Albedo) && !isCopied)
             multiplyByRounded(coder, h.colorFormat, rgba, body, floatsOf(planes.at[c]), stored, floatsOf(out));
         else if (c != Color)
             std::memcpy(out, planes.at[c], bytes);
@@ -257,8 +260,8 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
 {
     if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
-    if (h.colorFormat > WireFormat::Unorm8)
-        failMalformed("unknown format of colour", static_cast<std::int64_t>(WireFormat::Unorm8),
+    if (h.colorFormat > WireFormat::Bytes)
+        failMalformed("unknown format of colour", static_cast<std::int64_t>(WireFormat::Bytes),
                       static_cast<std::int64_t>(h.colorFormat));
     h.shape.check(header.region);
     const std::byte* in = unpack(pool, message, h, codec, coder);

@@ -270,11 +270,11 @@ struct ActiveSpans {
 
     // Calls f(first, count) for each span, with its first pixel's place in planes of this stride.
     template <class F>
-    void forEachSpan(std::size_t stride, const F& f) const
+    void forEachSpan(std::ptrdiff_t stride, const F& f) const
     {
         const Span* span = spans.data();
         for (std::size_t row = 0; row < rowCounts.size(); ++row) {
-            const std::size_t begin = (static_cast<std::size_t>(rowBegin) + row) * stride;
+            const std::ptrdiff_t begin = (rowBegin + static_cast<std::ptrdiff_t>(row)) * stride;
             for (int i = 0; i < rowCounts[row]; ++i, ++span)
                 f(begin + span->x, static_cast<int>(span->count));
         }
@@ -340,7 +340,7 @@ public:
     // `colors`, which has room for all pixels of the tile, and the rest to memory of its own; returns where they are.
     // Each row is copied as soon as its spans are found: rows of a large image are far apart in memory, and so are read
     // there once.
-    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, float* colors)
+    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors)
     {
         const ConstPlanes& planes = tile.planes();
         const auto most =
@@ -350,8 +350,8 @@ public:
             std::byte* to;
         };
         ConstPlanes result;
-        result.at[Color] = reinterpret_cast<const std::byte*>(colors);
-        std::array<Target, channelCount> targets{{{Color, reinterpret_cast<std::byte*>(colors)}}};
+        result.at[Color] = colors;
+        std::array<Target, channelCount> targets{{{Color, colors}}};
         std::size_t targetCount = 1;
         for (std::size_t c = Depth; c < channelCount; ++c)
             if (hasChannel(channels, c)) {
@@ -361,11 +361,11 @@ public:
                 result.at[c] = to;
             }
         bool isClean = true;
-        find(tile, byDepth, [&](std::size_t first, int count) {
+        find(tile, byDepth, [&](std::ptrdiff_t first, int count) {
             for (std::size_t i = 0; i < targetCount; ++i) {
                 const auto [channel, to] = targets[i];
-                isClean &= copyAndCheck(planes, channel, first, count, to);
-                targets[i].to += 4 * static_cast<std::size_t>(channelWords[channel]) * static_cast<std::size_t>(count);
+                isClean &= copyAndCheck(planes, tile.hasBytes, channel, first, count, to);
+                targets[i].to += tile.pixelBytes(channel) * static_cast<std::size_t>(count);
             }
         });
         isClean_ = isClean;
@@ -383,21 +383,22 @@ private:
     {
         clear();
         nanDepths_ = 0;
-        const float* depths = byDepth ? floatsOf(tile.planes().at[Depth]) : nullptr;
+        const ConstPlanes& planes = tile.planes();
+        const float* depths = byDepth ? floatsOf(planes.at[Depth]) : nullptr;
         const Region valid = tile.valid;
-        const int x0 = valid.x0 - tile.region.x0, width = tile.pixel(0, 0) ? valid.width() : 0;
+        const int x0 = valid.x0 - tile.region.x0, width = planes.at[Color] ? valid.width() : 0;
         const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
         const int ahead = width < 64 ? 1 : std::max(1, 384 / width); // rows: 6 KiB were best where it was measured
         for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const std::size_t begin = static_cast<std::size_t>(y) * tile.stride;
+            const std::ptrdiff_t begin = y * tile.stride;
             const auto found = [&](Span span) { f(begin + span.x, static_cast<int>(span.count)); };
             if (y + ahead < yEnd)
-                prefetch(tile.pixel(x0, y + ahead), width);
+                prefetch(tile.colorAt(x0, y + ahead), static_cast<std::size_t>(width) * tile.pixelBytes(Color));
             if (depths)
                 findRow(
                     y, x0, x0 + width,
                     [&](int x, int count) {
-                        const DepthBits bits = depthBits(depths + begin + static_cast<std::size_t>(x), count);
+                        const DepthBits bits = depthBits(depths + begin + x, count);
                         for (std::uint64_t nan = bits.nan; nan != 0; nan &= nan - 1)
                             ++nanDepths_;
                         return bits.active;
@@ -405,20 +406,24 @@ private:
                     found);
             else
                 findRow(
-                    y, x0, x0 + width, [&](int x, int count) { return activePixelBits(tile.pixel(x, y), count); },
+                    y, x0, x0 + width,
+                    [&](int x, int count) {
+                        return tile.hasBytes ? activeByteBits(tile.colorAt(x, y), count)
+                                             : activePixelBits(floatsOf(tile.colorAt(x, y)), count);
+                    },
                     found);
         }
         endRows();
     }
 
     // No processor knows by itself where the next row of an image begins.
-    static void prefetch(const float* row, int width)
+    static void prefetch(const std::byte* row, std::size_t bytes)
     {
 #if defined(__GNUC__)
-        for (int x = 0; x < width; x += 4)
-            __builtin_prefetch(row + 4 * x);
+        for (std::size_t i = 0; i < bytes; i += 64)
+            __builtin_prefetch(row + i);
 #else
-        (void)row, (void)width;
+        (void)row, (void)bytes;
 #endif
     }
 

@@ -119,6 +119,17 @@ DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& b
     return above < 0x8000;
 }
 
+// Of pixels of 8 bits a channel: level / 255, rounded once.
+DFB_INLINE void decodeBytes(const std::byte* in, std::size_t count, float* rgba) noexcept
+{
+    for (std::size_t i = 0; i < 4 * count; ++i)
+        rgba[i] = static_cast<float>(static_cast<std::uint8_t>(in[i])) / 255.0f;
+}
+DFB_AVX2 inline void decodeBytesAvx2(const std::byte* in, std::size_t count, float* rgba) noexcept
+{
+    decodeBytes(in, count, rgba);
+}
+
 // Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
 DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) noexcept
 {
@@ -256,24 +267,25 @@ enum class WireFormat : std::uint8_t {
     Float32, // what the renderer wrote
     Float16, // IEEE binary16 of what is scaled into its range
     Unorm16, // of a range that is the same on all ranks
-    Unorm8
+    Unorm8,
+    Bytes // what a renderer of 8-bit colours wrote, see TileView::color8; not to be asked for
 };
 
 // An error of the float image's colour and alpha, before they are converted to the output format, that may be made: the
 // greatest absolute difference of one of the four to what it would be with Float32.
 struct ErrorBudget {
     double error = 0;
-    float maxColor = 1; // see WirePrecision
+    float maxColor = 1; // see Precision
 };
 
 // How inputs travel to the tiles' owners; and to a tile of the same rank as well, or else the image would depend on who
 // owns what. Rounded to nearest, ties to even.
-struct WirePrecision {
-    WirePrecision() = default;
-    WirePrecision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
+struct Precision {
+    Precision() = default;
+    Precision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
     // The format of the colour is chosen anew for each frame: the cheapest that is sure to keep within the budget,
-    // given FrameParams::maxLayers. Where nothing is, Float32.
-    WirePrecision(const ErrorBudget& errorBudget) // NOLINT: meant to convert
+    // given FrameConfig::maxLayers. Where nothing is, Float32.
+    Precision(const ErrorBudget& errorBudget) // NOLINT: meant to convert
         : budget(errorBudget.error), maxColor(errorBudget.maxColor)
     {
     }
@@ -289,7 +301,14 @@ namespace detail {
 
 inline std::size_t bytesOf(WireFormat format) noexcept
 {
-    return format == WireFormat::Float32 ? 4 : format == WireFormat::Unorm8 ? 1 : 2;
+    switch (format) {
+    case WireFormat::Float32: return 4;
+    case WireFormat::Float16:
+    case WireFormat::Unorm16: return 2;
+    case WireFormat::Unorm8:
+    case WireFormat::Bytes: break;
+    }
+    return 1;
 }
 
 // What all fragments of a framebuffer have in common: which pixels they have, and how their colours are converted.
@@ -297,7 +316,7 @@ class WireCoder {
 public:
     WireCoder() = default;
     // `activeByDepth`: of the tile operation.
-    explicit WireCoder(const WirePrecision& precision, bool activeByDepth = false)
+    explicit WireCoder(const Precision& precision, bool activeByDepth = false)
         : activeByDepth_(activeByDepth), maxColor_(precision.maxColor),
           scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
     {
@@ -324,6 +343,7 @@ public:
         case WireFormat::Float16: encode(HalfCode(), scale_, 0x1p15f); return;
         case WireFormat::Unorm16: encode(Unorm16Code(), 65535.0f / maxColor_, 65535.0f); return;
         case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
+        case WireFormat::Bytes: return; // they are copied
         }
     }
     // An alpha of 0 becomes leastAlpha: it was above 0, as pixels of alpha 0 that are in range have no colour, and
@@ -343,6 +363,7 @@ public:
         case WireFormat::Float16: return decode(HalfCode(), 1 / scale_, 0x1p-15f);
         case WireFormat::Unorm16: return decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f);
         case WireFormat::Unorm8: return decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f);
+        case WireFormat::Bytes: cpuHasAvx2() ? decodeBytesAvx2(in, count, rgba) : decodeBytes(in, count, rgba); break;
         }
         return true;
     }
@@ -366,7 +387,8 @@ inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxC
     const double most = (1 + 0x1p-20) * std::max({reach, 1.0, background});
     const double conversion = 0x1p-21, n = static_cast<double>(layers);
     switch (format) {
-    case WireFormat::Float32: break;
+    case WireFormat::Float32:
+    case WireFormat::Bytes: break;
     case WireFormat::Float16: return most * (0x1p-11 / (1 - 0x1p-11) + n * 0x1p-39);
     case WireFormat::Unorm16: return most * n * (0.5 / 65535 + conversion);
     case WireFormat::Unorm8: return most * n * (0.5 / 255 + conversion);
@@ -399,6 +421,7 @@ inline const char* nameOf(WireFormat format) noexcept
     case WireFormat::Float16: return "float16";
     case WireFormat::Unorm16: return "unorm16";
     case WireFormat::Unorm8: return "unorm8";
+    case WireFormat::Bytes: return "bytes";
     }
     return "";
 }

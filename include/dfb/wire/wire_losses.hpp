@@ -33,7 +33,7 @@ public:
             return;
         const WireFormat format = fragment.colorFormat();
         double beyond = 0; // what this fragment may have that is not in range
-        if (format == WireFormat::Float32
+        if ((format == WireFormat::Float32 || format == WireFormat::Bytes)
             && !coder.inRange(fragment.color(), static_cast<int>(fragment.storedPixels())))
             beyond = largestOf(fragment);
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -62,7 +62,7 @@ public:
 
 private:
     struct Tile {
-        std::array<std::int64_t, 4> layers{}; // by WireFormat, over all passes
+        std::array<std::int64_t, 5> layers{}; // by WireFormat, over all passes
         double beyond = 0;
     };
 

@@ -49,7 +49,7 @@ void render(FrameBuffer<Op>& fb, const scene::Scene& s, bool accumulates,
     dfb::OrderedLoop ordered(fb, shared, owner);
     dfb::MixedParallelLoop mixed(fb, shared, owner);
     for (int frame = 0; frame < (accumulates ? s.passes : 1); ++frame) {
-        dfb::FrameParams params = paramsOf(s);
+        dfb::FrameConfig params = paramsOf(s);
         if (accumulates) {
             params.accumulationId = 1;
             params.samples = std::make_shared<std::vector<dfb::TileSamples>>(
@@ -78,8 +78,8 @@ void check(dfb::BlendRule rule, bool isSingle, bool accumulates = false)
             std::size_t wrong = 1;
             dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
                 auto config = configOf(s);
-                config.aux = dfb::imageAuxChannels;
-                config.depth = depth;
+                config.image.aux = dfb::imageAuxChannels;
+                config.image.depth = depth;
                 FrameBuffer<Op> fb(communicator, config);
                 render(fb, s, accumulates);
                 if (fb.isDisplayRank())
@@ -126,8 +126,8 @@ TEST_CASE("Positions of single passes in order need no depth at all, several pas
         return scene::outcomeOf([&] {
             dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
                 auto config = configOf(s);
-                config.depth = false;
-                config.aux = dfb::positionChannel;
+                config.image.depth = false;
+                config.image.aux = dfb::positionChannel;
                 FrameBuffer<Single> fb(communicator, config);
                 dfb::ImageParallelLoop(fb).render(dfb::inPlace([&](auto& view) {
                                                       const auto at = static_cast<std::size_t>(view.region.y0 * 61
@@ -194,8 +194,8 @@ dfb::testing::ErrorReport verify(const scene::Scene& s, bool depth = true)
     std::mutex mutex;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
-        config.aux = dfb::imageAuxChannels;
-        config.depth = depth;
+        config.image.aux = dfb::imageAuxChannels;
+        config.image.depth = depth;
         FrameBuffer<dfb::testing::Verified<Op>> fb(communicator, config);
         dfb::testing::Verification verification;
         render(fb, s, false, &verification);

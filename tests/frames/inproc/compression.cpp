@@ -22,8 +22,8 @@ TEST_CASE("Frames with and without compression take turns until all ranks have c
     std::vector<std::int64_t> bytes(2, 0);
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         auto config = scene::configOf(s);
-        config.codec = std::make_shared<dfb::SnappyCodec>();
-        config.compression = dfb::CompressionMode::Auto;
+        config.messages.codec = std::make_shared<dfb::SnappyCodec>();
+        config.messages.compression = dfb::CompressionMode::Auto;
         using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
         for (int frame = 0; frame < frames; ++frame) {
@@ -81,8 +81,8 @@ TEST_CASE("A rank for which nothing is gained gets its messages as they are", "[
         auto config = scene::configOf(s);
         const auto rank = static_cast<std::size_t>(communicator.rank());
         const auto codec = std::make_shared<CountingCodec>(rank == 1);
-        config.codec = codec;
-        config.compression = dfb::CompressionMode::Auto;
+        config.messages.codec = codec;
+        config.messages.compression = dfb::CompressionMode::Auto;
         using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
         for (int frame = 0; frame < 10; ++frame) { // those with odd numbers are with the codec

@@ -94,7 +94,7 @@ dfb::FrameReport cost(int rows)
     dfb::FrameReport result;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = side;
+        config.image.width = config.image.height = side;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         using Fb = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
@@ -178,7 +178,7 @@ TEST_CASE("A tile that has converged is not rendered, and nothing of it travels"
     std::vector<std::int64_t> callsOf;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = side;
+        config.image.width = config.image.height = side;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         using Fb = dfb::DistributedFrameBuffer<dfb::Progressive<dfb::AlphaBlend>, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
@@ -187,7 +187,7 @@ TEST_CASE("A tile that has converged is not rendered, and nothing of it travels"
         dfb::DataParallelLoop loop(fb, world);
         int taken = 0;
         for (const int step : {1, 2, 0}) { // all tiles, every second one, none
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.accumulationId = 1;
             std::vector<dfb::TileSamples> plan(tileCount);
             for (std::size_t t = 0; t < plan.size(); ++t)
@@ -241,8 +241,8 @@ TEST_CASE("A rank tells owners of its inputs if they have changed, and only thos
     std::vector<std::int64_t> messages;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = side;
-        config.format = dfb::OutputFormat::None; // finished tiles travel in messages of which time says how many
+        config.image.width = config.image.height = side;
+        config.image.format = dfb::OutputFormat::None; // finished tiles travel in messages of which time says how many
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
         Fb fb(communicator, config);
@@ -379,7 +379,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
         const auto connection = dfb::connect<dfb::InprocTransport>(communicator);
         fill(*connection->pool());
         dfb::FrameBufferConfig config;
-        config.width = config.height = side;
+        config.image.width = config.image.height = side;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         Fb fb(connection, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
@@ -399,7 +399,7 @@ std::vector<std::int64_t> allocationsOf(int rankCount, bool declaresAnew)
             view.color = &rgba[4 * first];
             view.depth = &depths[first];
         };
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         dfb::OrderedLoop orderedLoop(fb, shared, owner);
         dfb::DataParallelLoop loop(fb, worlds[0]);
         const auto start = [&] {
@@ -487,7 +487,7 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
     using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
     dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = side;
+        config.image.width = config.image.height = side;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         Fb fb(communicator, config);
         const dfb::World world({{7, {{0, 0, 0}, {1, 1, 1}}}, {8, {{1, 0, 0}, {2, 1, 1}}}});
@@ -553,11 +553,11 @@ TEST_CASE("What is too large for memory is named with its bytes and its rank, on
         for (const int inFlight : {1, 3}) {
             const auto texts = outcomes(std::size_t{1} << 30, [&](dfb::InprocCommunicator communicator) {
                 dfb::FrameBufferConfig config;
-                config.width = config.height = 65536;
-                config.format = c.format;
-                config.aux = c.aux;
-                config.depth = c.depth;
-                config.displayRank = 1;
+                config.image.width = config.image.height = 65536;
+                config.image.format = c.format;
+                config.image.aux = c.aux;
+                config.image.depth = c.depth;
+                config.image.displayRank = 1;
                 config.framesInFlight = inFlight;
                 config.executor = std::make_shared<dfb::ThreadExecutor>(1);
                 dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64, dfb::allChannels & ~dfb::farChannel>,
@@ -571,8 +571,8 @@ TEST_CASE("What is too large for memory is named with its bytes and its rank, on
         }
     const auto tables = outcomes(std::size_t{1} << 20, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = 65536;
-        config.format = OutputFormat::None;
+        config.image.width = config.image.height = 65536;
+        config.image.format = OutputFormat::None;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator, config);
     });

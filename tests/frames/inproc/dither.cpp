@@ -27,9 +27,9 @@ Picture pictureOf(const Scene& s, int ranks, dfb::OutputFormat format, bool dith
     std::mutex mutex;
     dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config = scene::configOf(s, 2);
-        config.format = format;
-        config.dither = dither;
-        config.ownerMap = owners;
+        config.image.format = format;
+        config.image.dither = dither;
+        config.image.ownerMap = owners;
         dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport> fb(communicator, config);
         scene::renderLoop(fb, s, Loop::Declared);
         const auto report = scene::renderLoop(fb, s, Loop::Declared);
@@ -137,7 +137,7 @@ TEST_CASE("Ranks must agree whether to dither", "[dither]")
     std::vector<std::string> said(2);
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config = scene::configOf(sceneOf(1));
-        config.dither = communicator.rank() == 1;
+        config.image.dither = communicator.rank() == 1;
         using FrameBuffer = dfb::DistributedFrameBuffer<Blend<12>, dfb::NoPixelOp, dfb::InprocTransport>;
         said[static_cast<std::size_t>(communicator.rank())] =
             scene::outcomeOf([&] { FrameBuffer(communicator, config); });

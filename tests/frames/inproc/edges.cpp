@@ -76,8 +76,8 @@ TEST_CASE("An image of 16384 x 16384 pixels of which little is touched", "[edges
     std::size_t wrong = 0;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
-        config.format = dfb::OutputFormat::RGBA8; // 1 GiB
-        config.depth = false;
+        config.image.format = dfb::OutputFormat::RGBA8; // 1 GiB
+        config.image.depth = false;
         FrameBuffer<dfb::BasicAlphaBlend<64>> fb(communicator, config);
         const auto mine = scene::renderLoop(fb, s, scene::Loop::Declared, -1);
         if (!fb.isDisplayRank())
@@ -134,8 +134,8 @@ TEST_CASE("A frame of 65536 x 32768 pixels, 32 GiB in float, that no rank displa
     std::atomic<std::int64_t> pixels{0};
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
-        config.format = dfb::OutputFormat::None;
-        config.depth = false;
+        config.image.format = dfb::OutputFormat::None;
+        config.image.depth = false;
         FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
         reports[static_cast<std::size_t>(fb.rank())] =
             dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))

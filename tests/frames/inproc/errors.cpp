@@ -252,7 +252,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     const auto board = std::make_shared<Switchboard>();
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(s);
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
         using Fb = InspectedFrameBuffer<Blend>;
         Fb fb({communicator, board}, config);
         // The frame comes to rank 0 when the bad calls are over: what is sent meanwhile was sent by them.
@@ -338,7 +338,7 @@ TEST_CASE("Frame parameters that can not be are refused", "[errors]")
     const Scene s = scene::makeScene(1);
     dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
         FrameBuffer<Blend> fb(communicator, configOf(s));
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         params.passes = 0;
         texts.push_back(outcomeOf([&] { fb.begin(params); }));
         params.passes = 1;
@@ -363,26 +363,26 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
         return true;
     };
     // Wrong on all, or on one.
-    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.width = 0; }));
-    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.height = 65537; }));
-    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.displayRank = -1; }));
-    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.displayRank = 5; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.width = rank == 1 ? -7 : c.width; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.width = 0; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.height = 65537; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.displayRank = -1; }));
+    CHECK(refused([](int, dfb::FrameBufferConfig& c) { c.image.displayRank = 5; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.width = rank == 1 ? -7 : c.image.width; }));
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) {
         if (rank == 1)
-            c.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks; };
+            c.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks; };
     }));
     // Different on one.
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.width += rank == 1; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.height += rank == 0; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.width += rank == 1; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.height += rank == 0; }));
     CHECK(refused(
-        [](int rank, dfb::FrameBufferConfig& c) { c.format = rank == 1 ? dfb::OutputFormat::RGBA8 : c.format; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.depth = rank != 1; }));
-    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.displayRank = rank == 1; }));
+        [](int rank, dfb::FrameBufferConfig& c) { c.image.format = rank == 1 ? dfb::OutputFormat::RGBA8 : c.image.format; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.depth = rank != 1; }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.displayRank = rank == 1; }));
     CHECK(refused(
-        [](int rank, dfb::FrameBufferConfig& c) { c.ownerMap = rank == 1 ? dfb::hashOwner : dfb::linearOwner; }));
+        [](int rank, dfb::FrameBufferConfig& c) { c.image.ownerMap = rank == 1 ? dfb::hashOwner : dfb::linearOwner; }));
     CHECK(refused(
-        [](int rank, dfb::FrameBufferConfig& c) { c.codec = rank == 1 ? std::make_shared<CopyCodec>() : nullptr; }));
+        [](int rank, dfb::FrameBufferConfig& c) { c.messages.codec = rank == 1 ? std::make_shared<CopyCodec>() : nullptr; }));
 
     std::vector<std::string> texts(3);
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
@@ -401,7 +401,7 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
 TEST_CASE("Different message pools are refused on every rank", "[errors]")
 {
     const auto texts =
-        constructed(3, [](int rank, dfb::FrameBufferConfig& c) { c.messagePoolBytes = rank == 1 ? 1 << 28 : 1 << 27; });
+        constructed(3, [](int rank, dfb::FrameBufferConfig& c) { c.messages.poolBytes = rank == 1 ? 1 << 28 : 1 << 27; });
     INFO(joined(texts));
     CHECK((allSame(texts) && has(texts[0], "InvalidArgument")));
 }
@@ -434,7 +434,7 @@ TEST_CASE("declare() at a wrong time or of what is not there is refused, and not
             const auto inputs = dfb::inputsOf(world, pairs);
             std::vector<std::string> mine;
             for (int round = 0; round < 3; ++round) { // what is refused must not be taken for what holds, either
-                dfb::FrameParams params = paramsOf(s);
+                dfb::FrameConfig params = paramsOf(s);
                 params.declared = true;
                 auto frame = fb.begin(params);
                 mine.push_back(outcomeOf([&] { frame.declare({{0, 0, 0}, {28, 0, 0}}); }));
@@ -492,8 +492,8 @@ TEST_CASE("A loop that fails before it has declared its inputs fails the frame a
         for (int odd = 0; odd < 3; ++odd) {
             const auto start = std::chrono::steady_clock::now();
             const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
-                dfb::FrameParams params = paramsOf(s);
-                params.timeoutMs = 60000;
+                dfb::FrameConfig params = paramsOf(s);
+                params.timeout = std::chrono::milliseconds(60000);
                 params.allowPartial = isPartial;
                 const auto report = dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
                                         .render(
@@ -521,7 +521,7 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
             for (int odd = 0; odd < ranks; ++odd) {
                 const BadFrame bad = badFrame<FrameBuffer<Blend>>(ranks, s, configOf(s), [&](auto& fb) {
                     const bool isOdd = fb.rank() == odd;
-                    dfb::FrameParams params;
+                    dfb::FrameConfig params;
                     params.declared = isOdd == oddDeclares;
                     auto frame = fb.begin(params);
                     if (params.declared)
@@ -538,7 +538,7 @@ TEST_CASE("Ranks that wait for different things find out, and none waits for eve
                 CHECK(allSame(bad.texts));
                 CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree: frame "));
                 const std::string value = oddDeclares ? "true" : "false";
-                CHECK(has(bad.texts[0], "FrameParams::declared is "));
+                CHECK(has(bad.texts[0], "FrameConfig::declared is "));
                 CHECK(has(bad.texts[0], value + " on rank " + std::to_string(odd)));
                 CHECK(bad.wrongAfter == 0);
             }
@@ -556,7 +556,7 @@ TEST_CASE("Ranks that were given other passes or samples find out, also where no
     const auto run = [&](const Case& c) {
         return badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
             const bool isOdd = fb.rank() == c.odd;
-            dfb::FrameParams params = scene::paramsOf(s);
+            dfb::FrameConfig params = scene::paramsOf(s);
             const dfb::TileSamples samples{0, isOdd ? 2 : 1};
             if (c.samples)
                 params.samples = std::make_shared<std::vector<dfb::TileSamples>>(
@@ -574,7 +574,7 @@ TEST_CASE("Ranks that were given other passes or samples find out, also where no
                           INFO((c.samples ? "samples" : "passes") << ", rank " << c.odd << joined(bad.texts));
                           CHECK(allSame(bad.texts));
                           CHECK(has(bad.texts[0], "FrameError: dfb: ranks disagree"));
-                          CHECK(has(bad.texts[0], c.samples ? "FrameParams::samples is " : "FrameParams::passes is "));
+                          CHECK(has(bad.texts[0], c.samples ? "FrameConfig::samples is " : "FrameConfig::passes is "));
                           CHECK(has(bad.texts[0], (c.samples ? "a plan of 56 samples on rank " : "2 on rank ")
                                                       + std::to_string(c.odd)));
                           CHECK(bad.wrongAfter == 0);
@@ -645,7 +645,7 @@ TEST_CASE("An exception of a pixel operation's newFrame comes out of end() on ev
     const Scene s = scene::makeScene(0);
     for (int culprit = 0; culprit < 3; ++culprit) {
         const BadFrame bad = badFrame<FrameBuffer<Blend, FaultyNewFrame>>(3, s, configOf(s), [&](auto& fb) {
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.declared = true;
             auto frame = fb.begin(params, {}, {fb.rank() == culprit});
             frame.declare({});
@@ -775,7 +775,7 @@ TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
                     scene::renderLoop(fb, s, Loop::Declared);
                     return;
                 }
-                dfb::FrameParams params = scene::paramsOf(s);
+                dfb::FrameConfig params = scene::paramsOf(s);
                 params.declared = true;
                 auto frame = fb.begin(params);
                 if (byException)
@@ -843,7 +843,7 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
     for (const Mistake& mistake : mistakes)
         for (int culprit = 0; culprit < 3; ++culprit) {
             auto config = configOf(s);
-            config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
+            config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == index ? 1 : 0; };
             const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, config, [&](auto& fb) {
                 auto frame = fb.begin();
                 auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
@@ -889,8 +889,8 @@ TEST_CASE("An input that comes when its owner has already voted does not vanish"
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
         using Fb = InspectedFrameBuffer<Blend>;
         auto config = configOf(s);
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 2; };
-        config.format = dfb::OutputFormat::None;
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 2; };
+        config.image.format = dfb::OutputFormat::None;
         Fb fb({communicator, board}, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         fb.allReduce({0}, Fb::Reduce::Sum);
@@ -947,12 +947,12 @@ std::vector<std::string> withInputTooMany(bool allowPartial)
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         using Fb = InspectedFrameBuffer<TileOp>;
         auto config = configOf(s);
-        config.depth = false;
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        config.image.depth = false;
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
         Fb fb({communicator, board}, config);
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-            dfb::FrameParams params;
-            params.timeoutMs = 20000;
+            dfb::FrameConfig params;
+            params.timeout = std::chrono::milliseconds(20000);
             params.allowPartial = allowPartial;
             auto frame = fb.begin(params);
             auto tile = std::make_unique<typename Fb::Tile>();
@@ -990,7 +990,7 @@ TEST_CASE("Cancelling a frame that is over changes nothing", "[errors]")
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         FrameBuffer<Blend> fb(communicator, configOf(s));
         texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.declared = true;
             auto first = fb.begin(params);
             first.declare({});
@@ -1041,11 +1041,11 @@ TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]"
         for (int culprit = 0; culprit < 3; ++culprit)
             for (const bool sendFirst : {false, true}) {
                 auto config = configOf(s);
-                config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 4 || tile == 5 ? 1 : 0; };
+                config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 4 || tile == 5 ? 1 : 0; };
                 const BadFrame bad = badFrame<FrameBuffer<Blend>>(
                     3, s, config,
                     [&](auto& fb) {
-                        dfb::FrameParams params;
+                        dfb::FrameConfig params;
                         params.declared = true;
                         auto frame = fb.begin(params);
                         auto tile = std::make_unique<FrameBuffer<Blend>::Tile>();
@@ -1078,7 +1078,7 @@ TEST_CASE("end() without declare() fails the frame on every rank", "[errors]")
     const Scene s = scene::makeScene(6);
     for (int culprit = 0; culprit < 3; ++culprit) {
         const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [&](auto& fb) {
-            dfb::FrameParams params;
+            dfb::FrameConfig params;
             params.declared = true;
             auto frame = fb.begin(params);
             if (fb.rank() != culprit)
@@ -1138,7 +1138,7 @@ TEST_CASE("Messages of a frame that is over are counted and do no harm", "[error
         dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
             using Fb = InspectedFrameBuffer<Blend>;
             auto config = configOf(s);
-            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             Fb fb({communicator, board}, config);
             auto tile = std::make_unique<Fb::Tile>();
             const auto setAll = [&](Fb::Frame& frame) {
@@ -1310,9 +1310,9 @@ std::vector<std::string> partialFrame(const Params& params, const More& more)
 TEST_CASE("What ends a partial frame is told to all ranks, also after an error that it could bear", "[errors]")
 {
     const auto params = [](int) {
-        dfb::FrameParams p;
+        dfb::FrameConfig p;
         p.allowPartial = true;
-        p.timeoutMs = 20000;
+        p.timeout = std::chrono::milliseconds(20000);
         return p;
     };
     const auto texts = partialFrame(params, [](auto& frame, int rank) {
@@ -1330,9 +1330,9 @@ TEST_CASE("What ends a partial frame is told to all ranks, also after an error t
 TEST_CASE("Ranks that began a partial frame differently disagree, whatever else went wrong", "[errors]")
 {
     const auto params = [](int rank) {
-        dfb::FrameParams p;
+        dfb::FrameConfig p;
         p.allowPartial = true;
-        p.timeoutMs = 20000;
+        p.timeout = std::chrono::milliseconds(20000);
         p.background[2] = static_cast<float>(rank);
         return p;
     };
@@ -1357,8 +1357,8 @@ TEST_CASE("An operation that takes longer than a frame may fails the frame, not 
         Fb fb(communicator, config);
         const auto rank = static_cast<std::size_t>(fb.rank());
         slowMs = 5 * limitMs / 2;
-        dfb::FrameParams params;
-        params.timeoutMs = limitMs;
+        dfb::FrameConfig params;
+        params.timeout = std::chrono::milliseconds(limitMs);
         texts[rank] = outcomeOf([&] {
             auto frame = fb.begin(params);
             sendOwned(fb, frame);

@@ -88,14 +88,14 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging][f
                 int threads = 0;
                 runOn(std::make_shared<Board>(), ranks, [&, &make = makeExecutor](const auto& communicator) {
                     auto config = floodConfig(256, make());
-                    config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
                     AddingFrameBuffer fb(communicator, config);
                     for (int i = 0; i < 2; ++i) {
                         const auto report = floodFrame(fb, parts, from);
                         if (fb.rank() == 0) {
                             wrong = wrongSums(fb.image(), ranks, parts);
                             reports.push_back(report);
-                            pool = fb.config().messagePoolBytes;
+                            pool = fb.config().messages.poolBytes;
                             threads = fb.executor().concurrency() + 1;
                         }
                     }
@@ -225,7 +225,7 @@ TEST_CASE("An owner that takes nothing out of its inbox is sent no more than its
         std::size_t wrong = 1;
         runOn(board, ranks, [&](const auto& communicator) {
             auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
-            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             AddingFrameBuffer fb(communicator, config);
             // The only worker of rank 0, and the thread that calls its framebuffer, are busy with something else until
             // every other rank has set more than a pool's worth.
@@ -250,7 +250,7 @@ TEST_CASE("An owner that takes nothing out of its inbox is sent no more than its
                     send();
                 });
             } else {
-                dfb::FrameParams params;
+                dfb::FrameConfig params;
                 params.declared = true;
                 auto frame = fb.begin(params);
                 frame.declare({});
@@ -279,9 +279,9 @@ TEST_CASE("The display rank is flooded by finished tiles", "[messaging][flood]")
         std::size_t pool = 0;
         runOn(std::make_shared<Board>(), 5, [&, &make = makeExecutor](const auto& communicator) {
             auto config = floodConfig(800, make());
-            config.displayRank = 3;
+            config.image.displayRank = 3;
             // The display rank has no tile of its own: 10 MB come to it.
-            config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile % 4 == 3 ? 4 : tile % 4; };
+            config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile % 4 == 3 ? 4 : tile % 4; };
             AddingFrameBuffer fb(communicator, config);
             for (int i = 0; i < 2; ++i) {
                 auto frame = fb.begin();
@@ -295,7 +295,7 @@ TEST_CASE("The display rank is flooded by finished tiles", "[messaging][flood]")
                 if (fb.isDisplayRank()) {
                     wrong.push_back(wrongSums(fb.image(), 1, 1));
                     report = r;
-                    pool = fb.config().messagePoolBytes;
+                    pool = fb.config().messages.poolBytes;
                 }
             }
         });
@@ -314,7 +314,7 @@ TEST_CASE("A flood in a frame that fails: everybody gets the error, and the next
             std::int64_t peakInbox = 0;
             runOn(std::make_shared<Board>(), ranks, [&](const auto& communicator) {
                 auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
-                config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
                 AddingFrameBuffer fb(communicator, config);
                 for (int i = 0; i < 3; ++i) {
                     std::atomic<int> calls{0};
@@ -361,7 +361,7 @@ TEST_CASE("What comes for a frame that is over does not take up room in the inbo
     std::promise<void> allSet;
     runOn(board, 2, [&](const auto& communicator) {
         auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
         AddingFrameBuffer fb(communicator, config);
         const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
         const auto sendOne = [&](AddingFrameBuffer::Frame& frame, int index) {
@@ -370,7 +370,7 @@ TEST_CASE("What comes for a frame that is over does not take up room in the inbo
             fillTile(*tile, 0, 0);
             frame.setTile(*tile);
         };
-        dfb::FrameParams params;
+        dfb::FrameConfig params;
         params.declared = true;
         {
             auto frame = fb.begin(params); // left by all
@@ -413,10 +413,10 @@ TEST_CASE("A message pool below the largest message's fourfold is raised to it; 
     for (const std::size_t bytes : {std::size_t{0}, std::size_t{1} << 20, std::size_t{1} << 21, std::size_t{64} << 20})
         runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
             auto config = configOf(s);
-            config.messagePoolBytes = bytes;
+            config.messages.poolBytes = bytes;
             FrameBuffer<Blend> fb(communicator, config);
             if (fb.rank() == 0)
-                pools.push_back(fb.config().messagePoolBytes);
+                pools.push_back(fb.config().messages.poolBytes);
         });
     CHECK(pools
           == std::vector<std::size_t>{std::size_t{1} << 20, std::size_t{1} << 20, std::size_t{1} << 21,
@@ -424,9 +424,9 @@ TEST_CASE("A message pool below the largest message's fourfold is raised to it; 
     std::size_t large = 0;
     runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
         auto config = configOf(s);
-        config.messagePoolBytes = 1;
+        config.messages.poolBytes = 1;
         FrameBuffer<dfb::BasicAlphaBlend<256>> fb(communicator, config);
-        large = fb.config().messagePoolBytes;
+        large = fb.config().messages.poolBytes;
     });
     CHECK(large == 4 * dfb::detail::largestFragment(256, 256, dfb::colorChannel | dfb::depthChannel));
 }
@@ -443,8 +443,8 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
                     [&](const auto& communicator) {
                         auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(2));
                         if (toOne)
-                            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                        dfb::ConnectionOptions options;
+                            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                        dfb::NetworkConfig options;
                         options.progress = dfb::Progress::Caller;
                         AddingFrameBuffer fb(communicator, config, options);
                         const auto r = floodFrame(fb, 3, from);
@@ -487,11 +487,11 @@ TEST_CASE("What an owner keeps of inputs is their active bytes, once for each fr
         std::vector<dfb::FrameReport> reports(2);
         runOn(board, 2, [&](const auto& communicator) {
             dfb::FrameBufferConfig config;
-            config.width = config.height = width;
+            config.image.width = config.image.height = width;
             config.framesInFlight = frames;
             config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-            config.messagePoolBytes = std::size_t{1} << 30; // not what limits it here
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            config.messages.poolBytes = std::size_t{1} << 30; // not what limits it here
             const auto connection = dfb::connect<BoardTransport>(communicator);
             if (connection->rank() == 0)
                 ownersPool = connection->pool();

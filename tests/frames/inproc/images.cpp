@@ -52,13 +52,13 @@ std::shared_ptr<dfb::Executor> makeExecutor(const Options& o)
 dfb::FrameBufferConfig configOf(const Scene& s, const Options& o)
 {
     dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = o.format;
-    config.depth = o.depth;
-    config.displayRank = o.displayRank;
-    config.ownerMap = o.ownerMap;
-    config.codec = o.codec;
+    config.image.width = s.width;
+    config.image.height = s.height;
+    config.image.format = o.format;
+    config.image.depth = o.depth;
+    config.image.displayRank = o.displayRank;
+    config.image.ownerMap = o.ownerMap;
+    config.messages.codec = o.codec;
     config.executor = makeExecutor(o);
     return config;
 }
@@ -368,7 +368,7 @@ TEST_CASE("Two framebuffers at once on one communicator", "[images]")
         Options o;
         const auto configA = configOf(a, o);
         auto configB = configA; // also the same executor
-        configB.displayRank = 1;
+        configB.image.displayRank = 1;
         FrameBuffer<Blend> fbA(communicator, configA);
         FrameBuffer<Single> fbB(communicator, configB);
         for (std::size_t i = 0; i < 2; ++i) {

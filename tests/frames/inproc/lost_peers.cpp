@@ -84,16 +84,16 @@ dfb::FrameBufferConfig smallConfig()
     return config;
 }
 
-dfb::ConnectionOptions timedOptions(int peerTimeoutMs = timeoutMs)
+dfb::NetworkConfig timedOptions(int peerTimeoutMs = timeoutMs)
 {
-    dfb::ConnectionOptions options;
-    options.peerTimeoutMs = peerTimeoutMs;
+    dfb::NetworkConfig options;
+    options.peerTimeout = std::chrono::milliseconds(peerTimeoutMs);
     return options;
 }
 
 FrameBuffer::Frame begin(FrameBuffer& fb)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = true;
     auto frame = fb.begin(params);
     frame.declare({});

@@ -145,7 +145,7 @@ TEST_CASE("Frames of two framebuffers on one connection, open at the same time; 
                         std::unique_ptr<FrameBuffer<Blend>> a;
                         std::unique_ptr<FrameBuffer<dfb::BasicImageParallel<32>>> b;
                         auto configB = configOf(sb);
-                        configB.displayRank = ranks - 1;
+                        configB.image.displayRank = ranks - 1;
                         if (shared) {
                             a = std::make_unique<FrameBuffer<Blend>>(connection, configOf(sa));
                             b = std::make_unique<FrameBuffer<dfb::BasicImageParallel<32>>>(connection, configB);
@@ -298,7 +298,7 @@ TEST_CASE("Repeated messages are counted exactly, and a frame without any has no
     runOn(board, 3, [&](const auto& communicator) {
         const Scene s = sceneFor(Loop::Listing3);
         auto config = configOf(s);
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
         FrameBuffer<Blend> fb(communicator, config);
         for (int round = 0; round < 2; ++round) {
             auto frame = fb.begin();
@@ -378,7 +378,7 @@ TEST_CASE("With checksums the image is the same", "[messaging]")
             }
         };
         runOn(board, 3, [&](const auto& communicator) {
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.checksums = true;
             if (scene::isDataParallel(loop)) {
                 FrameBuffer<Blend> fb(communicator, configOf(s), options);
@@ -425,15 +425,15 @@ Damaged damagedFrame(MessageKind kind, std::uint32_t scope, int place, int timeo
     };
     Scene s = sceneFor(Loop::Declared);
     runOn(board, 2, [&](const auto& communicator) {
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.checksums = true;
-        options.peerTimeoutMs = peerTimeoutMs;
+        options.peerTimeout = std::chrono::milliseconds(peerTimeoutMs);
         FrameBuffer<Blend> fb(communicator, configOf(s), options);
         const auto rank = static_cast<std::size_t>(fb.rank());
         const auto frame = [&](const Scene& shown, int limit) {
             return outcomeOf([&] {
                 Scene timed = shown;
-                timed.timeoutMs = limit;
+                timed.timeout = std::chrono::milliseconds(limit);
                 const auto report = scene::renderLoop(fb, timed, Loop::Declared);
                 if (fb.isDisplayRank())
                     result.wrong += scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(shown));
@@ -545,7 +545,7 @@ TEST_CASE("With frames in flight a damaged message costs frames, not the framebu
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
         config.framesInFlight = 2; // the second has never begun one when the first fails
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.checksums = true;
         FrameBuffer<Blend> fb(communicator, config, options);
         const auto rank = static_cast<std::size_t>(fb.rank());
@@ -586,9 +586,9 @@ TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in
     runOn(board, 2, [&](const auto& communicator) {
         auto config = configOf(s);
         config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.checksums = true;
-        options.peerTimeoutMs = 300;
+        options.peerTimeout = std::chrono::milliseconds(300);
         FrameBuffer<Blend> fb(communicator, config, options);
         scene::renderLoop(fb, s, Loop::Declared);
         if (fb.rank() == 1) {
@@ -710,7 +710,7 @@ TEST_CASE("What has come for a framebuffer that is refused is still in order whe
     std::vector<std::string> texts(2);
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
         auto config = configOf(sceneFor(Loop::Declared));
-        config.width += communicator.rank();
+        config.image.width += communicator.rank();
         config.executor = std::make_shared<dfb::CallerExecutor>(); // what it has not run waits for the end
         if (communicator.rank() == 0)
             Hasty::sentBoth().get_future().wait_for(std::chrono::seconds(20));
@@ -749,7 +749,7 @@ TEST_CASE("A damaged message that comes before its frame has begun fails that fr
             [&](const auto& communicator) {
                 const Scene s = sceneFor(Loop::Listing3);
                 auto config = configOf(s);
-                config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
                 FrameBuffer<Blend> fb(communicator, config);
                 scene::renderLoop(fb, s, Loop::Listing3);
                 if (fb.rank() == 1)
@@ -782,7 +782,7 @@ TEST_CASE("Ranks that disagree about checksums learn which rank has them, and no
                 runOn(
                     std::make_shared<Board>(), ranks,
                     [&](const BoardTransport::Communicator& communicator) {
-                        dfb::ConnectionOptions options;
+                        dfb::NetworkConfig options;
                         options.checksums = (communicator.inner.rank() == odd) == uses;
                         texts[static_cast<std::size_t>(communicator.inner.rank())] = outcomeOf(
                             [&] { FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options); });
@@ -808,7 +808,7 @@ TEST_CASE("The image is right after frames that failed when most of their tiles 
         runOn(std::make_shared<Board>(), 4, [&](const auto& communicator) {
             const Scene s = sceneFor(loop, 8);
             auto config = configOf(s, 2);
-            config.displayRank = 1;
+            config.image.displayRank = 1;
             FrameBuffer<Blend> fb(communicator, config);
             for (int i = 0; i < 6; ++i) {
                 if (i % 2 == 1) {
@@ -862,7 +862,7 @@ TEST_CASE("Finished tiles leave for the display rank while their owner still ren
     std::size_t wrong = 1;
     runOn(board, 2, [&](const auto& communicator) {
         auto config = floodConfig(512, std::make_shared<dfb::ThreadExecutor>(1)); // 16 tiles a batch
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
         AddingFrameBuffer fb(communicator, config);
         auto frame = fb.begin();
         const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
@@ -913,8 +913,8 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
             std::make_shared<Board>(), 2,
             [&](const BoardTransport::Communicator& communicator) {
                 auto config = configOf(s);
-                config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-                dfb::ConnectionOptions options;
+                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                dfb::NetworkConfig options;
                 options.progress = dfb::Progress::Caller;
                 FrameBuffer<Counter> fb(communicator, config, options);
                 {
@@ -978,15 +978,15 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
         }
     };
     using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, Count, BoardTransport>;
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.allowPartial = true;
-    params.timeoutMs = 20000;
+    params.timeout = std::chrono::milliseconds(20000);
     std::vector<dfb::FrameReport> reports(2);
     runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
         auto config = configOf(scene::makeScene(0, 1, 64 * (tiles + 1), 64));
-        config.format = dfb::OutputFormat::RGBA32F;
-        config.messagePoolBytes = 0;
-        config.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        config.image.format = dfb::OutputFormat::RGBA32F;
+        config.messages.poolBytes = 0;
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
         Fb fb(communicator, config);
         auto frame = fb.begin(params);
         auto tile = std::make_unique<Fb::Tile>();
@@ -1017,7 +1017,7 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
     // One was never sent; another may not have been handed on when the frame was cancelled.
     CHECK(reports[0].tilesIncomplete >= 1);
     CHECK(reports[0].tilesIncomplete <= 2);
-    CHECK(reports[0].compositingOverheadMs < params.timeoutMs / 2);
+    CHECK(reports[0].compositingOverheadMs < 20000.0 / 2);
 }
 
 } // namespace messaging_cases

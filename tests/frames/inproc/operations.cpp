@@ -32,10 +32,10 @@ dfb::FrameBufferConfig configFor(const Scene& s, dfb::OutputFormat format = dfb:
                                  bool depth = true)
 {
     dfb::FrameBufferConfig config;
-    config.width = s.width;
-    config.height = s.height;
-    config.format = format;
-    config.depth = depth;
+    config.image.width = s.width;
+    config.image.height = s.height;
+    config.image.format = format;
+    config.image.depth = depth;
     config.executor = std::make_shared<dfb::ThreadExecutor>(2);
     return config;
 }
@@ -315,13 +315,13 @@ TEST_CASE("A tile operation of a user's, with data for the frame", "[operations]
     int framesSeen = 0;
     dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
         auto config = configFor(s, dfb::OutputFormat::RGBA32F, false);
-        config.displayRank = 2;
+        config.image.displayRank = 2;
         FrameBuffer<CountInputs> fb(communicator, config);
         for (int frame = 1; frame <= 3; ++frame) {
             CountInputs::FrameData data;
             data.factor = 0.5 * frame;
             data.alpha = {0, 0, 0.25 * frame};
-            dfb::FrameParams params = scene::paramsOf(s);
+            dfb::FrameConfig params = scene::paramsOf(s);
             params.declared = true;
             auto open = fb.begin(params, data);
             std::vector<dfb::TileInput> inputs;

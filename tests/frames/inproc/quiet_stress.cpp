@@ -69,9 +69,9 @@ Outcome frames(std::uint64_t seed, int ranks, int threads, int inFlight, int cou
             return true;
         };
         auto config = configOf(s, threads);
-        config.quietMs = 1;
+        config.quiet = std::chrono::milliseconds(1);
         config.framesInFlight = inFlight;
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.progress = threads > 0 ? dfb::Progress::Thread : dfb::Progress::Caller;
         FrameBuffer fb({inner, faults}, config, options);
         std::mt19937_64 same(seed), own(seed * 31 + static_cast<std::uint64_t>(fb.rank()));

@@ -27,7 +27,7 @@ std::vector<std::vector<int>> threadsOf(int ranks, std::shared_ptr<dfb::Executor
     std::mutex mutex;
     dfb::runRanks(ranks, [&](const dfb::InprocCommunicator& communicator) {
         dfb::FrameBufferConfig config;
-        config.width = config.height = 20;
+        config.image.width = config.image.height = 20;
         config.executor = executor;
         FrameBuffer fb(communicator, config);
         const auto report = dfb::ImageParallelLoop(fb).render([](auto& tile) { tile.fill({0, 0, 0, 1}); });

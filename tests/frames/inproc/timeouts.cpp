@@ -90,12 +90,12 @@ struct Run {
     std::size_t wrongAfter = 1;
 };
 
-Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig config, const dfb::FrameParams& params,
+Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig config, const dfb::FrameConfig& params,
         const std::function<void(FrameBuffer&, FrameBuffer::Frame&)>& frame)
 {
     Run result;
     result.endings.resize(static_cast<std::size_t>(ranks));
-    const Scene s = scene::makeScene(5, 2, config.width, config.height);
+    const Scene s = scene::makeScene(5, 2, config.image.width, config.image.height);
     runOn(board, ranks, [&](const BoardTransport::Communicator& communicator) {
         auto mine = config;
         mine.executor = std::make_shared<dfb::ThreadExecutor>(1);
@@ -136,11 +136,11 @@ constexpr int limitMs = 1000;
 // How long after that many milliseconds an error may come, on a machine that is busy with other things.
 constexpr double marginMs = 5000;
 
-dfb::FrameParams timed(bool declared, int timeoutMs = limitMs)
+dfb::FrameConfig timed(bool declared, int timeoutMs = limitMs)
 {
-    dfb::FrameParams params;
+    dfb::FrameConfig params;
     params.declared = declared;
-    params.timeoutMs = timeoutMs;
+    params.timeout = std::chrono::milliseconds(timeoutMs);
     return params;
 }
 
@@ -176,7 +176,7 @@ TEST_CASE("Different time-outs are a disagreement", "[timeouts]")
         });
         INFO(joined(texts));
         CHECK(allSame(texts));
-        CHECK((has(texts[0], "FrameError: dfb: ranks disagree") && has(texts[0], "timeoutMs")));
+        CHECK((has(texts[0], "FrameError: dfb: ranks disagree") && has(texts[0], "FrameConfig::timeout")));
     }
 }
 
@@ -190,7 +190,7 @@ TEST_CASE("A time-out that is not reached changes nothing", "[timeouts]")
             FrameBuffer fb(communicator, configOf(s));
             for (const int timeoutMs : {0, 60000, 2147483647}) {
                 Scene mine = s;
-                mine.timeoutMs = timeoutMs;
+                mine.timeout = std::chrono::milliseconds(timeoutMs);
                 const auto report = scene::renderLoop(fb, mine, loop);
                 if (fb.isDisplayRank()) {
                     const Picture p(fb.image(), report);
@@ -215,7 +215,7 @@ TEST_CASE("An announced input that is never sent is named on every rank", "[time
     };
     const auto runCase = [](const Case& c) {
         auto config = smallConfig();
-        config.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 5 ? 1 : 0; };
+        config.image.ownerMap = [](int tile, const dfb::TileLayout&, int) { return tile == 5 ? 1 : 0; };
         std::vector<Ending> endings(static_cast<std::size_t>(c.ranks));
         runOn(
             std::make_shared<Board>(), c.ranks,
@@ -299,7 +299,7 @@ TEST_CASE("A declared input that is never sent is named with its source, part an
     };
     const auto runCase = [](const Case& c) {
         auto config = smallConfig();
-        config.displayRank = c.ranks / 2;
+        config.image.displayRank = c.ranks / 2;
         return run(std::make_shared<Board>(), c.ranks, config, timed(true), [&](FrameBuffer& fb, auto& frame) {
             const auto rank = static_cast<std::uint32_t>(fb.rank());
             frame.declare({{9, 40 + rank, 0}, {9, 40 + rank, 2}});
@@ -342,7 +342,7 @@ TEST_CASE("What several owners miss is all listed, whoever's time was up first",
             cases.push_back({c.ranks, c.missing, first});
     const auto runCase = [](const Case& c) {
         auto config = smallConfig();
-        config.ownerMap = [](int tile, const dfb::TileLayout&, int ranks) { return tile < ranks ? tile : 0; };
+        config.image.ownerMap = [](int tile, const dfb::TileLayout&, int ranks) { return tile < ranks ? tile : 0; };
         return run(std::make_shared<Board>(), c.ranks, config, timed(true), [&](FrameBuffer& fb, auto& frame) {
             std::vector<dfb::TileInput> inputs;
             if (fb.rank() == 0)
@@ -617,8 +617,8 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
         const Scene s = scene::makeScene(4, 2, 320, 320);
         runOn(board, ranks, [&](const auto& communicator) {
             auto config = configOf(s);
-            config.messagePoolBytes = 0; // 1 MiB
-            config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            config.messages.poolBytes = 0; // 1 MiB
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
             Large fb(communicator, config);
             {
                 auto frame = fb.begin(timed(true));
@@ -664,7 +664,7 @@ TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()",
         board, 2,
         [&](const auto& communicator) {
             auto config = configOf(scene::makeScene(0, 1, 640, 640));
-            config.messagePoolBytes = 0; // 1 MiB
+            config.messages.poolBytes = 0; // 1 MiB
             Large fb(communicator, config);
             texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
                 auto frame = fb.begin(timed(false));
@@ -722,7 +722,7 @@ TEST_CASE("Progress by the caller: an absent rank that does not poll is a Transp
     runOn(
         std::make_shared<Board>(), 2,
         [&](const auto& communicator) {
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.progress = dfb::Progress::Caller;
             FrameBuffer fb(communicator, smallConfig(), options);
             auto frame = fb.begin(timed(true));

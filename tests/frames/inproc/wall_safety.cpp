@@ -77,13 +77,13 @@ Outcome frames(MessageKind kind, int timeoutMs, const std::function<What(dfb::Bu
             const auto rank = static_cast<std::size_t>(fb.rank());
             armed = true; // rank 1 has sent what the constructors send to the wall
             const auto frame = [&](float shade) {
-                dfb::FrameParams params;
+                dfb::FrameConfig params;
                 params.background = {shade, shade, shade, 1};
                 const auto report = dfb::DataParallelLoop(fb, dfb::World())
                                         .render(
                                             scene::FlatCamera(), [](const dfb::Brick&, auto&) {}, params);
                 try {
-                    wall.finish(report.frame, timeoutMs);
+                    wall.finish(report.frame, std::chrono::milliseconds(timeoutMs));
                 } catch (const dfb::Error& e) {
                     if (shade == 0.5f)
                         result.kinds[rank] = e.info().kind;

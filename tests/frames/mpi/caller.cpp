@@ -44,13 +44,13 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
     const int rank = rankIn(MPI_COMM_WORLD), last = sizeOf(MPI_COMM_WORLD) - 1;
     constexpr int tiles = 400; // of 80 KiB, far more than MPI has under way at once
     dfb::FrameBufferConfig config;
-    config.width = config.height = 64 * 20;
-    config.format = dfb::OutputFormat::None;
+    config.image.width = config.image.height = 64 * 20;
+    config.image.format = dfb::OutputFormat::None;
     config.executor = std::make_shared<dfb::CallerExecutor>();
-    config.messagePoolBytes = std::size_t{1} << 30;
+    config.messages.poolBytes = std::size_t{1} << 30;
     const int owner = last > 1 ? 1 : 0;
-    config.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
-    dfb::ConnectionOptions options;
+    config.image.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
+    dfb::NetworkConfig options;
     options.progress = dfb::Progress::Caller;
     options.sharedMemory = false;
     Fb fb(MPI_COMM_WORLD, config, options);

@@ -94,7 +94,7 @@ TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
     for (const int culprit : culprits())
         for (const In in : {In::Renderer, In::Add, In::Finish, In::PixelOp}) {
             const std::string text = outcomeOf([&] {
-                dfb::FrameParams params = scene::paramsOf(s);
+                dfb::FrameConfig params = scene::paramsOf(s);
                 params.declared = true;
                 auto frame = fb.begin(params, {in == In::Add || in == In::Finish ? culprit : -1, in == In::Add},
                                       {in == In::PixelOp ? culprit : -1});
@@ -136,7 +136,7 @@ TEST_CASE("A frame left without end() is cancelled on every rank", "[errors]")
     for (const int culprit : culprits()) {
         const std::string text = outcomeOf([&] {
             if (fb.rank() == culprit) {
-                dfb::FrameParams params = scene::paramsOf(s);
+                dfb::FrameConfig params = scene::paramsOf(s);
                 params.declared = true;
                 auto frame = fb.begin(params);
             } else {
@@ -156,7 +156,7 @@ TEST_CASE("Inputs that contradict the tree fail the frame on every rank, and are
     const Scene s = scene::makeScene(6);
     auto config = configOf(s);
     const int size = sizeOf(MPI_COMM_WORLD), owner = size - 1;
-    config.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config);
     struct Input {
         int generation;
@@ -203,11 +203,11 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
 {
     const Scene s = scene::makeScene(3);
     const std::vector<std::function<void(dfb::FrameBufferConfig&)>> changes{
-        [](dfb::FrameBufferConfig& c) { c.width = 0; },
-        [](dfb::FrameBufferConfig& c) { c.displayRank = sizeOf(MPI_COMM_WORLD); },
-        [](dfb::FrameBufferConfig& c) { c.height += sizeOf(MPI_COMM_WORLD) > 1 ? rankIn(MPI_COMM_WORLD) : 70000; },
+        [](dfb::FrameBufferConfig& c) { c.image.width = 0; },
+        [](dfb::FrameBufferConfig& c) { c.image.displayRank = sizeOf(MPI_COMM_WORLD); },
+        [](dfb::FrameBufferConfig& c) { c.image.height += sizeOf(MPI_COMM_WORLD) > 1 ? rankIn(MPI_COMM_WORLD) : 70000; },
         [](dfb::FrameBufferConfig& c) {
-            c.width = rankIn(MPI_COMM_WORLD) == sizeOf(MPI_COMM_WORLD) - 1 ? -1 : c.width;
+            c.image.width = rankIn(MPI_COMM_WORLD) == sizeOf(MPI_COMM_WORLD) - 1 ? -1 : c.image.width;
         }};
     for (const auto& change : changes) {
         auto config = configOf(s);

@@ -24,7 +24,7 @@ using Single = dfb::BasicImageParallel<16>;
 // On the display rank what the last of `frames` frames gave, elsewhere an empty picture.
 template <class TileOp, class Transport, class Communicator>
 Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config,
-                  int deal = 0, const dfb::ConnectionOptions& options = {}, int frames = 2)
+                  int deal = 0, const dfb::NetworkConfig& options = {}, int frames = 2)
 {
     dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, Transport> fb(communicator, config, options);
     Picture result;
@@ -36,7 +36,7 @@ Picture pictureOn(const Communicator& communicator, const Scene& s, Loop loop, c
 }
 
 Picture overMpi(MPI_Comm communicator, const Scene& s, Loop loop, const dfb::FrameBufferConfig& config, int deal = 0,
-                const dfb::ConnectionOptions& options = {})
+                const dfb::NetworkConfig& options = {})
 {
     return scene::isDataParallel(loop)
                ? pictureOn<Blend, dfb::MpiTransport>(communicator, s, loop, config, deal, options)
@@ -54,7 +54,7 @@ Picture inProcess(int ranks, const Scene& s, Loop loop, const dfb::FrameBufferCo
         Picture p = scene::isDataParallel(loop) ? pictureOn<Blend, dfb::InprocTransport>(communicator, s, loop, mine)
                                                 : pictureOn<Single, dfb::InprocTransport>(communicator, s, loop, mine);
         const std::lock_guard<std::mutex> lock(mutex);
-        if (communicator.rank() == config.displayRank)
+        if (communicator.rank() == config.image.displayRank)
             result = std::move(p);
     });
     return result;
@@ -95,20 +95,20 @@ TEST_CASE("The image does not depend on configuration", "[images]")
     const Scene s = sceneFor(Loop::Declared, 5);
     const std::uint64_t expected = inProcess(1, s, Loop::Declared, configOf(s, 2)).hash();
     const auto check = [&](const char* what, const std::function<void(dfb::FrameBufferConfig&)>& change, int deal = 0,
-                           const dfb::ConnectionOptions& options = {}) {
+                           const dfb::NetworkConfig& options = {}) {
         auto config = configOf(s, 2);
         change(config);
         const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config, deal, options);
         INFO(what);
-        CHECK((rankIn(MPI_COMM_WORLD) == config.displayRank ? p.hash() == expected : p.bytes.empty()));
+        CHECK((rankIn(MPI_COMM_WORLD) == config.image.displayRank ? p.hash() == expected : p.bytes.empty()));
     };
     check(
         "bricks dealt out otherwise", [](auto&) {}, 3);
     check(
         "all bricks on the last rank", [](auto&) {}, -1);
-    check("another display rank", [&](auto& c) { c.displayRank = size - 1; });
-    check("linear owners", [](auto& c) { c.ownerMap = dfb::linearOwner; });
-    dfb::ConnectionOptions byCaller;
+    check("another display rank", [&](auto& c) { c.image.displayRank = size - 1; });
+    check("linear owners", [](auto& c) { c.image.ownerMap = dfb::linearOwner; });
+    dfb::NetworkConfig byCaller;
     byCaller.progress = dfb::Progress::Caller;
     check(
         "progress by the caller", [](auto&) {}, 0, byCaller);
@@ -119,7 +119,7 @@ TEST_CASE("The image does not depend on configuration", "[images]")
     check("oneTBB", [](auto& c) { c.executor = std::make_shared<dfb::TbbExecutor>(2); });
 #endif
 #if defined(DFB_HAS_SNAPPY)
-    check("compressed", [](auto& c) { c.codec = std::make_shared<dfb::SnappyCodec>(); });
+    check("compressed", [](auto& c) { c.messages.codec = std::make_shared<dfb::SnappyCodec>(); });
 #endif
 }
 
@@ -128,7 +128,7 @@ TEST_CASE("Output formats", "[images]")
     const Scene s = sceneFor(Loop::Declared, 6);
     for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8, dfb::OutputFormat::None}) {
         auto config = configOf(s, 2);
-        config.format = format;
+        config.image.format = format;
         const Picture p = overMpi(MPI_COMM_WORLD, s, Loop::Declared, config);
         if (format == dfb::OutputFormat::None || rankIn(MPI_COMM_WORLD) != 0)
             CHECK(p.bytes.empty());

@@ -110,7 +110,7 @@ using TamperedFrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, 
 Scene sceneFor(int bricks, std::uint64_t seed)
 {
     Scene s = scene::makeScene(bricks, seed);
-    s.timeoutMs = longMs;
+    s.timeout = std::chrono::milliseconds(longMs);
     return s;
 }
 
@@ -130,17 +130,17 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
     for (const flood::NamedExecutor& e : executors())
         for (const From from : {From::Loop, From::Thread}) {
             auto config = floodConfig(256, e.make());
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.sharedMemory = from == From::Loop;
-            config.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
-            config.displayRank = ranks - 1;
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int size) { return size - 1; };
+            config.image.displayRank = ranks - 1;
             AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
             dfb::FrameReport report;
             for (int i = 0; i < 2; ++i) {
                 report = floodFrame(fb, parts, from, longMs);
                 if (fb.isDisplayRank())
                     CHECK(wrongSums(fb.image(), ranks, parts) == 0);
-                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messagePoolBytes));
+                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messages.poolBytes));
                 CHECK((report.peakInboxBytes > 0) == (ranks > 1));
             }
             // A rank's memory: a pool in its inbox and on the way to it, a pool under way to others and one message
@@ -149,7 +149,7 @@ TEST_CASE("All ranks flood one owner that has the smallest pool", "[messaging]")
             const std::size_t message = dfb::detail::fragmentPrefix + 16 * 32 * 32;
             const auto threads = static_cast<std::size_t>(fb.executor().concurrency()) + 1;
             const std::size_t limit =
-                (2 * fb.config().messagePoolBytes + 2 * threads * message + 256 * 256 * 16) * 3 / 2
+                (2 * fb.config().messages.poolBytes + 2 * threads * message + 256 * 256 * 16) * 3 / 2
                 + 256 * static_cast<std::size_t>(report.messagesSent) + static_cast<std::size_t>(ranks) * 8192;
             INFO(e.name << ": " << report.peakMemoryBytes << " bytes, limit " << limit);
             CHECK(report.peakMemoryBytes <= static_cast<std::int64_t>(limit));
@@ -163,7 +163,7 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
         for (const bool shared : {true, false})
             for (const auto progress : {dfb::Progress::Thread, dfb::Progress::Caller}) {
                 auto config = floodConfig(384, e.make()); // 2.4 MB of finished tiles
-                dfb::ConnectionOptions options;
+                dfb::NetworkConfig options;
                 options.progress = progress;
                 options.sharedMemory = shared;
                 AddingFrameBuffer fb(MPI_COMM_WORLD, config, options);
@@ -171,7 +171,7 @@ TEST_CASE("Everybody floods everybody, and the display rank is flooded by finish
                 INFO(e.name);
                 if (fb.isDisplayRank())
                     CHECK(wrongSums(fb.image(), ranks, 2) == 0);
-                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messagePoolBytes));
+                CHECK(report.peakInboxBytes <= static_cast<std::int64_t>(fb.config().messages.poolBytes));
             }
 }
 
@@ -181,7 +181,7 @@ TEST_CASE("All through MPI gives the same image bit for bit", "[messaging]")
     std::vector<std::uint64_t> hashes;
     for (const bool shared : {true, false}) {
         auto config = configOf(s);
-        dfb::ConnectionOptions options;
+        dfb::NetworkConfig options;
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, config, options);
         for (int i = 0; i < 2; ++i) {
@@ -265,14 +265,14 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
                         std::byte{64};
                 return TamperingTransport::What::Pass;
             };
-            dfb::ConnectionOptions options;
+            dfb::NetworkConfig options;
             options.checksums = true;
             TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, damage}, configOf(s), options);
             CHECK(goodFrame(fb, nothing));
             bool right = true;
             const std::string text = outcomeOf([&] {
                 Scene mine = s;
-                mine.timeoutMs = 20000; // a message that comes after its frame's end makes the next one fail
+                mine.timeout = std::chrono::milliseconds(20000); // a message that comes after its frame's end makes the next one fail
                 right = goodFrame(fb, mine);
             });
             const bool same = sameEverywhere(text);
@@ -297,7 +297,7 @@ TEST_CASE("Tiles of a cancelled frame that come in a later one are dropped and c
                                                                           : TamperingTransport::What::Pass;
     };
     auto config = configOf(s);
-    config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
     TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, hold, held}, config);
     const int last = fb.size() - 1;
     const auto sendTiles = [&](auto& frame, int count, float alpha) {
@@ -339,8 +339,8 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
     const Scene s = sceneFor(6, 8);
     dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s));
     const int last = fb.size() - 1;
-    dfb::FrameParams params;
-    params.timeoutMs = 1000; // enough for all but what is missing, on a busy machine
+    dfb::FrameConfig params;
+    params.timeout = std::chrono::milliseconds(1000); // enough for all but what is missing, on a busy machine
     for (const bool declared : {true, false}) {
         params.declared = declared;
         const std::string text = outcomeOf([&] {
@@ -386,7 +386,7 @@ TEST_CASE("A lost message is an error in time on every rank", "[messaging]")
         TamperedFrameBuffer<Blend> fb({MPI_COMM_WORLD, lose}, configOf(s));
         const std::string text = outcomeOf([&] {
             Scene mine = s;
-            mine.timeoutMs = 1000; // enough for all but what is lost, on a busy machine
+            mine.timeout = std::chrono::milliseconds(1000); // enough for all but what is lost, on a busy machine
             goodFrame(fb, mine);
         });
         const bool same = sameEverywhere(text);
@@ -401,10 +401,10 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
 {
     const Scene s = sceneFor(6, 10);
     auto config = configOf(s);
-    dfb::ConnectionOptions options;
+    dfb::NetworkConfig options;
     options.progress = dfb::Progress::Caller;
     const int size = sizeOf(MPI_COMM_WORLD), rank = rankIn(MPI_COMM_WORLD);
-    config.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
     static std::atomic<int> inputs;
     inputs = 0;
     struct Counter : dfb::BasicAlphaBlend<16> {

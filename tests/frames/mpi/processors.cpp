@@ -69,7 +69,7 @@ TEST_CASE("Ranks whose CPU masks meet divide the processors; those with masks of
     CHECK(sharingRanks() == size);
     {
         dfb::FrameBufferConfig config;
-        config.width = config.height = 20;
+        config.image.width = config.image.height = 20;
         dfb::DistributedFrameBuffer<dfb::BasicImageParallel<16>> fb(MPI_COMM_WORLD, config);
         const auto report = dfb::ImageParallelLoop(fb).render([](auto& tile) { tile.fill({0, 0, 0, 1}); });
         CHECK(report.threads == std::max(1, processors / size));

@@ -55,7 +55,7 @@ namespace {
 Scene sceneFor(int bricks, std::uint64_t seed)
 {
     Scene s = scene::makeScene(bricks, seed);
-    s.timeoutMs = 30000; // no frame takes so long
+    s.timeout = std::chrono::milliseconds(30000); // no frame takes so long
     return s;
 }
 
@@ -74,8 +74,8 @@ TEST_CASE("Owners that see the image of the display rank send it no tiles", "[sh
     std::int64_t messages[2] = {}, bytes[2] = {};
     for (const bool shared : {true, false}) {
         auto config = scene::configOf(s);
-        config.displayRank = sizeOf(MPI_COMM_WORLD) - 1;
-        dfb::ConnectionOptions options;
+        config.image.displayRank = sizeOf(MPI_COMM_WORLD) - 1;
+        dfb::NetworkConfig options;
         options.sharedMemory = shared;
         dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, config, options);
         dfb::FrameReport report;
@@ -118,7 +118,7 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
             mayGoOn = true;
         });
         Scene impatient = s;
-        impatient.timeoutMs = 2000; // by then rank 1 has long been at that tile
+        impatient.timeout = std::chrono::milliseconds(2000); // by then rank 1 has long been at that tile
         impatient.allowPartial = allowPartial;
         const std::string text =
             scene::outcomeOf([&] { report = scene::renderLoop(fb, impatient, scene::Loop::Declared); });

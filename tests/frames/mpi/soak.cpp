@@ -93,8 +93,8 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
     const scene::Scene first = scene::makeScene(1 + static_cast<int>(h % 6), seed, 9 + static_cast<int>(h >> 8 & 63),
                                                 5 + static_cast<int>(h >> 16 & 63));
     auto config = configOf(first, 1 + static_cast<int>(h >> 24 & 1));
-    config.displayRank = static_cast<int>(h >> 32 & 255) % sizeOf(communicator);
-    dfb::ConnectionOptions options;
+    config.image.displayRank = static_cast<int>(h >> 32 & 255) % sizeOf(communicator);
+    dfb::NetworkConfig options;
     options.sharedMemory = (h >> 41) % 4 != 0;
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(communicator, config, options);
     std::string wrong;

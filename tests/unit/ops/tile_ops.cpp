@@ -426,7 +426,7 @@ TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take i
             std::vector<bool> there(inputs, false);
             for (const std::size_t i : order) {
                 dfb::detail::InputFaults faults;
-                const dfb::detail::WireCoder coder{dfb::WirePrecision()};
+                const dfb::detail::WireCoder coder{dfb::Precision()};
                 op.add(dfb::detail::decodeFragment(
                     *pool,
                     dfb::detail::encodeFragment(*pool, *in.tiles[i], dfb::colorChannel, 0, nullptr, coder,

@@ -295,7 +295,7 @@ template <class Check>
 void withWorld(const std::vector<dfb::Brick>& bricks, const Check& check)
 {
     dfb::FrameBufferConfig config;
-    config.width = config.height = 8;
+    config.image.width = config.image.height = 8;
     dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
         FrameBuffer fb(communicator, config);
         check(dfb::SharedWorld(fb, dfb::World(bricks)));

@@ -325,7 +325,7 @@ TEST_CASE("A colour that is out of its format's range is refused, in every place
 {
     const auto pool = dfb::MemoryPool::create();
     const dfb::TileLayout layout(5, 3, 8);
-    const dfb::detail::WireCoder coder{dfb::WirePrecision(dfb::WireFormat::Float16)};
+    const dfb::detail::WireCoder coder{dfb::Precision(dfb::WireFormat::Float16)};
     auto tile = makeTile<8>(layout, 0);
     for (int y = 0; y < 3; ++y)
         for (int x = 0; x < 5; ++x) {
@@ -408,7 +408,7 @@ TEST_CASE("By depth what has one travels, whatever its colour, and nothing else"
     tile->pixel(4, 0)[0] = notANumber;                                            // is not looked at
     tile->pixel(5, 0)[0] = 0.5f, tile->pixel(5, 0)[3] = 1.0f, tile->depth[5] = 0; // in range
     for (const auto format : {dfb::WireFormat::Float32, dfb::WireFormat::Unorm8}) {
-        const dfb::detail::WireCoder coder(dfb::WirePrecision(format), true);
+        const dfb::detail::WireCoder coder(dfb::Precision(format), true);
         dfb::detail::InputFaults faults;
         const dfb::Fragment fragment = dfb::detail::decodeFragment(
             *pool, dfb::detail::encodeFragment(*pool, *tile, 3, 0, nullptr, coder, format, faults), layout,

@@ -73,7 +73,7 @@ TEST_CASE("Spans reach over the places where a row is cut for the search", "[wir
             tile->pixel(x, 0)[3] = 1;                   // all
             tile->pixel(x, 1)[0] = x % 64 != 5 ? 1 : 0; // with gaps
         }
-        active.gather(*tile, dfb::colorChannel, false, colors.data());
+        active.gather(*tile, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()));
         REQUIRE(active.rowCounts.size() == 2);
         CHECK(active.rowCounts[0] == 1);
         CHECK(active.spans[0].count == width);
@@ -107,12 +107,12 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
                     image[static_cast<std::size_t>(4 * (y * stride + x) + c)] =
                         valid.contains(r.x0 + x, r.y0 + y) ? (random() % 8 ? 0.5f : 0.0f) : notANumber;
         dfb::detail::ActivePixels narrow, wide;
-        narrow.gather(view, dfb::colorChannel, false, colors.data());
+        narrow.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(colors.data()));
         CHECK_FALSE(narrow.mayBeFaulty());
         for (float& value : image)
             value = std::isnan(value) ? 0 : value;
         view.valid = view.region;
-        wide.gather(view, dfb::colorChannel, false, expectedColors.data());
+        wide.gather(view, dfb::colorChannel, false, reinterpret_cast<std::byte*>(expectedColors.data()));
         REQUIRE(narrow.pixels == wide.pixels);
         CHECK((narrow.pixels == 0 || (narrow.rowBegin == wide.rowBegin && narrow.rowEnd == wide.rowEnd)));
         CHECK(narrow.rowCounts == wide.rowCounts);

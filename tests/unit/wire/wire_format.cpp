@@ -43,9 +43,9 @@ std::vector<float> through(WireFormat format, const dfb::detail::WireCoder& code
     return result;
 }
 
-dfb::WirePrecision precisionOf(WireFormat format, float maxColor = 1)
+dfb::Precision precisionOf(WireFormat format, float maxColor = 1)
 {
-    dfb::WirePrecision precision = format;
+    dfb::Precision precision = format;
     precision.maxColor = maxColor;
     return precision;
 }

@@ -59,7 +59,7 @@ struct TileInputs {
 
 // How inputs travel, and what the operation is told of it.
 struct TileWire {
-    WirePrecision precision;
+    Precision precision;
     float minTransmittance = 0;
     const Codec* codec = nullptr;
 };
