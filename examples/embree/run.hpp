@@ -1,9 +1,11 @@
-// Run: one rank's whole run of dfb_render. It has a source file of its own, as it takes long to compile.
+// Run: one rank's whole run of dfb_render. It has source files of its own, as it takes long to compile.
 #pragma once
 
 #include "options.hpp"
 
 #include <dfb/dfb.hpp>
+
+#include <memory>
 
 namespace example {
 
@@ -12,5 +14,8 @@ int runInproc(const dfb::InprocCommunicator& communicator, const Options& option
 #if defined(DFB_HAS_MPI)
 int runMpi(MPI_Comm communicator, const Options& options, int threads);
 #endif
+// Of either; where every rank has the whole scene.
+int runImageParallel(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& options,
+                     int threads);
 
 } // namespace example
