@@ -5,6 +5,7 @@
 #include <dfb/comm/inproc_transport.hpp>
 #include <dfb/display_wall.hpp>
 #include <dfb/distributed_framebuffer.hpp>
+#include <dfb/image_compositor.hpp>
 #include <dfb/ops/image_parallel.hpp>
 #include <dfb/ops/progressive.hpp>
 #include <dfb/ops/sort_last.hpp>

@@ -27,7 +27,7 @@ set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp)
 set(level_11 display_wall.hpp frame/outcome.hpp)
 set(level_12 frame/job_share.hpp)
 set(level_13 frame/frame_engine.hpp)
-set(level_14 distributed_framebuffer.hpp)
+set(level_14 distributed_framebuffer.hpp image_compositor.hpp)
 set(level_15 dfb.hpp)
 set(last_level 15)
 

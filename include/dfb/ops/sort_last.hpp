@@ -365,7 +365,7 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
     std::sort(pointers.begin(), pointers.end(), [this](const Fragment* a, const Fragment* b) {
         const TileHeader &x = a->header(), &y = b->header();
         if (rule_ == BlendRule::InOrder)
-            return std::tie(x.pass, x.generation) < std::tie(y.pass, y.generation);
+            return std::tie(x.pass, x.generation, x.source) < std::tie(y.pass, y.generation, y.source);
         return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
     });
 }

@@ -1,0 +1,368 @@
+// ImageCompositor: one picture out of images that ranks have rendered already. No camera, no bricks, no tiles:
+//
+//   dfb::ImageCompositor compositor(communicator, dfb::ImageBlend::Nearest, {width, height});
+//   dfb::InputImage mine(pixels, depths);
+//   mine.bottomUp = true; // as glReadPixels() gives them
+//   mine.farDepth = 1;
+//   compositor.composite(mine);
+//   if (compositor.isDisplayRank())
+//       show(compositor.image());
+#pragma once
+
+#include <dfb/compiled.hpp>
+#include <dfb/frame.hpp>
+#include <dfb/frame/engine.hpp>
+#include <dfb/ops/sort_last.hpp>
+
+#if defined(DFB_HAS_MPI)
+#include <dfb/comm/mpi_transport.hpp>
+#endif
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <utility>
+#include <vector>
+
+namespace dfb {
+
+// How the images of the ranks become one.
+enum class ImageBlend : std::uint8_t {
+    Nearest, // of each pixel the one with the least depth, for opaque geometry; a pixel without a depth is empty
+    ByDepth, // each pixel blended front to back by depth; at equal depths the lower rank is in front
+    InOrder  // images blended front to back in an order of the ranks; no depth is needed
+};
+
+// The image that a rank has rendered, where it lies in memory. It is read by ImageCompositor::start() and not changed.
+struct InputImage {
+    // No image: this rank has nothing to show.
+    InputImage() = default;
+    // 4 bytes or floats a pixel, and a depth for each pixel. Null depths: none, for ImageBlend::InOrder.
+    explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
+    explicit InputImage(const float* floats, const float* depths = nullptr) : rgba32f(floats), depth(depths) {}
+
+    // One of these; 8-bit colours are sent as 8 bits and blended exactly. Level k counts as k / 255: images that are
+    // encoded for a display are blended as they are, so ask for OutputFormat::RGBA8.
+    const std::uint8_t* rgba8 = nullptr;
+    const float* rgba32f = nullptr;
+    const float* depth = nullptr;  // grows away from the camera
+    std::ptrdiff_t rowPixels = 0;  // from a row to the next, of colour and depth; 0: the width of `region`
+    bool bottomUp = false;         // the first row is the lowest, as in OpenGL
+    bool isBgra = false;           // bytes are blue, green, red, alpha
+    bool hasStraightAlpha = false; // colours are not multiplied by alpha yet; 8-bit ones then travel as floats
+    float farDepth = std::numeric_limits<float>::infinity(); // a pixel at this depth or beyond is empty; 1 in OpenGL
+    // The part of the picture that the memory holds; empty: all of it. x counts from the left, y from the first row.
+    Region region{0, 0, 0, 0};
+    // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
+    Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
+};
+
+// One object per rank. Construction, destruction and resize() are collective. Members are called by one thread at a
+// time; the work is done on all threads of config.executor.
+class ImageCompositor {
+public:
+    // config.image says what the display rank gets. Throws what the constructor of DistributedFrameBuffer throws.
+    ImageCompositor(std::shared_ptr<Connection> connection, ImageBlend blend, FrameBufferConfig config);
+#if defined(DFB_HAS_MPI)
+    // Over a connection of its own.
+    ImageCompositor(MPI_Comm communicator, ImageBlend blend, FrameBufferConfig config, NetworkConfig network = {})
+        : ImageCompositor(connect<MpiTransport>(communicator, std::move(network)), blend, std::move(config))
+    {
+    }
+#endif
+
+    ImageCompositor(const ImageCompositor&) = delete;
+    ImageCompositor& operator=(const ImageCompositor&) = delete;
+    // A picture that is open fails on all ranks.
+    ~ImageCompositor()
+    {
+        if (isOpen_)
+            engine_->leave();
+    }
+
+    int rank() const noexcept { return engine_->rank(); }
+    int size() const noexcept { return engine_->size(); }
+    bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
+    const FrameBufferConfig& config() const noexcept { return engine_->config(); }
+
+    // Whether image() has its lowest row first, as OpenGL takes it; not so at first. The same on all ranks, and not
+    // while a picture is open.
+    void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
+
+    // Collective. Makes one picture of the images of all ranks; start() and end() in one. `place` is for
+    // ImageBlend::InOrder: this rank's place in the order, 0 in front, another for each rank.
+    FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {})
+    {
+        start(image, place, frame);
+        return end();
+    }
+    // For the other ways to blend.
+    FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
+    {
+        return composite(image, -1, frame);
+    }
+
+    // Reads this rank's image and sends it; when it returns, the memory may be used again. Waits for no other rank,
+    // unless this one has too much under way (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open.
+    // What is wrong with the image comes out of end() on all ranks.
+    void start(const InputImage& image, int place, const FrameConfig& frame = {});
+    void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
+
+    // Whether end() would return without waiting; see DistributedFrameBuffer::Frame::isDone(). False without start().
+    bool isDone()
+    {
+        if (isOpen_)
+            engine_->requireProgress();
+        return isOpen_ && engine_->isDone();
+    }
+
+    // Collective. Waits until the picture is complete on the display rank. Throws what Frame::end() throws: FrameError,
+    // the same on all ranks, after which the next picture can be made; or TransportError.
+    FrameReport end();
+
+    // The last picture, on the display rank; empty elsewhere, before the first picture, and after one that failed. It
+    // holds until the next start(). Pixels that nobody has show FrameConfig::background, at a depth of +infinity.
+    const Image& image() const noexcept { return engine_->image(); }
+
+    // Collective. Pictures have this size from now on; image() is empty. Throws InvalidArgument if a picture is open,
+    // or on all ranks if the size cannot be.
+    void resize(int width, int height);
+
+private:
+    std::unique_ptr<detail::Operations> makeOperations() const;
+    void makeEngine(const FrameBufferConfig& config);
+    void send(const InputImage& image, int place, bool usesDepth);
+
+    std::shared_ptr<Connection> connection_;
+    ImageBlend blend_;
+    bool bottomUp_ = false, isOpen_ = false;
+    std::unique_ptr<detail::Operations> operations_;
+    std::unique_ptr<detail::Engine> engine_;
+    std::vector<TileInput> inputs_;
+};
+
+} // namespace dfb
+
+#if DFB_HAS_BODIES
+#include <dfb/frame/frame_engine.hpp>
+
+namespace dfb {
+
+namespace detail {
+
+// Blends inputs front to back by their source, which is the place of their rank.
+class BlendBySource : public SortLast<BlendRule::InOrder, 64, colorChannel | depthChannel> {
+public:
+    static constexpr ChannelMask neededChannels = colorChannel;
+};
+
+template <class TileOp>
+std::unique_ptr<Operations> plainOperations()
+{
+    static const NoFrameData none;
+    auto operations = std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp());
+    operations->offer(none, none);
+    return operations;
+}
+
+// The part of an input image that is in one tile, as a view of pixels that a framebuffer takes.
+class InputTile {
+public:
+    using View = TileView<colorChannel | depthChannel, 64>;
+
+    // `isFlipped`: the image's first row is the last of the picture.
+    InputTile(const InputImage& image, const Region& region, const TileLayout& layout, bool isFlipped)
+        : image_(image), held_(region), height_(layout.height()), isFlipped_(isFlipped)
+    {
+        valid_ = intersection(intersection(held_, image.valid), {0, 0, layout.width(), layout.height()});
+        if (isFlipped)
+            valid_ = {valid_.x0, height_ - valid_.y1, valid_.x1, height_ - valid_.y0};
+    }
+
+    const Region& valid() const noexcept { return valid_; } // in the picture
+
+    // Fills in where the pixels of view.region are. What has to be converted is in memory of this thread, until its
+    // next call.
+    void find(View& view) const
+    {
+        const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();
+        const int row = (isFlipped_ ? height_ - 1 - view.region.y0 : view.region.y0) - held_.y0;
+        const std::ptrdiff_t first = row * rowPixels + (view.region.x0 - held_.x0);
+        view.valid = valid_;
+        view.stride = isFlipped_ ? -rowPixels : rowPixels;
+        view.color8 = image_.rgba8 ? image_.rgba8 + 4 * first : nullptr;
+        view.color = image_.rgba32f ? image_.rgba32f + 4 * first : nullptr;
+        view.depth = image_.depth ? image_.depth + first : nullptr;
+        const bool hasFarDepth = image_.depth && image_.farDepth < std::numeric_limits<float>::infinity();
+        if (!image_.hasStraightAlpha && !image_.isBgra && !hasFarDepth)
+            return;
+        static thread_local std::unique_ptr<Converted> converted;
+        if (!converted)
+            converted.reset(new Converted);
+        convert(view, *converted);
+    }
+
+private:
+    struct Converted {
+        float color[4 * 64 * 64], depth[64 * 64];
+        std::uint8_t color8[4 * 64 * 64];
+    };
+
+    // Copies the valid pixels to memory with rows of 64 pixels, as a framebuffer wants them.
+    void convert(View& view, Converted& to) const
+    {
+        const Region some = intersection(view.region, valid_);
+        const bool staysBytes = view.color8 && !image_.hasStraightAlpha;
+        const int red = image_.isBgra ? 2 : 0, blue = 2 - red;
+        for (int y = some.y0 - view.region.y0; y < some.y1 - view.region.y0; ++y)
+            for (int x = some.x0 - view.region.x0; x < some.x1 - view.region.x0; ++x) {
+                const std::ptrdiff_t from = y * view.stride + x, at = y * 64 + x;
+                const bool isEmpty = view.depth && view.depth[from] >= image_.farDepth;
+                if (view.depth)
+                    to.depth[at] = isEmpty ? std::numeric_limits<float>::infinity() : view.depth[from];
+                if (staysBytes) {
+                    const std::uint8_t* in = view.color8 + 4 * from;
+                    std::uint8_t* out = to.color8 + 4 * at;
+                    out[0] = in[red], out[1] = in[1], out[2] = in[blue], out[3] = in[3];
+                    std::fill_n(out, isEmpty ? 4 : 0, std::uint8_t{0});
+                } else {
+                    const auto value = [&](int c) {
+                        return view.color8 ? static_cast<float>(view.color8[4 * from + c]) / 255.0f
+                                           : view.color[4 * from + c];
+                    };
+                    const float alpha = value(3), factor = image_.hasStraightAlpha ? alpha : 1.0f;
+                    float* out = to.color + 4 * at;
+                    out[0] = value(red) * factor, out[1] = value(1) * factor, out[2] = value(blue) * factor;
+                    out[3] = alpha;
+                    std::fill_n(out, isEmpty ? 4 : 0, 0.0f);
+                }
+            }
+        view.stride = 64;
+        view.color8 = staysBytes ? to.color8 : nullptr;
+        view.color = staysBytes ? nullptr : to.color;
+        view.depth = view.depth ? to.depth : nullptr;
+    }
+
+    const InputImage& image_;
+    Region held_, valid_;
+    int height_;
+    bool isFlipped_;
+};
+
+} // namespace detail
+
+DFB_COMPILED_ONCE ImageCompositor::ImageCompositor(std::shared_ptr<Connection> connection, ImageBlend blend,
+                                                   FrameBufferConfig config)
+    : connection_(std::move(connection)), blend_(blend)
+{
+    config.framesInFlight = 1;
+    if (!config.executor)
+        config.executor = detail::makeThreads(*connection_);
+    makeEngine(config);
+}
+
+DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOperations() const
+{
+    switch (blend_) {
+    case ImageBlend::ByDepth: return detail::plainOperations<AlphaBlend>();
+    case ImageBlend::InOrder: return detail::plainOperations<detail::BlendBySource>();
+    case ImageBlend::Nearest: break;
+    }
+    return detail::plainOperations<DepthComposite>();
+}
+
+DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
+{
+    auto operations = makeOperations();
+    try {
+        engine_ = detail::makeEngine(connection_, config, *operations, 0);
+    } catch (const InvalidArgument&) {
+        // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
+        if (!engine_)
+            connection_.reset();
+        throw;
+    }
+    operations_ = std::move(operations);
+}
+
+DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
+{
+    if (isOpen_)
+        detail::failArgument("resize() while a picture is open: end() it first");
+    FrameBufferConfig config = engine_->config();
+    config.image.width = width;
+    config.image.height = height;
+    makeEngine(config);
+}
+
+DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place, const FrameConfig& frame)
+{
+    if (isOpen_)
+        detail::failArgument("start() while a picture is open: end() it first");
+    if (frame.passes != 1 || frame.samples)
+        detail::failArgument("a picture of images has one sample a pixel");
+    FrameConfig declared = frame;
+    declared.declared = true;
+    if (declared.maxLayers == 0)
+        declared.maxLayers = size();
+    engine_->begin(declared);
+    isOpen_ = true;
+    try {
+        send(image, place, blend_ != ImageBlend::InOrder || config().image.depth);
+    } catch (...) {
+        engine_->abort(std::current_exception(), -1);
+    }
+}
+
+DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
+{
+    if (!isOpen_)
+        detail::failArgument("end() without start()");
+    engine_->requireProgress();
+    isOpen_ = false;
+    return engine_->end();
+}
+
+// Declares and sends the tiles that the image has a part of.
+DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place, bool usesDepth)
+{
+    const TileLayout& layout = engine_->layout();
+    const bool isThere = image.rgba8 || image.rgba32f;
+    Region region = image.region;
+    if (region.empty())
+        region = {0, 0, layout.width(), layout.height()};
+    if (isThere && usesDepth && !image.depth)
+        detail::failArgument("an image without depth, which %s needs",
+                             blend_ == ImageBlend::InOrder ? "the depth of the picture" : "this way to blend");
+    if (image.rowPixels != 0 && image.rowPixels < region.width())
+        detail::failArgument("rows of %d pixels that are %lld pixels apart", region.width(),
+                             static_cast<long long>(image.rowPixels));
+    if (image.rgba8 && image.rgba32f)
+        detail::failArgument("an image of 8 bits and of floats");
+    if (blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
+        detail::failArgument("place %d in an order of %d ranks", place, size());
+    const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_);
+    const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
+    inputs_.clear();
+    const Region tiles = isThere ? layout.tilesIn(part.valid()) : Region();
+    for (int row = tiles.y0; row < tiles.y1; ++row)
+        for (int column = tiles.x0; column < tiles.x1; ++column)
+            inputs_.push_back({layout.tileAt(column, row), source, 0});
+    engine_->declare(inputs_);
+    config().executor->parallelFor(inputs_.size(), [&](std::size_t i) {
+        if (engine_->failed())
+            return;
+        detail::InputTile::View view;
+        static_cast<TileHeader&>(view) = engine_->headerOf(inputs_[i].tile, 0);
+        view.generation = 1;
+        view.source = source;
+        part.find(view);
+        engine_->setTile(view);
+    });
+}
+
+} // namespace dfb
+#endif

@@ -1,0 +1,336 @@
+// ImageCompositor: one picture out of finished images, compared with a composition in double that shares no code.
+
+#include <dfb/image_compositor.hpp>
+
+#include "everywhere.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstring>
+#include <limits>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+namespace frame_cases {
+
+namespace {
+
+constexpr int imageWidth = 150, imageHeight = 93;
+
+std::uint32_t mixed(std::uint32_t a, std::uint32_t b, std::uint32_t c)
+{
+    std::uint32_t h = a * 0x9e3779b1u ^ (b + 0x7f4a7c15u) * 0x85ebca6bu ^ (c + 0x165667b1u) * 0xc2b2ae35u;
+    h = (h ^ h >> 15) * 0x2c1b3c6du;
+    h = (h ^ h >> 12) * 0x297a2d39u;
+    return h ^ h >> 15;
+}
+
+// How an image lies in memory.
+struct Form {
+    const char* name;
+    bool isFloat, bottomUp, isBgra, hasStraightAlpha;
+    int padding = 0;     // pixels after each row
+    bool isPart = false; // only the valid rectangle lies in memory
+};
+
+// What a rank shows at a pixel of the picture, counted from its upper left corner.
+struct Source {
+    std::array<int, 4> levels{}; // alpha last
+    float depth = 1;
+};
+
+Source sourceAt(int rank, int x, int y, bool hasStraightAlpha)
+{
+    const std::uint32_t h =
+        mixed(static_cast<std::uint32_t>(rank), static_cast<std::uint32_t>(x), static_cast<std::uint32_t>(y));
+    Source s;
+    s.levels[3] = h % 4 == 0 ? 255 : static_cast<int>(h >> 8 & 255);
+    for (std::uint32_t c = 0; c < 3; ++c) {
+        const int value = static_cast<int>(mixed(h, c, 5) & 255);
+        s.levels[c] = hasStraightAlpha ? value : std::min(value, s.levels[3]);
+    }
+    s.depth = h % 3 == 0 ? 1.0f : static_cast<float>(h >> 4 & 63) / 64; // many are equal
+    return s;
+}
+
+// In the picture, from its upper left corner. Ranks differ, and the third one has nothing.
+dfb::Region validOf(int rank)
+{
+    const int inset = 9 * rank;
+    if (rank == 2)
+        return {0, 0, 0, 0};
+    return {std::min(inset, 70), std::min(2 * inset, 40), imageWidth - std::min(inset / 2, 30),
+            imageHeight - std::min(inset, 33)};
+}
+
+bool isIn(const dfb::Region& r, int x, int y) { return x >= r.x0 && x < r.x1 && y >= r.y0 && y < r.y1; }
+
+// A rank's image in memory, with what must not be read around it.
+struct OwnImage {
+    std::vector<std::uint8_t> bytes;
+    std::vector<float> floats, depths;
+    dfb::InputImage image;
+
+    OwnImage(int rank, const Form& form, bool hasDepth)
+    {
+        dfb::Region valid = validOf(rank); // as its own rows are counted
+        if (form.bottomUp)
+            valid = {valid.x0, imageHeight - valid.y1, valid.x1, imageHeight - valid.y0};
+        if (valid.width() <= 0)
+            return;
+        const dfb::Region held = form.isPart ? valid : dfb::Region{0, 0, imageWidth, imageHeight};
+        const int row = held.width() + form.padding;
+        const auto pixels = static_cast<std::size_t>(row * held.height());
+        bytes.assign(form.isFloat ? 0 : 4 * pixels, 199);
+        floats.assign(form.isFloat ? 4 * pixels : 0, std::numeric_limits<float>::quiet_NaN());
+        depths.assign(pixels, -1.0f); // would be in front of all
+        for (int y = valid.y0; y < valid.y1; ++y)
+            for (int x = valid.x0; x < valid.x1; ++x) {
+                const Source s = sourceAt(rank, x, form.bottomUp ? imageHeight - 1 - y : y, form.hasStraightAlpha);
+                const auto i = static_cast<std::size_t>((y - held.y0) * row + x - held.x0);
+                depths[i] = s.depth;
+                for (std::size_t c = 0; c < 4; ++c) {
+                    const int level = s.levels[form.isBgra && c < 3 ? 2 - c : c];
+                    if (form.isFloat)
+                        floats[4 * i + c] = static_cast<float>(level) / 255.0f;
+                    else
+                        bytes[4 * i + c] = static_cast<std::uint8_t>(level);
+                }
+            }
+        if (form.isFloat)
+            image.rgba32f = floats.data();
+        else
+            image.rgba8 = bytes.data();
+        image.depth = hasDepth ? depths.data() : nullptr;
+        image.farDepth = 1;
+        image.bottomUp = form.bottomUp;
+        image.isBgra = form.isBgra;
+        image.hasStraightAlpha = form.hasStraightAlpha;
+        image.rowPixels = form.padding > 0 ? row : 0;
+        image.region = form.isPart ? valid : dfb::Region{0, 0, 0, 0};
+        image.valid = valid;
+    }
+};
+
+constexpr std::array<float, 4> background{0.25f, 0.5f, 0.125f, 0.75f};
+
+struct Expected {
+    std::array<double, 4> rgba{};
+    float depth = std::numeric_limits<float>::infinity();
+};
+
+// `placeOf(rank)`: where it is in the order.
+template <class PlaceOf>
+Expected expectedAt(int x, int y, int ranks, dfb::ImageBlend blend, const Form& form, bool hasDepth,
+                    const PlaceOf& placeOf)
+{
+    std::vector<std::tuple<double, int, Source>> layers;
+    for (int rank = 0; rank < ranks; ++rank)
+        if (isIn(validOf(rank), x, y)) {
+            const Source s = sourceAt(rank, x, y, form.hasStraightAlpha);
+            if (hasDepth && s.depth >= 1)
+                continue;
+            const double key = blend == dfb::ImageBlend::InOrder ? placeOf(rank) : static_cast<double>(s.depth);
+            layers.emplace_back(key, rank, s);
+        }
+    std::sort(layers.begin(), layers.end(), [](const auto& a, const auto& b) {
+        return std::make_pair(std::get<0>(a), std::get<1>(a)) < std::make_pair(std::get<0>(b), std::get<1>(b));
+    });
+    if (blend == dfb::ImageBlend::Nearest && layers.size() > 1)
+        layers.resize(1);
+    Expected e;
+    double through = 1;
+    for (const auto& [key, rank, s] : layers) {
+        const double alpha = s.levels[3] / 255.0;
+        for (std::size_t c = 0; c < 4; ++c)
+            e.rgba[c] += through * s.levels[c] / 255.0 * (form.hasStraightAlpha && c < 3 ? alpha : 1.0);
+        through *= 1 - alpha;
+        // A pixel that is 0 in all channels is not there, unless its depth says so; colours are not above alpha.
+        if (hasDepth && (s.levels[3] > 0 || blend == dfb::ImageBlend::Nearest))
+            e.depth = std::min(e.depth, s.depth);
+    }
+    for (std::size_t c = 0; c < 4; ++c)
+        e.rgba[c] += through * static_cast<double>(background[c]);
+    return e;
+}
+
+struct Images {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        const std::vector<Form> forms{{"8 bit", false, false, false, false},
+                                      {"OpenGL", false, true, false, false},
+                                      {"BGRA in wide rows", false, false, true, false, 5},
+                                      {"straight alpha", false, true, true, true, 3},
+                                      {"floats", true, false, false, false},
+                                      {"floats with straight alpha", true, true, false, true, 7},
+                                      {"only what is valid", false, true, false, false, 2, true}};
+        Result result;
+        const auto connection = dfb::connect<Transport>(communicator);
+        const auto executor = std::make_shared<dfb::ThreadExecutor>(2);
+        for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder})
+            for (const bool toBytes : {true, false}) {
+                const bool hasDepth = blend != dfb::ImageBlend::InOrder;
+                dfb::FrameBufferConfig config(imageWidth, imageHeight,
+                                              toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F,
+                                              hasDepth && !toBytes);
+                config.executor = executor;
+                config.image.displayRank = connection->size() - 1;
+                dfb::ImageCompositor compositor(connection, blend, config);
+                result.expect(compositor.image().empty(), "an image before the first");
+                const int ranks = compositor.size();
+                const auto placeOf = [&](int rank) { return (rank + 2) % ranks; };
+                for (const Form& form : forms)
+                    for (const bool toBottomUp : {false, true}) {
+                        compositor.setBottomUp(toBottomUp);
+                        dfb::FrameConfig frame;
+                        frame.background = background;
+                        {
+                            const OwnImage own(compositor.rank(), form, hasDepth);
+                            compositor.start(
+                                own.image, blend == dfb::ImageBlend::InOrder ? placeOf(compositor.rank()) : -1, frame);
+                        } // it is not needed any more
+                        compositor.end();
+                        if (!compositor.isDisplayRank())
+                            continue;
+                        check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                    }
+            }
+        return result;
+    }
+
+    template <class PlaceOf>
+    static void check(Result& result, const dfb::Image& image, const Form& form, dfb::ImageBlend blend, bool toBottomUp,
+                      bool hasDepth, int ranks, const PlaceOf& placeOf)
+    {
+        int wrong = 0, wrongDepths = 0;
+        const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
+        for (int y = 0; y < imageHeight; ++y)
+            for (int x = 0; x < imageWidth; ++x) {
+                const Expected e = expectedAt(x, y, ranks, blend, form, hasDepth, placeOf);
+                const auto i = static_cast<std::size_t>((toBottomUp ? imageHeight - 1 - y : y) * imageWidth + x);
+                for (std::size_t c = 0; c < 4; ++c) {
+                    // Colours are floats on the way: a rounding of 2^-24 for each of 7 layers, twice where they are
+                    // multiplied by alpha.
+                    constexpr double rounding = 14 * 0x1p-24;
+                    if (isFloat)
+                        wrong += !(std::abs(static_cast<double>(image.rgba32f()[4 * i + c]) - e.rgba[c])
+                                   <= rounding + 0x1p-24);
+                    else
+                        wrong += !(std::abs(image.rgba8()[4 * i + c] - 255 * e.rgba[c]) <= 0.5 + 255 * rounding);
+                }
+                if (image.hasDepth())
+                    wrongDepths += image.depth()[i] != e.depth;
+            }
+        const std::string name = std::string(form.name) + (toBottomUp ? ", to bottom-up" : "") + ", blend "
+                                 + std::to_string(static_cast<int>(blend));
+        result.expect(wrong == 0, name + ": " + std::to_string(wrong) + " wrong values");
+        result.expect(wrongDepths == 0, name + ": " + std::to_string(wrongDepths) + " wrong depths");
+    }
+};
+
+// 8-bit images travel as bytes, and give what floats of the same values give, bit for bit.
+struct BytesAndFloats {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto connection = dfb::connect<Transport>(communicator);
+        dfb::FrameBufferConfig config(imageWidth, imageHeight, dfb::OutputFormat::RGBA32F);
+        config.executor = std::make_shared<dfb::ThreadExecutor>(2);
+        for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
+            dfb::ImageCompositor compositor(connection, blend, config);
+            const int place = blend == dfb::ImageBlend::InOrder ? compositor.rank() : -1;
+            std::vector<std::vector<std::byte>> pictures;
+            std::vector<std::int64_t> bytes;
+            for (const bool isFloat : {false, true}) {
+                const OwnImage own(compositor.rank(), {"", isFloat, false, false, false}, true);
+                bytes.push_back(compositor.composite(own.image, place).bytesSent);
+                const dfb::Image& image = compositor.image();
+                pictures.emplace_back(image.bytes(), image.bytes() + (image.empty() ? 0 : 16 * image.pixelCount()));
+            }
+            result.expect(pictures[0] == pictures[1], "floats give another picture");
+            result.expect(compositor.size() == 1 || bytes[0] < bytes[1], "8 bits are no fewer bytes");
+        }
+        return result;
+    }
+};
+
+// Wrong images and other sizes: the error is the same on all ranks, and the next picture is right.
+struct Failures {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        dfb::FrameBufferConfig config(imageWidth, imageHeight);
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::Nearest, config);
+        const std::vector<std::uint8_t> pixels(4 * 300 * 200, 255);
+        const std::vector<float> depths(300 * 200, 0.5f);
+        const dfb::InputImage good(pixels.data(), depths.data());
+        const auto expectGood = [&](int width, int height, const std::string& when) {
+            compositor.composite(good);
+            const dfb::Image& image = compositor.image();
+            if (!compositor.isDisplayRank())
+                return;
+            int wrong = image.width() != width || image.height() != height;
+            for (std::size_t i = 0; i < 4 * image.pixelCount(); ++i)
+                wrong += image.rgba8()[i] != 255;
+            result.expect(wrong == 0, "a wrong picture after " + when);
+        };
+        const auto expectError = [&](const dfb::InputImage& image, const char* what, const std::string& part) {
+            const std::string text = scene::outcomeOf(
+                [&] { compositor.composite(compositor.rank() == compositor.size() - 1 ? image : good); });
+            result.expect(text.find("FrameError") != std::string::npos && text.find(part) != std::string::npos,
+                          std::string(what) + ": " + text);
+            result.expect(compositor.image().empty(), std::string(what) + ": an image after an error");
+            expectGood(imageWidth, imageHeight, what);
+        };
+        expectError(dfb::InputImage(pixels.data()), "no depth", "without depth");
+        dfb::InputImage narrow = good;
+        narrow.rowPixels = imageWidth - 1;
+        expectError(narrow, "narrow rows", "149 pixels apart");
+        dfb::InputImage both = good;
+        both.rgba32f = depths.data();
+        expectError(both, "two images", "of 8 bits and of floats");
+
+        for (const auto& [width, height] : {std::make_pair(64, 31), std::make_pair(300, 200)}) {
+            compositor.resize(width, height);
+            result.expect(compositor.image().empty(), "an image after resize()");
+            expectGood(width, height, "resize()");
+        }
+        const std::string text = scene::outcomeOf([&] { compositor.resize(0, 10); });
+        result.expect(text.find("InvalidArgument") != std::string::npos, "resize() to nothing: " + text);
+        expectGood(300, 200, "resize() that failed");
+
+        compositor.start(good);
+        for (const std::string& misuse :
+             {scene::outcomeOf([&] { compositor.start(good); }), scene::outcomeOf([&] { compositor.resize(8, 8); })})
+            result.expect(misuse.find("while a picture is open") != std::string::npos, "misuse: " + misuse);
+        compositor.end();
+        const std::string twice = scene::outcomeOf([&] { compositor.end(); });
+        result.expect(twice.find("end() without start()") != std::string::npos, "end() twice: " + twice);
+        return result;
+    }
+};
+
+} // namespace
+
+TEST_CASE("Finished images of any form become the picture that a composition in double gives", "[image_compositor]")
+{
+    everywhere<Images>();
+}
+
+TEST_CASE("Images of 8 bits travel as bytes and give what floats give", "[image_compositor]")
+{
+    everywhere<BytesAndFloats>();
+}
+
+TEST_CASE("An image that cannot be fails the picture on all ranks, and resize() changes its size", "[image_compositor]")
+{
+    everywhere<Failures>();
+}
+
+} // namespace frame_cases
