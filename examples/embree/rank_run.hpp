@@ -657,8 +657,7 @@ private:
 
 // Runs with these operations.
 template <class TileOp, class PixelOp>
-int runWith(TileOp, PixelOp, std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o,
-            int threads)
+int runWith(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
 {
     return RankRun<TileOp, PixelOp>(std::move(connection), transport, o, threads).run();
 }

@@ -18,7 +18,7 @@ int runOver(std::shared_ptr<dfb::Connection> connection, const char* transport, 
     if (isImageParallel(o))
         return runImageParallel(std::move(connection), transport, o, threads);
     const auto run = [&](auto tileOp, auto pixelOp) {
-        return runWith(tileOp, pixelOp, std::move(connection), transport, o, threads);
+        return runWith<decltype(tileOp), decltype(pixelOp)>(std::move(connection), transport, o, threads);
     };
     if (o.deep > 0 || o.interleave > 1)
         return run(dfb::DeepBlend(), dfb::NoPixelOp());

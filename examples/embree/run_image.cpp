@@ -7,7 +7,7 @@ namespace example {
 int runImageParallel(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
 {
     const auto run = [&](auto tileOp, auto pixelOp) {
-        return runWith(tileOp, pixelOp, std::move(connection), transport, o, threads);
+        return runWith<decltype(tileOp), decltype(pixelOp)>(std::move(connection), transport, o, threads);
     };
     if (o.verify)
         return run(VerifiedSingle(), dfb::NoPixelOp());

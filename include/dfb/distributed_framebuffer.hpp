@@ -143,6 +143,44 @@ public:
             return guardAbout(body, &tile);
         }
 
+        // Calls job(i, tile) for each i in [0, count), on all workers of the executor and this thread, each with a tile
+        // of its own: a Tile, or a TileView if that is asked for. The job calls start(tile, ...), renders, and calls
+        // setTile(tile). Returns when all jobs have. An exception of a job makes the frame fail as guard() does; then
+        // no other job begins. With allowPartial the frame goes on without the tile that it was about.
+        template <class WorkerTile = Tile, class Job>
+        void forEachTile(std::int64_t count, const Job& job)
+        {
+            guard([&] {
+                fb_->executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
+                    if (failed())
+                        return;
+                    // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be
+                    // given another job on the same thread.
+                    static thread_local std::unique_ptr<WorkerTile> spare;
+                    std::unique_ptr<WorkerTile> tile = std::move(spare);
+                    if (!tile)
+                        tile.reset(new WorkerTile); // start() clears it
+                    tile->tile = -1;
+                    guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile);
+                    spare = std::move(tile);
+                });
+            });
+        }
+
+        // Calls render(tile) for each of these tiles and each of its passes, with a tile that start() has made ready;
+        // render(tile) calls setTile(tile). Threads and exceptions as above.
+        template <class Render>
+        void forEachTile(const std::vector<int>& tiles, const Render& render)
+        {
+            forEachTile(static_cast<std::int64_t>(tiles.size()), [&](std::int64_t i, Tile& tile) {
+                const int index = tiles[static_cast<std::size_t>(i)];
+                for (int pass = 0; pass < samples(index).count && !failed(); ++pass) {
+                    start(tile, index, pass);
+                    render(tile);
+                }
+            });
+        }
+
         // Makes the frame fail on all ranks, with the text of this exception; with FrameConfig::allowPartial it goes on
         // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
         // will name it. From any thread.

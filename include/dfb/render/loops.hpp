@@ -51,6 +51,8 @@ template <class FrameBuffer, class Find>
 struct TileOf<FrameBuffer, InPlace<Find>> {
     using Type = typename FrameBuffer::TileView;
 };
+template <class FrameBuffer, class Render>
+using TileFor = typename TileOf<FrameBuffer, Render>::Type;
 
 // A job for each pass of each of some items, numbered item by item.
 class PassJobs {
@@ -95,29 +97,6 @@ private:
     std::int64_t count_ = 0;
     std::vector<std::int64_t> firstJob_; // of each item, unless all have equally many passes
 };
-
-// Calls job(i, tile) for i in [0, count) on the framebuffer's executor, each with a tile of its own, of the kind that
-// `Render` wants. An exception of a job makes the frame fail on all ranks; then no further job is begun.
-template <class Render, class FrameBuffer, class Job>
-void forEachTile(FrameBuffer& fb, typename FrameBuffer::Frame& frame, std::int64_t count, const Job& job)
-{
-    using Tile = typename TileOf<FrameBuffer, Render>::Type;
-    frame.guard([&] {
-        fb.executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
-            if (frame.failed())
-                return;
-            // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be given
-            // another job on the same thread.
-            static thread_local std::unique_ptr<Tile> spare;
-            std::unique_ptr<Tile> tile = std::move(spare);
-            if (!tile)
-                tile.reset(new Tile); // start() clears it
-            tile->tile = -1;
-            frame.guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile); // the frame may do without that one
-            spare = std::move(tile);
-        });
-    });
-}
 
 } // namespace detail
 
@@ -181,12 +160,13 @@ public:
             const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
             // `number` jobs: first, first + step and so on, modulo all there are.
             const auto run = [&](std::int64_t first, std::int64_t number, std::int64_t step = 1) {
-                detail::forEachTile<RenderTile>(fb_, frame, number, [&](std::int64_t i, auto& tile) {
-                    const auto [item, pass] = jobs_.at((first + i * step) % count);
-                    frame.start(tile, tileOf(item), pass);
-                    renderTile(tile);
-                    frame.setTile(tile);
-                });
+                frame.template forEachTile<detail::TileFor<FrameBuffer, RenderTile>>(
+                    number, [&](std::int64_t i, auto& tile) {
+                        const auto [item, pass] = jobs_.at((first + i * step) % count);
+                        frame.start(tile, tileOf(item), pass);
+                        renderTile(tile);
+                        frame.setTile(tile);
+                    });
             };
             switch (distribution_) {
             case WorkDistribution::Owned: run(0, count); break;
@@ -239,7 +219,7 @@ public:
             findInputs(world, pairs_, inputs_);
             frame.declare(inputs_);
             jobs_.find(pairs_.size(), [&](std::size_t i) { return frame.samples(pairs_[i].tile).count; });
-            forEachTile<Render>(fb, frame, jobs_.count(), [&](std::int64_t i, auto& tile) {
+            frame.template forEachTile<TileFor<FrameBuffer, Render>>(jobs_.count(), [&](std::int64_t i, auto& tile) {
                 const auto [item, pass] = jobs_.at(i);
                 const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs_[item].brick)];
                 frame.start(tile, pairs_[item].tile, pass);

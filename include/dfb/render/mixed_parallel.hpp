@@ -352,16 +352,17 @@ public:
                     inputs_.push_back({pair.tile, b.brick.id, 0});
             frame.declare(inputs_);
             const auto count = static_cast<std::int64_t>(work_.jobs.size());
-            detail::forEachTile<RenderBrick>(fb_, frame, count, [&](std::int64_t i, auto& tile) {
-                const detail::MixedJob& job = work_.jobs[static_cast<std::size_t>(i)];
-                const BrickInTile& pair = work_.pairs[job.pair];
-                const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
-                frame.start(tile, pair.tile, job.pass);
-                tile.generation = 1;
-                tile.source = brick.id;
-                detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
-                frame.setTile(tile);
-            });
+            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
+                count, [&](std::int64_t i, auto& tile) {
+                    const detail::MixedJob& job = work_.jobs[static_cast<std::size_t>(i)];
+                    const BrickInTile& pair = work_.pairs[job.pair];
+                    const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+                    frame.start(tile, pair.tile, job.pass);
+                    tile.generation = 1;
+                    tile.source = brick.id;
+                    detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+                    frame.setTile(tile);
+                });
         });
         return frame;
     }
@@ -412,19 +413,21 @@ public:
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findEmpty(fb_.layout().tileCount(), fb_.ownedTiles());
             const auto emptyCount = static_cast<std::int64_t>(work_.empty.size());
-            detail::forEachTile<RenderBrick>(fb_, frame, emptyCount, [&](std::int64_t i, auto& tile) {
-                const int index = work_.empty[static_cast<std::size_t>(i)];
-                for (int pass = 0; pass < frame.samples(index).count; ++pass) {
-                    frame.start(tile, index, pass);
-                    frame.setTile(tile);
-                }
-            });
+            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
+                emptyCount, [&](std::int64_t i, auto& tile) {
+                    const int index = work_.empty[static_cast<std::size_t>(i)];
+                    for (int pass = 0; pass < frame.samples(index).count; ++pass) {
+                        frame.start(tile, index, pass);
+                        frame.setTile(tile);
+                    }
+                });
             if (work_.anyHidden.exchange(false))
                 work_.renderFrontsFirst();
             const auto count = static_cast<std::int64_t>(work_.jobs.size());
-            detail::forEachTile<RenderBrick>(fb_, frame, count, [&](std::int64_t i, auto& tile) {
-                renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile);
-            });
+            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
+                count, [&](std::int64_t i, auto& tile) {
+                    renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile);
+                });
         });
         return frame;
     }
