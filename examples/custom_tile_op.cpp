@@ -31,19 +31,13 @@ public:
     void add(dfb::Fragment&& fragment) // in any order
     {
         const int level = fragment.header().generation;
-        dfb::FragmentCursor rows(fragment);
-        for (int y = 0; y < region_.height(); ++y) {
-            const dfb::FragmentRow row = rows.next();
-            const float* color = row.color;
-            for (int s = 0; s < row.spanCount; ++s)
-                for (int x = row.spans[s].x; x < row.spans[s].x + row.spans[s].count; ++x, color += 4) {
-                    const auto pixel = static_cast<std::size_t>(y * region_.width() + x);
-                    if (level <= level_[pixel])
-                        continue;
-                    level_[pixel] = level;
-                    std::copy_n(color, 4, &color_[4 * pixel]);
-                }
-        }
+        fragment.forEachPixel([&](int x, int y, const float* rgba, float) {
+            const auto pixel = static_cast<std::size_t>(y * region_.width() + x);
+            if (level <= level_[pixel])
+                return;
+            level_[pixel] = level;
+            std::copy_n(rgba, 4, &color_[4 * pixel]);
+        });
     }
 
     void finish(dfb::FinishedTile& out)

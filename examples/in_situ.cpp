@@ -356,8 +356,8 @@ std::string run(MPI_Comm comm, const Options& options)
         std::snprintf(number, sizeof number, "_%04d.ppm", frames++);
         name = options.out + number;
         const bool written = !fb.isDisplayRank() || writePicture(name, fb.image());
-        if (fb.allReduce({written}, FrameBuffer::Reduce::Min)[0] == 0) // the others can not see it
-            return name + " can not be written";
+        if (fb.allReduce({written}, FrameBuffer::Reduce::Min)[0] == 0) // the others cannot see it
+            return name + " cannot be written";
         renderingTime += MPI_Wtime() - advanced;
     }
 

@@ -119,7 +119,7 @@ public:
         std::ofstream file(path, std::ios::app);
         file << '\n' << title << "\n\n" << text();
         if (!file.flush())
-            throw std::runtime_error("can not write " + path);
+            throw std::runtime_error("cannot write " + path);
     }
 
 private:

@@ -97,7 +97,7 @@ inline void writePlot(const std::string& path, const std::string& title, const s
     }
     svg << "</svg>\n";
     if (!svg.flush())
-        throw std::runtime_error("can not write " + path);
+        throw std::runtime_error("cannot write " + path);
 }
 
 } // namespace bench

@@ -47,7 +47,7 @@ inline void appendJson(const std::string& path, const std::vector<Result>& resul
     for (const Result& r : results)
         file << r.json() << '\n';
     if (!file.flush())
-        throw std::runtime_error("can not write " + path);
+        throw std::runtime_error("cannot write " + path);
 }
 
 // Whether no other result is at least as fast and as exact, and better in one.
@@ -122,7 +122,7 @@ inline void writeSvg(const std::string& path, const std::string& title, std::vec
     }
     svg << "</svg>\n";
     if (!svg.flush())
-        throw std::runtime_error("can not write " + path);
+        throw std::runtime_error("cannot write " + path);
 }
 
 } // namespace bench

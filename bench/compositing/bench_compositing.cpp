@@ -322,7 +322,7 @@ private:
                 file << "| " << ratios(mine, peer) << ' ';
         file << "|\n";
         if (!file.flush())
-            throw std::runtime_error("can not write " + o_.table);
+            throw std::runtime_error("cannot write " + o_.table);
     }
 
     MPI_Comm comm_;

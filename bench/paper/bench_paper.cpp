@@ -73,7 +73,7 @@ void writePpm(const std::string& path, const std::vector<float>& linear, int wid
     for (std::size_t i = 0; i < pixels.size(); i += 4)
         file.write(reinterpret_cast<const char*>(&pixels[i]), 3);
     if (!file.flush())
-        throw std::runtime_error("can not write " + path);
+        throw std::runtime_error("cannot write " + path);
 }
 
 class PaperFigure {

@@ -156,7 +156,7 @@ inline void writeMeasurements(const std::vector<Measurement>& all, const std::st
         std::ofstream file(path, std::ios::app);
         file << what;
         if (!file.flush())
-            throw std::runtime_error("can not write " + path);
+            throw std::runtime_error("cannot write " + path);
     };
     std::string lines;
     for (const Measurement& m : all)

@@ -148,7 +148,7 @@ public:
                 << panels_[i] << "</g>\n";
         svg << "</svg>\n";
         if (!svg.flush())
-            throw std::runtime_error("can not write " + path);
+            throw std::runtime_error("cannot write " + path);
     }
 
 private:

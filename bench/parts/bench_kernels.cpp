@@ -631,7 +631,7 @@ void report(const Reporter& reporter, const std::string& json, const std::string
     if (!tablePath.empty())
         table.appendTo(tablePath, title);
     if (!json.empty() && !file.flush())
-        throw std::runtime_error("can not write " + json);
+        throw std::runtime_error("cannot write " + json);
 }
 
 } // namespace

@@ -56,7 +56,7 @@ inline void writeFloats(const std::string& path, int width, int height, const fl
 
 } // namespace detail
 
-// Throws if the file can not be opened for writing. What it holds stays; if there is none, none is left behind.
+// Throws if the file cannot be opened for writing. What it holds stays; if there is none, none is left behind.
 inline void requireWritable(const std::string& path)
 {
     std::error_code ignored;

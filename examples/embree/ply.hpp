@@ -44,7 +44,7 @@ public:
         readHeader();
         Mesh mesh;
         for (const PlyElement& element : elements_) {
-            // A row takes at least a byte, so that a false count can not ask for more memory than the file has.
+            // A row takes at least a byte, so that a false count cannot ask for more memory than the file has.
             if (!element.properties.empty() && element.count > bytes_.size() - at_)
                 fail("it ends early: expected " + std::to_string(element.count) + " of element " + element.name
                      + ", got " + std::to_string(bytes_.size() - at_) + " bytes");

@@ -27,7 +27,7 @@ struct Hit {
     Vec3 color;
 };
 
-// One device for all bricks of the process, for as long as there are any: Embree can not make thousands.
+// One device for all bricks of the process, for as long as there are any: Embree cannot make thousands.
 inline std::shared_ptr<std::remove_pointer_t<RTCDevice>> sharedDevice()
 {
     static std::mutex mutex;
@@ -37,7 +37,7 @@ inline std::shared_ptr<std::remove_pointer_t<RTCDevice>> sharedDevice()
     if (!device) {
         const RTCDevice made = rtcNewDevice(nullptr);
         if (!made)
-            throw std::runtime_error("Embree can not create a device, error "
+            throw std::runtime_error("Embree cannot create a device, error "
                                      + std::to_string(rtcGetDeviceError(nullptr)));
         device.reset(made, rtcReleaseDevice);
         current = device;
@@ -63,7 +63,7 @@ public:
         rtcCommitScene(scene_.get());
         const RTCError error = rtcGetDeviceError(device_.get());
         if (error != RTC_ERROR_NONE)
-            throw std::runtime_error("Embree can not build its scene, error " + std::to_string(error));
+            throw std::runtime_error("Embree cannot build its scene, error " + std::to_string(error));
     }
 
     bool empty() const { return scene_ == nullptr; }

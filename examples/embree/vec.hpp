@@ -70,7 +70,7 @@ inline bool isUsable(const Vec3& a)
 }
 
 // a * b + c, rounded the same way wherever it is inlined: once where the target has the instruction (the compiler
-// might otherwise contract in one place and not in another), twice where it has not and so can not contract.
+// might otherwise contract in one place and not in another), twice where it has not and so cannot contract.
 inline float mulAdd(float a, float b, float c)
 {
 #if defined(__FMA__) || defined(__FP_FAST_FMAF) || defined(__ARM_FEATURE_FMA)

@@ -229,7 +229,7 @@ private:
                  detail::printed("its rank did not declare it, part %d", input.part));
     }
 
-    // Blames the first input of a generation, where the culprit can not be told from the others.
+    // Blames the first input of a generation, where the culprit cannot be told from the others.
     [[noreturn]] void failAt(int generationIndex, ErrorKind kind, std::int64_t expected, std::int64_t got) const
     {
         const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), Input{generationIndex, 0, 0, -1, 0});

@@ -89,7 +89,7 @@ public:
         // any.
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
-        // Lets `rank` know that inputs from this generation on can not be seen. What it has sent by then is dropped by
+        // Lets `rank` know that inputs from this generation on cannot be seen. What it has sent by then is dropped by
         // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
 
@@ -243,7 +243,7 @@ public:
     };
 
     // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
-    // TransportError if the transport can not be used.
+    // TransportError if the transport cannot be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(communicator, std::move(config), NetworkConfig(), std::move(pixelOp))
     {
@@ -308,7 +308,7 @@ public:
     bool poll() { return engine().poll(); }
 
     // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
-    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` can not be. Frames begin
+    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` cannot be. Frames begin
     // and end in the same order on all ranks, and with several in flight also each begin() before or after the same
     // end(): setTile() may wait for room that a rank makes only when it has begun that frame, too. The oldest must end
     // before one too many begins.

@@ -52,7 +52,7 @@ enum class ErrorKind : std::uint32_t {
     Cancelled,        // a frame was cancelled, or left without end()
     TimedOut,         // a frame was not complete in time
     Transport,        // the transport reported a failure
-    MissingInput      // a frame can not become complete: all ranks wait for it, and nothing is under way any more
+    MissingInput      // a frame cannot become complete: all ranks wait for it, and nothing is under way any more
 };
 
 inline const char* toString(ErrorKind kind)
@@ -157,7 +157,7 @@ public:
     using Error::Error;
 };
 
-// The transport can not work or has failed; the framebuffer is of no further use.
+// The transport cannot work or has failed; the framebuffer is of no further use.
 class TransportError : public Error {
 public:
     using Error::Error;

@@ -7,6 +7,8 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <limits>
+#include <type_traits>
 #include <utility>
 
 namespace dfb {
@@ -96,6 +98,12 @@ public:
         return i == count;
     }
 
+    // Calls f(x, y, rgba, depth) for each active pixel, row by row. x and y count from the tile's upper left corner,
+    // `rgba` points to 4 floats, and depth is +infinity if none travelled. For other channels f may take two arguments
+    // more: the FragmentRow, and the pixel's index k in it, as in row.normal() + 3 * k.
+    template <class F>
+    void forEachPixel(const F& f) const;
+
 private:
     friend class FragmentCursor;
     TileHeader header_;
@@ -170,5 +178,23 @@ private:
     bool hasAux_;
     int row_ = 0;
 };
+
+template <class F>
+void Fragment::forEachPixel(const F& f) const
+{
+    FragmentCursor cursor(*this);
+    for (int y = 0; y < header_.region.height(); ++y) {
+        const FragmentRow row = cursor.next();
+        int k = 0;
+        for (const Span* span = row.spans; span != row.spans + row.spanCount; ++span)
+            for (int x = span->x; x < span->x + span->count; ++x, ++k) {
+                const float depth = row.depth ? row.depth[k] : std::numeric_limits<float>::infinity();
+                if constexpr (std::is_invocable_v<const F&, int, int, const float*, float, const FragmentRow&, int>)
+                    f(x, y, row.color + 4 * k, depth, row, k);
+                else
+                    f(x, y, row.color + 4 * k, depth);
+            }
+    }
+}
 
 } // namespace dfb

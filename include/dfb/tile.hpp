@@ -127,6 +127,8 @@ bool isOpaque(const Region& region, std::ptrdiff_t stride, const IsOpaqueAt& isO
 
 } // namespace detail
 
+// Keep tiles on the heap or one per worker: 64x64 pixels of colour and depth are 80 KiB, 256x256 are 1.3 MB.
+//
 // Pixel (x, y) of the tile, counted from region.x0 and region.y0, is pixel i = y * size + x: color[4 * i], and as far
 // as the tile has the channels depth[i], normal[3 * i], albedo[3 * i], position[3 * i], primitiveId[i], instanceId[i],
 // farDepth[i]. Pixels outside the region are never read.

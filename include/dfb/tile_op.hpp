@@ -1,7 +1,11 @@
 // The contract of a tile operation (TileOp): how the inputs of one tile become a finished tile.
 //
-// A TileOp is a default-constructible type; the framebuffer keeps one object per tile that it owns and calls it
-// for one tile at a time, so it needs no mutex. It does not know the framebuffer, messages or threads.
+// A TileOp is a default-constructible type. The framebuffer keeps one object per tile that it owns. Calls for one tile
+// come one after the other, from any worker, so the operation needs no mutex; calls for different tiles come at once.
+// It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
+//
+// All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
+// TileInfo::background, and averages them. Inputs come in any order, empty ones too: Fragment::empty().
 //
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,

@@ -188,7 +188,7 @@ TEST_CASE("A rank that was built with another packet format is named on all rank
                 text = e.what();
             }
             INFO(text);
-            CHECK(contains(text, "can not read each other"));
+            CHECK(contains(text, "cannot read each other"));
             CHECK(contains(text, "rank 0 sends packets of format "
                                      + std::to_string(odd == 0 ? 12345 : detail::packetFormat)));
             CHECK(contains(text, "rank " + std::to_string(odd == 0 ? 1 : odd) + " of format "

@@ -21,7 +21,7 @@ using test::isLineWith;
 
 namespace {
 
-// Premultiplied RGBA with values that 8 bits can not tell apart, beyond 1, and the least there is.
+// Premultiplied RGBA with values that 8 bits cannot tell apart, beyond 1, and the least there is.
 std::vector<float> pixels(int width, int height)
 {
     std::mt19937 random(7);
@@ -310,7 +310,7 @@ TEST_CASE("The statistics have every field that a reader of them looks for", "[o
     CHECK(frame.at("peak_memory_bytes") == 6000000000u);
 }
 
-TEST_CASE("What can not be written is an error that names the file", "[output]")
+TEST_CASE("What cannot be written is an error that names the file", "[output]")
 {
     const test::TemporaryFolder folder;
     std::filesystem::create_directory(folder / "folder");

@@ -30,7 +30,7 @@ public:
     void finish(dfb::FinishedTile& out)
     {
         if (fails_)
-            throw std::runtime_error("this operation can not");
+            throw std::runtime_error("this operation cannot");
         BasicAlphaBlend::finish(out);
     }
 
@@ -109,14 +109,14 @@ struct PartialFrames {
             fails(frame(soon,
                         [&](const dfb::Brick& b, auto& tile) {
                             if (tile.tile == lost && b.id == s.bricks[0].id)
-                                throw std::runtime_error("this renderer can not");
+                                throw std::runtime_error("this renderer cannot");
                             renderBrick(s, b, tile);
                         },
                         {}),
-                  dfb::ErrorKind::UserCode, "this renderer can not", one, false, "a renderer");
+                  dfb::ErrorKind::UserCode, "this renderer cannot", one, false, "a renderer");
             isFine("after a renderer");
             const auto start = std::chrono::steady_clock::now();
-            fails(frame(never, renderAll, {lost}), dfb::ErrorKind::UserCode, "this operation can not", one, true,
+            fails(frame(never, renderAll, {lost}), dfb::ErrorKind::UserCode, "this operation cannot", one, true,
                   "an operation");
             result.expect(std::chrono::steady_clock::now() - start < std::chrono::milliseconds(never / 2),
                           "an operation that fails is waited for");
@@ -197,7 +197,7 @@ struct CancelledFrames {
                         sendAll(fb, frame, s, true);
                     cancel(BeforeEnd);
                     std::thread other;
-                    if (fb.rank() == who && when == InEnd) // which can not come to an end without it
+                    if (fb.rank() == who && when == InEnd) // which cannot come to an end without it
                         other = std::thread([&] { frame.cancel(); });
                     const std::string outcome = scene::outcomeOf([&] { frame.end(); });
                     if (other.joinable())

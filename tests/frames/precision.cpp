@@ -163,7 +163,7 @@ struct OtherChannels {
     }
 };
 
-// What can not be is refused on all ranks.
+// What cannot be is refused on all ranks.
 struct NoPrecision {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
@@ -208,7 +208,7 @@ TEST_CASE("Depth, positions and ids are the same in any format, normals stay mea
     everywhere<frame_cases::OtherChannels>();
 }
 
-TEST_CASE("A wire precision that can not be is refused on all ranks", "[precision]")
+TEST_CASE("A wire precision that cannot be is refused on all ranks", "[precision]")
 {
     everywhere<frame_cases::NoPrecision>();
 }

@@ -71,7 +71,7 @@ struct Distributions {
 };
 
 // Rank 0 is stuck in its first tile until the others have done more than their fair share of all, which they only can
-// if what is handed out on demand goes to them. (Over MPI ranks can not see each other: there nobody is stuck.)
+// if what is handed out on demand goes to them. (Over MPI ranks cannot see each other: there nobody is stuck.)
 struct Dynamic {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

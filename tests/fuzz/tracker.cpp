@@ -1,5 +1,5 @@
 // DependencyTracker beside a model that looks at all that has come anew each time: complete exactly when the model says
-// so, an error exactly when what has come can not be part of any tree.
+// so, an error exactly when what has come cannot be part of any tree.
 //
 // An input: how many roots, then a byte for what comes next, and what belongs to it.
 #include "fuzz.hpp"
@@ -24,7 +24,7 @@ class Model {
 public:
     explicit Model(int rootCount) : rootCount_(rootCount) {}
 
-    // False if the input by itself can not be.
+    // False if the input by itself cannot be.
     bool arrive(int generation, std::uint32_t source, std::uint16_t part, int children)
     {
         if (generation < 0 || generation >= dfb::DependencyTracker::maxGenerations || children < 0

@@ -92,7 +92,7 @@ dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI 
 dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
   WITHOUT MPI TBB Snappy)
 
-# What can not be had is said clearly.
+# What cannot be had is said clearly.
 dfb_add_package_test(find_package_misses_testing HOW find_package COMPONENTS testing
   FAILS "component 'testing' is not installed")
 dfb_add_package_test(other_minor_version HOW find_package VERSION 0.0 FAILS "requested version \"0.0\"")

@@ -2,7 +2,7 @@
 #   -DTIMEOUT_MS=<ms> -DFOLDER=<folder> -P mpi_dead.cmake -- <mpiexec> <argument>... <program> <argument>...
 # Starts mpi_dead and looks at what it says: who was told of which rank, and when; or that the job was aborted in time.
 # BACK: the lost rank comes back, and is told, too. NETWORK: MPI may find out first, when it sends something there.
-# Ranks that are in a destructor can not be told, but for those whose handler is called; they are gone in time.
+# Ranks that are in a destructor cannot be told, but for those whose handler is called; they are gone in time.
 cmake_policy(VERSION 3.16)
 file(REMOVE_RECURSE ${FOLDER})
 file(MAKE_DIRECTORY ${FOLDER})

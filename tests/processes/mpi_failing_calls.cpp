@@ -158,7 +158,7 @@ int main(int argc, char** argv)
         failing = nullptr;
         return std::make_pair(what, text);
     };
-    // Without them the ranks can not say anything to each other.
+    // Without them the ranks cannot say anything to each other.
     for (const char* call : {"MPI_Comm_idup", "MPI_Iallgather", "MPI_Ialltoall", "MPI_Iallreduce"}) {
         const auto [what, text] = make(call, true);
         check(has(text, "transport failure: rank ") && has(text, expected(call)), what, text);

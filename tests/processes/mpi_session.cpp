@@ -4,7 +4,7 @@
 //   mpirun -n 3 mpi_session lower        the MPI library has a lower thread level than is asked for
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
-//   mpirun -n 3 mpi_session give_up      rank 1 can not go on, and the others neither: the same
+//   mpirun -n 3 mpi_session give_up      rank 1 cannot go on, and the others neither: the same
 // With a file as second argument, the last two append to it what each rank caught: a launcher may drop what a rank
 // prints just before its job ends. Returns 0 if all is well.
 #include <dfb/dfb.hpp>

@@ -189,7 +189,7 @@ TEST_CASE("One leaf too many is an error in every order", "[tracker]")
                 r.error && std::any_of(tree.begin(), tree.end(), [&](const Input& i) {
                     return i.generation == leaves && static_cast<std::int64_t>(i.source) == r.error->source;
                 });
-            // Who is the one too many can not be told; but it is one of that generation.
+            // Who is the one too many cannot be told; but it is one of that generation.
             if (!isLeaf || r.error->kind != dfb::ErrorKind::TooManyInputs || r.error->generation != leaves
                 || r.error->expected != expected || r.error->got != expected + 1) {
                 ++wrong;

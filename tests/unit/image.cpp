@@ -161,7 +161,7 @@ TEST_CASE("An image shows what it has and says what it has not", "[image]")
     CHECK_THROWS_AS(floats.rgba8(), dfb::InvalidArgument);
 }
 
-TEST_CASE("sRGB levels of values that a double can not tell from a boundary", "[image]")
+TEST_CASE("sRGB levels of values that a double cannot tell from a boundary", "[image]")
 {
     using dfb::detail::DoubleDouble;
     int wrong = 0;

@@ -122,7 +122,7 @@ class Processors {
 public:
     static constexpr int limit = 1024;
 
-    // The CPU mask of the calling thread, which the threads that it starts inherit; where that can not be asked for,
+    // The CPU mask of the calling thread, which the threads that it starts inherit; where that cannot be asked for,
     // all that the machine has. Never empty.
     static Processors ofThisThread() noexcept
     {

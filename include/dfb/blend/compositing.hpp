@@ -1,7 +1,7 @@
 // Compositing: the pure functions on spans of pixels that tile operations are made of: over, and
 // sort-and-blend, both accumulated in double.
 //
-// The fold (one for all ops, so that arrival order, threads and ranks can not show): per pixel, front to back
+// The fold (one for all ops, so that arrival order, threads and ranks cannot show): per pixel, front to back
 // in (depth, position in the list of layers), colour and alpha accumulate as A += T * a, and T *= 1 - a is
 // carried by itself. For colour and alpha that are finite floats, alpha in [0, 1], colour non-negative, and up
 // to 65536 layers the accumulated double is within 2^-36 (relative) of the exact sum, so rounding it to float is

@@ -113,11 +113,11 @@ public:
         if (left_ > 0)
             fail("a control message is too long", 0);
     }
-    // And when what was read can not be.
+    // And when what was read cannot be.
     void require(bool canBe) const
     {
         if (!canBe)
-            fail("a control message says what can not be", 0);
+            fail("a control message says what cannot be", 0);
     }
     std::size_t left() const noexcept { return left_; }
 

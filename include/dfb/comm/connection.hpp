@@ -264,7 +264,7 @@ public:
         throw TransportError(*failure_);
     }
 
-    // This rank can not go on: says so to the others, so that nobody waits for it. False if it has failed before.
+    // This rank cannot go on: says so to the others, so that nobody waits for it. False if it has failed before.
     bool giveUp(const ErrorInfo& error)
     {
         if (!setFailure(error))
@@ -319,7 +319,7 @@ private:
         return crc == 0 ? 1 : crc;
     }
 
-    // By such messages ranks find out whether they were set up alike, and that they can not go on. A rank that uses
+    // By such messages ranks find out whether they were set up alike, and that they cannot go on. A rank that uses
     // checksums reads those of one that does not, and the other way round, so that both can say what differs.
     static bool isOfSetUp(detail::MessageKind kind)
     {
@@ -481,7 +481,7 @@ private:
         ErrorInfo error;
         error.kind = ErrorKind::Transport;
         error.rank = other;
-        error.message = detail::printed("this rank is lost: it has ended, is stopped or can not be reached. Rank %d "
+        error.message = detail::printed("this rank is lost: it has ended, is stopped or cannot be reached. Rank %d "
                                         "has heard nothing of it for %lld ms (peerTimeout)",
                                         rank(), static_cast<long long>(config_.peerTimeout.count()));
         if (link_->canAbort() && !config_.onPeerLost)

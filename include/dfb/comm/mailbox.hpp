@@ -34,7 +34,7 @@ public:
     // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
     // but for those of reduce().
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    // A message of whatever kind, perhaps not even for this object: what it can not fail for, it leaves to
+    // A message of whatever kind, perhaps not even for this object: what it cannot fail for, it leaves to
     // keepDamage().
     virtual void undecodable(int source, const ErrorInfo& error) = 0;
     virtual void work(int) {} // what submitWork() was given

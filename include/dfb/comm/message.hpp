@@ -119,10 +119,10 @@ enum class MessageKind : std::uint8_t {
     JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
     Jobs,          // a range of them
     ImagePlace,    // where in shared memory the image of the display rank lies
-    Failure,       // the sender's connection can not go on, nor can anybody who waits for it
+    Failure,       // the sender's connection cannot go on, nor can anybody who waits for it
     AreYouThere,   // to be answered at once with the next
     Present,       // the sender is there, and answers whenever it is asked
-    Hidden         // from which generation on inputs of a tile can not be seen
+    Hidden         // from which generation on inputs of a tile cannot be seen
 };
 
 struct MessageHeader {

@@ -64,7 +64,7 @@ private:
         MPI_Initialized(&initialized);
         MPI_Finalized(&finalized);
         if (finalized)
-            throw TransportError("MPI has been finalised: it can not be initialised again");
+            throw TransportError("MPI has been finalised: it cannot be initialised again");
         if (initialized)
             throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
         detail::checkMpi(MPI_Init_thread(&argc, &argv, asked, &level_), "MPI_Init_thread", -1);

@@ -96,7 +96,7 @@ public:
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
     // below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all ranks if they were built with different packet
-    // formats, or if one of them can not make its transport, with its rank and what has failed there. The others can
+    // formats, or if one of them cannot make its transport, with its rank and what has failed there. The others can
     // not be told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result.
     // Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
@@ -333,7 +333,7 @@ private:
             return;
         const int other = static_cast<int>(differs - all.begin());
         const auto number = [](std::uint64_t format) { return static_cast<unsigned long long>(format); };
-        std::string text = detail::printed("ranks were built with versions of dfb that can not read each other: rank 0 "
+        std::string text = detail::printed("ranks were built with versions of dfb that cannot read each other: rank 0 "
                                            "sends packets of format %llu",
                                            number(all.front()));
         int named = 0; // those that differ from rank 0
@@ -503,7 +503,7 @@ private:
         }
     }
 
-    // It is quiet when they have gone, or can not go.
+    // It is quiet when they have gone, or cannot go.
     void finishNotices()
     {
         int done = 1;
@@ -845,7 +845,7 @@ private:
         }
         if (!moveUntil([&] { return completed(goodbyes); }) || !barrier())
             return false;
-        // A receive that can not be cancelled any more has a packet.
+        // A receive that cannot be cancelled any more has a packet.
         cancelPackets([this](int slot, std::size_t byteCount) {
             unpack(statuses_[static_cast<std::size_t>(slot)].MPI_SOURCE, packetAt(slot), byteCount);
         });
@@ -893,7 +893,7 @@ private:
         }
     }
 
-    // MPI may still use the buffers, and freeing a communicator is collective: what can not be taken back is left to
+    // MPI may still use the buffers, and freeing a communicator is collective: what cannot be taken back is left to
     // it.
     void abandon()
     {

@@ -66,7 +66,7 @@ public:
 #endif
     }
 
-    // That of another process, or of this one, in which blocks are only given back; null if it can not be reached.
+    // That of another process, or of this one, in which blocks are only given back; null if it cannot be reached.
     static std::shared_ptr<NodeMemory> open(const Address& address)
     {
 #if defined(MFD_CLOEXEC)

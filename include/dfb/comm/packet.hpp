@@ -24,7 +24,7 @@ static_assert(sizeof(PacketRecord) == 16);
 constexpr std::size_t packetBytes = 8192; // at most
 
 // Of packets, and of all else that transports over a network say to each other. To be raised with every change: ranks
-// that were built with different ones can not read each other, and find out before the first packet.
+// that were built with different ones cannot read each other, and find out before the first packet.
 constexpr std::uint64_t packetFormat = 3;
 
 // Fills one packet after the other. Records begin at multiples of 16.

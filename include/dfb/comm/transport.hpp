@@ -83,8 +83,8 @@ enum class Progress {
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;
-    virtual void fail(const ErrorInfo& error) = 0; // the transport can not go on
-    virtual bool failed() const = 0;               // it can not, or another rank has said that it can not
+    virtual void fail(const ErrorInfo& error) = 0; // the transport cannot go on
+    virtual bool failed() const = 0;               // it cannot, or another rank has said that it cannot
     // Called over and over by a stop() that waits for other ranks, on its thread: here, alone, send() may be called.
     virtual void waiting() {}
 
@@ -266,7 +266,7 @@ public:
     virtual void stop(bool orderly) = 0;
 
     // What a transport may leave out. Without it other ranks see no memory of this one, a rank has its processors for
-    // itself, and the job can not be ended.
+    // itself, and the job cannot be ended.
     virtual bool lendsTo(int other) const = 0;
     virtual std::int32_t placeOf(const std::byte* block) const = 0;
     virtual std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const = 0;

@@ -1,5 +1,5 @@
 // Declarations: every rank tells the owners which inputs it will send, and all learn when all owners
-// know. Counts come from the senders only, so owner and contributor can not disagree about visibility.
+// know. Counts come from the senders only, so owner and contributor cannot disagree about visibility.
 //
 // What a rank has declared holds until it declares something else. In each frame a rank sends a manifest to those
 // owners alone for which its inputs are not those of the last frame; the owner acknowledges it and forgets the rank's

@@ -52,7 +52,7 @@ public:
                 failArgument("the display rank is %d of %d", config_.image.displayRank, size());
             if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
                 failArgument(
-                    "there can not be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
+                    "there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
                     config_.framesInFlight);
             if (config_.image.aux & ~(traits().channels & imageAuxChannels))
                 failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
@@ -480,7 +480,7 @@ private:
     }
 
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
-    // next one can not do without it.
+    // next one cannot do without it.
     void undecodable(int source, const ErrorInfo& error) override
     {
         mailbox_->keepDamage(source, error); // first: begin() opens the gate and then looks
@@ -699,12 +699,12 @@ private:
         return !params.samples && accumulates(params) ? nextSample_ : 0;
     }
 
-    // Throws InvalidArgument for samples that this framebuffer can not take.
+    // Throws InvalidArgument for samples that this framebuffer cannot take.
     void checkSamples(const FrameConfig& params) const
     {
         if (!params.samples) {
             if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
-                failArgument("a tile can not have %d samples from %d on: take another accumulationId", params.passes,
+                failArgument("a tile cannot have %d samples from %d on: take another accumulationId", params.passes,
                              firstSampleOf(params));
             return;
         }
@@ -713,7 +713,7 @@ private:
                          layout().tileCount());
         for (const TileSamples& t : *params.samples) {
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
-                failArgument("a tile can not have %d samples from %d on", t.count, t.first);
+                failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
             if (!traits().keepsState && (t.count == 0 || t.first > 0))
                 failArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
             if ((t.first > 0 || t.count == 0) && !accumulates(params))

@@ -1,4 +1,4 @@
-// HiddenTiles: from which generation on the inputs of a tile can not be seen, as an opaque one is in front of them.
+// HiddenTiles: from which generation on the inputs of a tile cannot be seen, as an opaque one is in front of them.
 #pragma once
 
 #include <algorithm>

@@ -43,7 +43,7 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (request.count < 0 || request.workers < 1 || (next_ >= 0 && request.count != handedOutOf_))
-            failMalformed("a request for jobs that can not be", next_ < 0 ? -1 : handedOutOf_, request.count);
+            failMalformed("a request for jobs that cannot be", next_ < 0 ? -1 : handedOutOf_, request.count);
         handedOutOf_ = request.count;
         if (next_ < 0)
             next_ = fixedPart(request.count);

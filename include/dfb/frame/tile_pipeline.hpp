@@ -29,7 +29,7 @@ namespace dfb::detail {
 
 class TilePipeline {
 public:
-    // `config` and `operations` must live as long as this. Throws InvalidArgument for a configuration that can not be.
+    // `config` and `operations` must live as long as this. Throws InvalidArgument for a configuration that cannot be.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
                  int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),

@@ -26,7 +26,7 @@
 
 namespace dfb::detail {
 
-// Throws InvalidArgument for a tile that a renderer can not have meant for this frame.
+// Throws InvalidArgument for a tile that a renderer cannot have meant for this frame.
 // `passesOf(tile)`: how many passes that tile has.
 template <class PassesOf>
 void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo& frame, const PassesOf& passesOf)
@@ -309,7 +309,7 @@ private:
     struct Slot {
         std::int64_t frame = -1;
         bool ready = false, touched = false, declared = false, hasPixels = false, finished = false;
-        bool spoilt = false;  // an input has contradicted the others, or the op can not do with it; also if finished
+        bool spoilt = false;  // an input has contradicted the others, or the op cannot do with it; also if finished
         bool counted = false; // by declare()
         std::vector<DependencyTracker> trees;                       // one per pass
         std::vector<std::pair<std::uint32_t, std::uint16_t>> names; // of the inputs that were declared

@@ -389,7 +389,7 @@ public:
         TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
         if (its.announced || count.tiles < 0 || count.tiles > its.owned || count.batches < 0
             || count.batches > count.tiles)
-            failMalformed("a count of tiles that can not be", its.owned, count.tiles);
+            failMalformed("a count of tiles that cannot be", its.owned, count.tiles);
         its.announced = count;
         addReceived(its, placed);
     }

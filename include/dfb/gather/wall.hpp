@@ -202,7 +202,7 @@ private:
             return "a wall of " + std::to_string(layout_.columns) + 'x' + std::to_string(layout_.rows) + " displays of "
                    + std::to_string(layout_.displayWidth) + 'x' + std::to_string(layout_.displayHeight) + ", bezels of "
                    + std::to_string(layout_.bezelX) + 'x' + std::to_string(layout_.bezelY) + ", format "
-                   + nameOf(format_) + ": can not be";
+                   + nameOf(format_) + ": cannot be";
         if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
             return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
                    + std::to_string(layout_.ranks.size()) + " ranks";

@@ -257,7 +257,7 @@ public:
         const bool hides = opaqueHides(this->store_.info());
         // Else the tracker says so in the end; here the tile may not wait for that.
         if (hides && std::find(generations_.begin(), generations_.end(), generation) != generations_.end())
-            detail::failArgument("inputs in order form a list: there can not be two of generation %d", generation);
+            detail::failArgument("inputs in order form a list: there cannot be two of generation %d", generation);
         generations_.push_back(generation);
         if (generation > opaque_)
             return;

@@ -66,7 +66,7 @@ private:
         double beyond = 0;
     };
 
-    // Infinity if it can not be said how much of what is behind comes through.
+    // Infinity if it cannot be said how much of what is behind comes through.
     static double largestOf(const Fragment& fragment)
     {
         const float* rgba = fragment.color();

@@ -1,4 +1,4 @@
-// What goes wrong: every call that can not be right, every failure of a frame, and ranks that leave. The same error on
+// What goes wrong: every call that cannot be right, every failure of a frame, and ranks that leave. The same error on
 // every rank, no hang, and the next frame is right.
 #include "board.hpp"
 #include "catch.hpp"
@@ -242,7 +242,7 @@ std::vector<std::string> constructed(int ranks, const std::function<void(int, df
 
 } // namespace
 
-TEST_CASE("A tile that can not be right is refused at once, and nothing is sent", "[errors]")
+TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent", "[errors]")
 {
     const Scene s = scene::makeScene(4);
     std::vector<std::string> texts;
@@ -332,7 +332,7 @@ TEST_CASE("A tile that can not be right is refused at once, and nothing is sent"
     CHECK(wrong == 0);
 }
 
-TEST_CASE("Frame parameters that can not be are refused", "[errors]")
+TEST_CASE("Frame parameters that cannot be are refused", "[errors]")
 {
     std::vector<std::string> texts;
     const Scene s = scene::makeScene(1);

@@ -420,7 +420,7 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
     CHECK(naps[1] <= ranks * (quietMs / (timeoutMs / 4) + 2));
 }
 
-TEST_CASE("A time-out for peers that can not be is refused on all ranks", "[lost_peers]")
+TEST_CASE("A time-out for peers that cannot be is refused on all ranks", "[lost_peers]")
 {
     for (const int wrong : {-1, 1, 99}) {
         std::vector<std::string> texts(2);

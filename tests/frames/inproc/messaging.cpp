@@ -500,7 +500,7 @@ TEST_CASE("With checksums a changed byte anywhere is an error, never a wrong ima
             CHECK((text == "fine" || has(text, "FrameError: dfb: malformed message")
                    || has(text, "FrameError: dfb: timed out") || has(text, "TransportError")));
         }
-        // Who misses the verdict can not fail a frame that the other has seen end well.
+        // Who misses the verdict cannot fail a frame that the other has seen end well.
         CHECK(errors >= 1);
         if (c.target.scope != FrameVerdict) {
             CHECK(d.texts[0] == d.texts[1]);

@@ -1,4 +1,4 @@
-// Frames with a time-out: what is missing fails them with an error that says so, the same on every rank; what can not
+// Frames with a time-out: what is missing fails them with an error that says so, the same on every rank; what cannot
 // even be agreed on is a TransportError. Ranks are threads; every test has a time limit.
 #include "board.hpp"
 #include "catch.hpp"

@@ -1,4 +1,4 @@
-// Display walls and messages that are lost, come twice or say what can not be: an error that says so, on every rank,
+// Display walls and messages that are lost, come twice or say what cannot be: an error that says so, on every rank,
 // and none waits for ever; never a display that is wrong without a word.
 #include "board.hpp"
 #include "catch.hpp"
@@ -108,7 +108,7 @@ const std::vector<std::string> fine{"fine", "fine"};
 
 } // namespace
 
-TEST_CASE("A part of a display that can not be fails its frame on every rank, and the next is right", "[wall]")
+TEST_CASE("A part of a display that cannot be fails its frame on every rank, and the next is right", "[wall]")
 {
     struct Lie {
         const char* name;
@@ -149,7 +149,7 @@ TEST_CASE("A part of a display that can not be fails its frame on every rank, an
     }
 }
 
-TEST_CASE("A wall does not wait for what can not come: a message of a kind that it does not get", "[wall]")
+TEST_CASE("A wall does not wait for what cannot come: a message of a kind that it does not get", "[wall]")
 {
     struct Lie {
         const char* name;

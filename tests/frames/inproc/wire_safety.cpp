@@ -1,4 +1,4 @@
-// Ranks that were built differently, and messages that say what can not be: an error that says so, on every rank, and
+// Ranks that were built differently, and messages that say what cannot be: an error that says so, on every rank, and
 // none waits for ever. (That no bytes at all do harm is what tests/fuzz looks at.)
 #include "board.hpp"
 #include "catch.hpp"
@@ -197,7 +197,7 @@ Changed changed(MessageKind kind, std::uint32_t scope, int sender, const std::fu
 
 } // namespace
 
-TEST_CASE("A message that says what can not be fails its frame on every rank, and the next is right", "[wire_safety]")
+TEST_CASE("A message that says what cannot be fails its frame on every rank, and the next is right", "[wire_safety]")
 {
     struct Lie {
         const char* name;
@@ -251,9 +251,9 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
         {"a batch that is longer than it says", MessageKind::FinishedTiles, 1,
          [](dfb::Buffer& m) { put(m, body, std::uint64_t{16}); }, "a batch of tiles has the wrong size"},
         {"more finished tiles than there are", MessageKind::TilesDone, 1,
-         [](dfb::Buffer& m) { put(m, body, std::int32_t{1000}); }, "a count of tiles that can not be"},
+         [](dfb::Buffer& m) { put(m, body, std::int32_t{1000}); }, "a count of tiles that cannot be"},
         {"more finished tiles than the rank owns", MessageKind::TilesDone, 1,
-         [=](dfb::Buffer& m) { put(m, body, owned + 1); }, "a count of tiles that can not be"},
+         [=](dfb::Buffer& m) { put(m, body, owned + 1); }, "a count of tiles that cannot be"},
         {"fewer finished tiles than come", MessageKind::TilesDone, 1, oneLess, "more finished tiles than were counted"},
         {"fewer finished tiles than come after it", MessageKind::TilesDone, 1, oneLess,
          "more finished tiles than were counted", MessageKind::FinishedTiles},
@@ -261,7 +261,7 @@ TEST_CASE("A message that says what can not be fails its frame on every rank, an
          "finished tiles than were counted"},
         {"fewer messages of finished tiles than come after it", MessageKind::TilesDone, 1, oneMessageLess,
          "fewer finished tiles than were counted", MessageKind::FinishedTiles},
-        {"more messages than tiles", MessageKind::TilesDone, 1, oneMessageMore, "a count of tiles that can not be"},
+        {"more messages than tiles", MessageKind::TilesDone, 1, oneMessageMore, "a count of tiles that cannot be"},
     };
     for (const Lie& lie : lies) {
         const Changed c = changed(lie.kind, 0, lie.sender, lie.change, lie.overtaken);

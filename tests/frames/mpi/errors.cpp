@@ -223,7 +223,7 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
     CHECK(goodFrame(fb, s));
 }
 
-TEST_CASE("A tile that can not be right is refused at once", "[errors]")
+TEST_CASE("A tile that cannot be right is refused at once", "[errors]")
 {
     const Scene s = scene::makeScene(3);
     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>> fb(MPI_COMM_WORLD, configOf(s));

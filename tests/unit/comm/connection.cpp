@@ -373,7 +373,7 @@ TEST_CASE("What is lost is said in words, by rank", "[connection]")
     connection->detach(address);
 }
 
-TEST_CASE("Who gives up says so to all others, once, and they can not go on either", "[connection]")
+TEST_CASE("Who gives up says so to all others, once, and they cannot go on either", "[connection]")
 {
     const auto a = wireOf(0, 3), b = wireOf(1, 3);
     {

@@ -667,7 +667,7 @@ TEST_CASE("More than a pool is neither granted nor asked for", "[flow]")
     const std::uint64_t most = ~std::uint64_t{0};
     CHECK_THROWS_AS(link.flow->requested(1, {most, most}), dfb::Error);
     CHECK_THROWS_AS(link.flow->requested(1, {300, 299}), dfb::Error);
-    // For a message that can not be:
+    // For a message that cannot be:
     CHECK_THROWS_AS(link.flow->requested(1, {301, 301}), dfb::Error);
     link.flow->requested(1, {300, 350}); // and nobody waits behind them
     REQUIRE(link.credits.size() == 1);

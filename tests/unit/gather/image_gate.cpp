@@ -30,7 +30,7 @@ TEST_CASE("Only writers of the frame that is open get in", "[gather]")
     CHECK(ImageWriter(gate, 2));
 }
 
-TEST_CASE("A gate does not close before all writers have left, and says if it can not", "[gather]")
+TEST_CASE("A gate does not close before all writers have left, and says if it cannot", "[gather]")
 {
     ImageGate gate;
     gate.open(5);

@@ -123,7 +123,25 @@ std::size_t differences(const TileOf<Size>& tile, const dfb::Fragment& fragment,
                 wrong += row.depth[k] != tile.depth[y * Size + x];
         }
     }
-    return wrong;
+    // forEachPixel() gives each of these pixels once, row by row, with the same values.
+    std::size_t seen = 0;
+    int last = -1;
+    const auto look = [&](int x, int y, const float* rgba, float depth) {
+        const int place = y * Size + x;
+        wrong += place <= last || !isActive(tile.pixel(x, y))
+                 || std::memcmp(rgba, tile.pixel(x, y), 4 * sizeof(float)) != 0
+                 || depth != (withDepth ? tile.depth[place] : infinity);
+        last = place;
+        ++seen;
+    };
+    fragment.forEachPixel(look);
+    const std::size_t active = seen;
+    last = -1;
+    fragment.forEachPixel([&](int x, int y, const float* rgba, float depth, const dfb::FragmentRow& row, int k) {
+        wrong += rgba != row.color + 4 * k || (withDepth && depth != row.depth[k]);
+        look(x, y, rgba, depth);
+    });
+    return wrong + (active != fragment.activePixels()) + (seen != 2 * active);
 }
 
 dfb::FragmentEncoding expectedEncoding(Content content, bool withDepth, std::size_t active, std::size_t pixels)

@@ -103,7 +103,7 @@ private:
     std::string text_;
 };
 
-// The case can not go on: something did not happen in time.
+// The case cannot go on: something did not happen in time.
 class GaveUp : public std::runtime_error {
     using std::runtime_error::runtime_error;
 };
