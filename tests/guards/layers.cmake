@@ -20,10 +20,10 @@ set(level_6 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing
 set(level_7 frame/declarations.hpp frame/frame_terms.hpp ops/sort_last.hpp pixel_op.hpp render/sampling.hpp
             render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
 set(level_8 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
-            render/loops.hpp render/shared_world.hpp testing/tile_op_test.hpp testing/verified.hpp)
-set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/mixed_parallel.hpp
+            render/loops.hpp testing/tile_op_test.hpp testing/verified.hpp)
+set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/shared_world.hpp
             testing/adversarial.hpp)
-set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp)
+set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp render/mixed_parallel.hpp)
 set(level_11 display_wall.hpp frame/outcome.hpp)
 set(level_12 frame/job_share.hpp)
 set(level_13 frame/frame_engine.hpp)

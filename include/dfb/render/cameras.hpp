@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <utility>
 #include <vector>
 
 namespace dfb {
@@ -57,6 +58,121 @@ inline double tanHalf(float fovY)
 }
 
 } // namespace detail
+
+// A camera as most toolkits have it, from a view matrix and a projection matrix: perspective, off-axis or orthographic.
+//
+// Matrices are 4x4, column by column, as OpenGL takes them: row r of column c is at [4 * c + r]. VTK's vtkMatrix4x4
+// lies row by row: transpose it. Clip coordinates as in OpenGL: -w to w is the image from left to right in x, from its
+// lowest row to its uppermost in y. The far plane cuts nothing off, the near plane only orthographic rays.
+class MatrixCamera {
+public:
+    // Throws InvalidArgument if a number is not finite or the matrices make no image.
+    MatrixCamera(const float (&view)[16], const float (&projection)[16])
+    {
+        for (int r = 0; r < 4; ++r) {
+            double row[4] = {};
+            for (int c = 0; c < 4; ++c)
+                for (int k = 0; k < 4; ++k)
+                    row[c] += static_cast<double>(projection[4 * k + r]) * static_cast<double>(view[4 * c + k]);
+            rows_[r] = {{row[0], row[1], row[2]}, row[3]};
+            if (!std::isfinite(row[0] + row[1] + row[2] + row[3]))
+                detail::failArgument("the camera's matrices have numbers that are not finite");
+        }
+        isOrthographic_ = !(detail::length(rows_[3].normal) > 0);
+        if (isOrthographic_ && rows_[3].offset < 0)
+            for (Plane& row : rows_)
+                row = {-1 * row.normal, -row.offset};
+        const Plane &x = rows_[0], &y = rows_[1], &last = isOrthographic_ ? rows_[2] : rows_[3];
+        const double volume = detail::dot(detail::cross(x.normal, y.normal), last.normal),
+                     size = detail::length(x.normal) * detail::length(y.normal) * detail::length(last.normal);
+        if (!(std::fabs(volume) > 1e-12 * size) || (isOrthographic_ && !(rows_[3].offset > 0)))
+            detail::failArgument("the camera's matrices are singular: they make no image");
+        if (!isOrthographic_)
+            eye_ = meetingPoint(x, y, last);
+        // An orthographic camera looks along -z of its view.
+        const detail::Point3 ahead = isOrthographic_ ? detail::Point3{-view[2], -view[6], -view[10]} : last.normal;
+        side_ = detail::dot(detail::cross(x.normal, y.normal), ahead) < 0 ? -1 : 1;
+    }
+
+    // Whether all rays have one direction.
+    bool isOrthographic() const noexcept { return isOrthographic_; }
+
+    // Where all rays begin. Of no use for an orthographic camera.
+    Vec3 eye() const noexcept { return detail::vecOf(eye_); }
+
+    // The ray through a point of the image. It begins at the eye, or for an orthographic camera at the near plane.
+    Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
+    {
+        const Plane column = through(rows_[0], 2 * x / width - 1), row = through(rows_[1], 1 - 2 * y / height);
+        const detail::Point3 direction = side_ * detail::normalized(detail::cross(column.normal, row.normal));
+        if (!isOrthographic_)
+            return {eye(), detail::vecOf(direction)};
+        return {detail::vecOf(meetingPoint(column, row, nearPlane())), detail::vecOf(direction)};
+    }
+
+    // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
+    Footprint project(const Box3& bounds, int width, int height) const
+    {
+        const Plane& w = rows_[3];
+        const double pixels = 0.5
+                              * std::max(detail::length(rows_[0].normal) * width,
+                                         detail::length(rows_[1].normal) * height); // per unit, times w
+        const double unit = isOrthographic_ ? 1 : detail::length(w.normal);         // w at distance 1
+        std::vector<PixelPoint> points;
+        points.reserve(8);
+        int behind = 0;
+        bool near = false;
+        double margin = 0;
+        for (int corner = 0; corner < 8; ++corner) {
+            const detail::Point3 p = detail::cornerOf(bounds, corner), d = p - eye_;
+            // Renderers' rays and points are floats: see projectBox().
+            const double rounding =
+                isOrthographic_ ? 0 : 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) * unit;
+            const double depth = w.at(p);
+            behind += depth < -rounding;
+            near = near || depth <= rounding;
+            if (near)
+                continue;
+            points.push_back({0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)});
+            const double way = isOrthographic_ ? std::fabs(nearPlane().at(p)) / detail::length(nearPlane().normal) : 0;
+            const double largest = detail::length(p) + detail::length(eye_) + 2 * way;
+            margin = std::max(margin, 0.125 + 5e-7 * largest * pixels / depth);
+        }
+        if (behind == 8)
+            return {};
+        if (near)
+            return Footprint::whole(width, height);
+        return Footprint(std::move(points), margin, width, height);
+    }
+
+private:
+    // The points p with dot(normal, p) + offset == 0; also a row of a matrix.
+    struct Plane {
+        detail::Point3 normal;
+        double offset = 0;
+
+        double at(const detail::Point3& p) const { return detail::dot(normal, p) + offset; }
+    };
+
+    // Where `row` is `k` times w.
+    Plane through(const Plane& row, double k) const
+    {
+        return {row.normal - k * rows_[3].normal, row.offset - k * rows_[3].offset};
+    }
+    Plane nearPlane() const { return through(rows_[2], -1); }
+
+    static detail::Point3 meetingPoint(const Plane& a, const Plane& b, const Plane& c)
+    {
+        const detail::Point3 ab = detail::cross(a.normal, b.normal), bc = detail::cross(b.normal, c.normal),
+                             ca = detail::cross(c.normal, a.normal);
+        return (-1 / detail::dot(a.normal, bc)) * (a.offset * bc + b.offset * ca + c.offset * ab);
+    }
+
+    Plane rows_[4]; // of the product of both matrices: x, y, z, w
+    detail::Point3 eye_;
+    double side_ = 1;
+    bool isOrthographic_ = false;
+};
 
 // Depth of field: points at `focusDistance` along the view are sharp; `apertureRadius` is that of the lens, in units of
 // the world.

@@ -249,7 +249,7 @@ public:
     // ended. `renderBrick(brick, tile)` is called from several threads at once, for each pass with its own tile.pass;
     // it writes colour and depth of the pixels of tile.region that rays meet within brick.bounds into the cleared tile,
     // depth growing away from the camera. Unlike in Listing 3 the owners do not count the bricks that project to their
-    // tiles: each rank declares what it will send, so the two can not disagree. Throws what FrameBuffer::begin()
+    // tiles: each rank declares what it will send, so the two cannot disagree. Throws what FrameBuffer::begin()
     // throws; an exception of renderBrick becomes a FrameError of Frame::end() on all ranks.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,

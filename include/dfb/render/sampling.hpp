@@ -34,7 +34,7 @@ struct SamplingSettings {
 // A frame that throws FrameError must be followed by reset(): what was accumulated is lost.
 class AdaptiveSampler {
 public:
-    // Throws InvalidArgument for settings that can not be.
+    // Throws InvalidArgument for settings that cannot be.
     AdaptiveSampler(const TileLayout& layout, const SamplingSettings& settings) : layout_(layout), settings_(settings)
     {
         if (settings.firstSamples < 2 || settings.maxSamples < settings.firstSamples || settings.frameSamples < 1

@@ -2,12 +2,15 @@
 // or where one must know what is in front of what.
 #pragma once
 
+#include <dfb/render/cameras.hpp>
 #include <dfb/render/visibility.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <string>
 #include <utility>
 #include <vector>
@@ -103,10 +106,10 @@ std::vector<BrickInTile> visibleTiles(const SharedWorld& world, const Camera& ca
     return result;
 }
 
-// The bricks, by their place in SharedWorld::bricks(), such that no ray from `eye` meets one before another that stands
-// earlier in the list. Takes time with the square of their number. Throws InvalidArgument if two overlap, or if
-// there is no such order: three boxes can each be in front of the next.
-inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
+namespace detail {
+
+// `isParallel`: axes along which no ray goes, so that no ray crosses a plane between two boxes there.
+inline std::vector<int> frontToBack(const SharedWorld& world, const Vec3& eye, const bool (&isParallel)[3])
 {
     const auto& bricks = world.bricks();
     const std::size_t n = bricks.size();
@@ -114,22 +117,22 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
     enum class Before { Either, First, Second };
     const auto compare = [&](const Box3& a, const Box3& b) {
         bool apart = false, first = false, second = false;
-        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
+        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e, bool parallel) {
             if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
                 apart = true;
-                first = first || e <= bLower;
-                second = second || e >= aUpper;
+                first = first || parallel || e <= bLower;
+                second = second || parallel || e >= aUpper;
             } else if (bUpper <= aLower) {
                 apart = true;
-                first = first || e >= bUpper;
-                second = second || e <= aLower;
+                first = first || parallel || e >= bUpper;
+                second = second || parallel || e <= aLower;
             }
         };
-        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
-        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
-        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
+        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x, isParallel[0]);
+        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y, isParallel[1]);
+        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z, isParallel[2]);
         if (!apart)
-            detail::failArgument("two bricks overlap: there is no order in which they could be blended");
+            failArgument("two bricks overlap: there is no order in which they could be blended");
         return first == second ? Before::Either : first ? Before::First : Before::Second;
     };
     std::vector<std::vector<int>> behind(n);
@@ -152,8 +155,28 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
             if (--inFront[static_cast<std::size_t>(next)] == 0)
                 order.push_back(next);
     if (order.size() != n)
-        detail::failArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
+        failArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
     return order;
+}
+
+} // namespace detail
+
+// Returns the bricks, by their place in SharedWorld::bricks(), such that no ray from `eye` meets one before another
+// that stands earlier in the list. Takes time with the square of their number. Throws InvalidArgument if two overlap,
+// or if there is no such order: three boxes can each be in front of the next.
+inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
+{
+    return detail::frontToBack(world, eye, {false, false, false});
+}
+
+// Returns this order for all rays of a camera, also of an orthographic one. Throws likewise.
+inline std::vector<int> visibilityOrder(const SharedWorld& world, const MatrixCamera& camera)
+{
+    if (!camera.isOrthographic())
+        return visibilityOrder(world, camera.eye());
+    const Vec3 d = camera.ray(0, 0, 1, 1).direction;
+    const auto from = [](float direction) { return std::copysign(std::numeric_limits<float>::infinity(), -direction); };
+    return detail::frontToBack(world, {from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0});
 }
 
 } // namespace dfb

@@ -80,6 +80,50 @@ Count check(const Camera& camera, std::uint64_t seed)
 
 const dfb::Vec3 eye{1, 2, 8}, view{-0.1f, -0.2f, -1}, up{0, 1, 0};
 
+// Matrices as in OpenGL, column by column.
+struct Matrix {
+    float at[16] = {};
+};
+
+Matrix lookAlong(const dfb::Vec3& from, const dfb::Vec3& along, const dfb::Vec3& upwards)
+{
+    const dfb::Vec3 back = -1.0f * normalize(along), right = normalize(cross(along, upwards)), top = cross(back, right);
+    return {{right.x, top.x, back.x, 0, right.y, top.y, back.y, 0, right.z, top.z, back.z, 0, -dot(right, from),
+             -dot(top, from), -dot(back, from), 1}};
+}
+
+// As glFrustum() and glOrtho() do.
+Matrix frustum(float l, float r, float b, float t, float n, float f)
+{
+    return {{2 * n / (r - l), 0, 0, 0, 0, 2 * n / (t - b), 0, 0, (r + l) / (r - l), (t + b) / (t - b),
+             -(f + n) / (f - n), -1, 0, 0, -2 * f * n / (f - n), 0}};
+}
+Matrix ortho(float l, float r, float b, float t, float n, float f)
+{
+    return {{2 / (r - l), 0, 0, 0, 0, 2 / (t - b), 0, 0, 0, 0, -2 / (f - n), 0, -(r + l) / (r - l), -(t + b) / (t - b),
+             -(f + n) / (f - n), 1}};
+}
+
+// Where the matrices put a point, by the textbook; w in z.
+dfb::Vec3 pixelOf(const Matrix& v, const Matrix& p, const dfb::Vec3& point, int width, int height)
+{
+    double in[4] = {point.x, point.y, point.z, 1}, out[4] = {};
+    for (const Matrix* m : {&v, &p}) {
+        for (int r = 0; r < 4; ++r) {
+            out[r] = 0;
+            for (int c = 0; c < 4; ++c)
+                out[r] += static_cast<double>(m->at[4 * c + r]) * in[c];
+        }
+        std::copy_n(out, 4, in);
+    }
+    return {static_cast<float>(0.5 * width * (1 + out[0] / out[3])),
+            static_cast<float>(0.5 * height * (1 - out[1] / out[3])), static_cast<float>(out[3])};
+}
+
+const Matrix projections[] = {frustum(-0.4f, 0.4f, -0.3f, 0.3f, 1, 100), frustum(-0.1f, 0.7f, -0.5f, 0.2f, 1, 30),
+                              frustum(-0.004f, 0.004f, -0.003f, 0.003f, 0.01f, 1e6f), ortho(-4, 4, -3, 3, 0.1f, 100),
+                              ortho(-1, 5, -4, 2, -50, 50)};
+
 } // namespace
 
 TEST_CASE("No ray of any camera meets a box in a tile that its projection leaves out", "[cameras]")
@@ -97,6 +141,10 @@ TEST_CASE("No ray of any camera meets a box in a tile that its projection leaves
     checkAll(dfb::DomeCamera({0, 0, 0}, {0, 1, 0}, {0, 0, 1}, 300), 5, 0.9);
     checkAll(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, {0, 1, 0}, 10), 6, 0.25);
     checkAll(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, {0.3f, 1, 0}, -90), 7, 0.6);
+    const Matrix v = lookAlong(eye, view, up), inside = lookAlong({0, 0, 0.5f}, view, up);
+    for (const Matrix& p : projections)
+        checkAll(dfb::MatrixCamera(v.at, p.at), 8, 0.25);
+    checkAll(dfb::MatrixCamera(inside.at, projections[1].at), 9, 0.6);
 }
 
 TEST_CASE("Without a lens, between the eyes and at rest cameras are the pinhole", "[cameras]")
@@ -129,9 +177,68 @@ TEST_CASE("Without a lens, between the eyes and at rest cameras are the pinhole"
     CHECK(dome.ray(14.9, 45, 120, 90).direction.x == 0.0f);
 }
 
+TEST_CASE("A matrix camera's rays meet the points that its matrices project there", "[cameras]")
+{
+    const int width = 120, height = 90;
+    const Matrix v = lookAlong(eye, view, up);
+    Random random(11);
+    for (const Matrix& p : projections) {
+        const dfb::MatrixCamera camera(v.at, p.at);
+        CHECK(camera.isOrthographic() == (p.at[15] == 1));
+        int seen = 0, wrong = 0;
+        for (int i = 0; i < 2000; ++i) {
+            const dfb::Vec3 at = point(random, 6);
+            const dfb::Vec3 pixel = pixelOf(v, p, at, width, height);
+            if (pixel.z <= 0)
+                continue;
+            const dfb::Ray ray = camera.ray(pixel.x, pixel.y, width, height);
+            const dfb::Vec3 way = at - ray.origin, aside = cross(way, ray.direction);
+            ++seen;
+            wrong += !(std::sqrt(dot(aside, aside)) < 1e-4f) || !(dot(way, ray.direction) > 0)
+                     || !(std::fabs(dot(ray.direction, ray.direction) - 1) < 1e-6f);
+            // A small box is where its corners are, and two pixels more at most.
+            const dfb::Vec3 half{0.2f, 0.1f, 0.3f};
+            const dfb::Box3 box{at - half, at + half};
+            float x0 = 1e9f, x1 = -1e9f, y0 = 1e9f, y1 = -1e9f, w = 1;
+            for (int corner = 0; corner < 8; ++corner) {
+                const auto c = dfb::detail::vecOf(dfb::detail::cornerOf(box, corner));
+                const dfb::Vec3 q = pixelOf(v, p, c, width, height);
+                x0 = std::min(x0, q.x), x1 = std::max(x1, q.x), y0 = std::min(y0, q.y), y1 = std::max(y1, q.y);
+                w = std::min(w, q.z);
+            }
+            const dfb::Region found = camera.project(box, width, height).region();
+            if (w > 0.01f && !found.empty())
+                wrong += (found.x0 > 0 && static_cast<float>(found.x0) < x0 - 2)
+                         || (found.y0 > 0 && static_cast<float>(found.y0) < y0 - 2)
+                         || (found.x1<width&& static_cast<float>(found.x1)> x1 + 2)
+                         || (found.y1<height&& static_cast<float>(found.y1)> y1 + 2);
+        }
+        CHECK(wrong == 0);
+        CHECK(seen > 900);
+    }
+    // The symmetric frustum is the pinhole.
+    const dfb::MatrixCamera camera(v.at, projections[0].at);
+    const auto pinhole = dfb::PerspectiveCamera::along(eye, view, up, 2 * 16.6992442f); // its tangent is 0.3
+    const dfb::Vec3 apart = camera.eye() - eye;
+    CHECK(dot(apart, apart) < 1e-10f);
+    float largest = 0;
+    for (int i = 0; i < 100; ++i) {
+        const double x = 1.2 * i, y = 90 - 0.7 * i;
+        const dfb::Vec3 d = camera.ray(x, y, width, height).direction - pinhole.direction(x, y, width, height);
+        largest = std::max(largest, dot(d, d));
+    }
+    CHECK(largest < 1e-12f);
+}
+
 TEST_CASE("Cameras that are none are refused", "[cameras]")
 {
     using dfb::InvalidArgument;
+    const Matrix v = lookAlong(eye, view, up), none;
+    Matrix notFinite = projections[0];
+    notFinite.at[5] = std::numeric_limits<float>::quiet_NaN();
+    CHECK_THROWS_AS(dfb::MatrixCamera(v.at, none.at), InvalidArgument);
+    CHECK_THROWS_AS(dfb::MatrixCamera(none.at, projections[0].at), InvalidArgument);
+    CHECK_THROWS_AS(dfb::MatrixCamera(v.at, notFinite.at), InvalidArgument);
     CHECK_THROWS_AS(dfb::ThinLensCamera(eye, {0, 0, 0}, up, 45, 0.1f, 1), InvalidArgument);
     CHECK_THROWS_AS(dfb::ThinLensCamera(eye, view, up, 180, 0.1f, 1), InvalidArgument);
     CHECK_THROWS_AS(dfb::ThinLensCamera(eye, view, up, 45, -0.1f, 1), InvalidArgument);

@@ -338,7 +338,7 @@ void bisect(std::mt19937& random, const dfb::Box3& box, int count, std::vector<d
 TEST_CASE("The bricks of a bisection have an order from anywhere", "[visibility_order]")
 {
     std::mt19937 random(3);
-    const auto uniform = [&](double a, double b) { return a + (b - a) * (random() % 100000) / 1e5; };
+    const auto uniform = [&](double a, double b) { return a + (b - a) * static_cast<double>(random() % 100000) / 1e5; };
     for (int round = 0; round < 40; ++round) {
         std::vector<dfb::Brick> bricks;
         bisect(random, {{-1, -1, -1}, {1, 1, 1}}, 1 + static_cast<int>(random() % 40), bricks);
@@ -360,6 +360,47 @@ TEST_CASE("The bricks of a bisection have an order from anywhere", "[visibility_
                 }
             }
             CHECK(wrong == 0);
+        });
+    }
+}
+
+TEST_CASE("The bricks of a bisection have an order along any direction", "[visibility_order]")
+{
+    std::mt19937 random(5);
+    const auto uniform = [&](double a, double b) { return a + (b - a) * static_cast<double>(random() % 100000) / 1e5; };
+    for (int round = 0; round < 40; ++round) {
+        std::vector<dfb::Brick> bricks;
+        bisect(random, {{-1, -1, -1}, {1, 1, 1}}, 1 + static_cast<int>(random() % 40), bricks);
+        // Looks along -z of its view, whose axes are two turns of those of the world; or along an axis.
+        const double a = round < 4 ? 1.5707963267948966 * round : uniform(0, 6.28),
+                     b = round < 4 ? 0 : uniform(-1.5, 1.5);
+        const dfb::Vec3 right{static_cast<float>(std::cos(a)), 0, static_cast<float>(-std::sin(a))},
+            back{static_cast<float>(std::sin(a) * std::cos(b)), static_cast<float>(std::sin(b)),
+                 static_cast<float>(std::cos(a) * std::cos(b))},
+            top = cross(back, right);
+        const float view[16] = {right.x, top.x, back.x, 0, right.y, top.y, back.y, 0,
+                                right.z, top.z, back.z, 0, 0,       0,     0,      1};
+        const float projection[16] = {0.5f, 0, 0, 0, 0, 0.5f, 0, 0, 0, 0, -0.1f, 0, 0, 0, 0, 1};
+        const dfb::MatrixCamera camera(view, projection);
+        withWorld(bricks, [&](const dfb::SharedWorld& world) {
+            const std::vector<int> order = dfb::visibilityOrder(world, camera);
+            REQUIRE(order.size() == bricks.size());
+            int wrong = 0, hits = 0;
+            for (int i = 0; i < 300; ++i) {
+                const dfb::Ray ray = camera.ray(uniform(0, 100), uniform(0, 100), 100, 100);
+                const double d[3] = {ray.direction.x, ray.direction.y, ray.direction.z};
+                double before = -1;
+                for (const int place : order) {
+                    const double t = enter(world.bricks()[static_cast<std::size_t>(place)].brick.bounds, ray.origin, d);
+                    if (t == std::numeric_limits<double>::infinity())
+                        continue;
+                    wrong += t < before;
+                    ++hits;
+                    before = t;
+                }
+            }
+            CHECK(wrong == 0);
+            CHECK(hits > 50);
         });
     }
 }
