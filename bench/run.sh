@@ -1,7 +1,7 @@
 #!/bin/sh
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
-# benchmarks but bench_messaging and bench_gather: their tables go to README.md and bench/README.md, all figures to
+# benchmarks but bench_messaging and bench_gather: their tables go to docs/performance.md and bench/README.md, all figures to
 # bench/results. Half an hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
 # of a program, is to start it there, 4 ranks at best, one on each.
 # The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
@@ -103,7 +103,7 @@ between() {
         }' "$file" >"$file.new"
     mv "$file.new" "$file"
 }
-between README.md error_time "$results/error_time.4.md" "$results/error_time.8.md"
+between docs/performance.md error_time "$results/error_time.4.md" "$results/error_time.8.md"
 between bench/README.md compositing "$results/compositing.md"
 between bench/README.md overlap "$results/overlap.md"
 between bench/README.md scaling "$results/scaling.md"

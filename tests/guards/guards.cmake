@@ -22,7 +22,20 @@ add_test(NAME guard.readme
   COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/readme.cmake)
 add_test(NAME guard.architecture
   COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/architecture.cmake)
-set_tests_properties(guard.readme guard.architecture PROPERTIES LABELS guard)
+add_test(NAME guard.docs
+  COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/docs.cmake)
+set_tests_properties(guard.readme guard.architecture guard.docs PROPERTIES LABELS guard)
+
+# The blocks of code in docs/ compile.
+if(TARGET dfb::mpi AND TARGET dfb::snappy)
+  include(guards/doc_blocks/blocks.cmake)
+  dfb_write_doc_blocks(_doc_blocks ${PROJECT_SOURCE_DIR} ${CMAKE_CURRENT_BINARY_DIR})
+  add_library(dfb_doc_blocks OBJECT ${_doc_blocks})
+  target_link_libraries(dfb_doc_blocks PRIVATE dfb_developer)
+  target_include_directories(dfb_doc_blocks PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/guards/doc_blocks)
+  target_compile_options(dfb_doc_blocks PRIVATE -O0)
+  set_target_properties(dfb_doc_blocks PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
+endif()
 
 # Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so
 # with that component, the umbrella with each set of components, all others with nothing but our include folder.

@@ -1,0 +1,46 @@
+// What the blocks of code in docs/ take as given; see docs/recipes.md. Nothing of this is linked or run.
+#pragma once
+
+#include <dfb/dfb.hpp>
+
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <memory>
+#include <optional>
+#include <vector>
+
+namespace doc {
+
+struct RenderPixel {
+    void operator()(const dfb::Brick&, const dfb::Vec3&, float*, float&) const {}
+    void operator()(const dfb::Brick&, const dfb::Ray&, float*, float&) const {}
+    void operator()(int, int, float*, float&) const {}
+};
+struct RenderTile {
+    template <class Tile>
+    void operator()(Tile&) const
+    {
+    }
+    template <class Tile>
+    void operator()(const dfb::Brick&, Tile&) const
+    {
+    }
+};
+
+extern MPI_Comm communicator;
+extern dfb::World world;
+extern dfb::PerspectiveCamera camera;
+extern dfb::WallLayout layout;
+extern dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb;
+extern int width, height;
+extern std::vector<std::uint8_t> pixels;
+extern std::vector<float> depths;
+extern const RenderPixel renderPixel;
+extern const RenderTile renderTile, renderBrick;
+void show(const dfb::Image&);
+void handleEvents();
+
+} // namespace doc
+
+#pragma GCC diagnostic ignored "-Wshadow" // a block may have an fb of its own
