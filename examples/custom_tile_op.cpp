@@ -22,33 +22,26 @@ public:
 
     void newFrame(const dfb::TileInfo& info)
     {
-        region_ = info.region;
-        const auto pixels = static_cast<std::size_t>(region_.width() * region_.height());
-        color_.assign(4 * pixels, 0.0);
-        level_.assign(pixels, -1);
+        images_.newFrame(info);
+        level_.assign(images_.count(), -1);
     }
 
     void add(dfb::Fragment&& fragment) // in any order
     {
-        const int level = fragment.header().generation;
+        const int pass = fragment.header().pass, level = fragment.header().generation;
         fragment.forEachPixel([&](int x, int y, const float* rgba, float) {
-            const auto pixel = static_cast<std::size_t>(y * region_.width() + x);
+            const std::size_t pixel = images_.index(pass, x, y);
             if (level <= level_[pixel])
                 return;
             level_[pixel] = level;
-            std::copy_n(rgba, 4, &color_[4 * pixel]);
+            std::copy_n(rgba, 4, images_.pixel(pixel));
         });
     }
 
-    void finish(dfb::FinishedTile& out)
-    {
-        for (int y = 0; y < out.height(); ++y)
-            out.setRow(y, &color_[static_cast<std::size_t>(4 * y * out.width())], nullptr);
-    }
+    void finish(dfb::FinishedTile& out) { images_.finish(out); }
 
 private:
-    dfb::Region region_;
-    std::vector<double> color_;
+    dfb::PassImages images_;
     std::vector<int> level_; // of the value that a pixel has
 };
 static_assert(dfb::is_tile_op_v<FinestLevel>);

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <type_traits>
 
 namespace dfb {
 
@@ -184,16 +185,23 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     }
 
     // Calls f(x, y, rgba, depth), or f(x, y, rgba) without a depth channel, for each pixel of the region, row by row:
-    // x and y are its place in the image, `rgba` points to its 4 floats, `depth` is a reference to its depth.
+    // x and y are its place in the image, `rgba` points to its 4 floats, `depth` is a reference to its depth. For other
+    // channels f may take the pixel's number i as its last argument, as in tile.normal + 3 * i.
     template <class PixelFunction>
     void forEachPixel(const PixelFunction& f)
     {
         for (int y = 0; y < region.height(); ++y)
             for (int x = 0; x < region.width(); ++x) {
-                if constexpr (hasDepth)
-                    f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[y * Size + x]);
+                const int i = y * Size + x;
+                if constexpr (hasDepth && std::is_invocable_v<const PixelFunction&, int, int, float*, float&, int>)
+                    f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[i], i);
+                else if constexpr (hasDepth)
+                    f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[i]);
+                else if constexpr (std::is_invocable_v<const PixelFunction&, int, int, float*, int>)
+                    f(region.x0 + x, region.y0 + y, pixel(x, y), i);
                 else
                     f(region.x0 + x, region.y0 + y, pixel(x, y));
+                (void)i;
             }
     }
 

@@ -5,7 +5,8 @@
 // It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
-// TileInfo::background, and averages them. Inputs come in any order, empty ones too: Fragment::empty().
+// TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order, empty ones too:
+// Fragment::empty().
 //
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,
@@ -47,6 +48,7 @@
 #include <limits>
 #include <type_traits>
 #include <utility>
+#include <vector>
 
 namespace dfb {
 
@@ -225,6 +227,56 @@ private:
     bool dither_;
     detail::BackgroundPixels* background_;
     std::int64_t writtenPixels_ = 0;
+};
+
+// The passes of a tile as images, for tile operations of your own: lays each over the background, and averages them.
+// Holds 32 bytes for each pixel and pass.
+class PassImages {
+public:
+    // Begins a frame: all pixels of all passes are empty. Call it in TileOp::newFrame().
+    void newFrame(const TileInfo& info)
+    {
+        width_ = info.region.width();
+        pixels_ = static_cast<std::size_t>(width_) * static_cast<std::size_t>(info.region.height());
+        passes_ = static_cast<std::size_t>(info.passes);
+        background_ = info.background;
+        color_.assign(4 * pixels_ * passes_, 0.0);
+    }
+
+    // The number of a pixel, for what else an operation keeps of it: 0 to count() - 1. `pass` is TileHeader::pass; x
+    // and y count from the tile's upper left corner.
+    std::size_t index(int pass, int x, int y) const noexcept
+    {
+        return static_cast<std::size_t>(pass) * pixels_ + static_cast<std::size_t>(y * width_ + x);
+    }
+    std::size_t count() const noexcept { return pixels_ * passes_; }
+
+    // The pixel's premultiplied linear RGBA: 4 values to be set.
+    double* pixel(std::size_t index) noexcept { return &color_[4 * index]; }
+
+    // Writes all rows of the finished tile. Call it in TileOp::finish(). An image with depth gets +infinity.
+    void finish(FinishedTile& out) const
+    {
+        std::vector<double> row(4 * static_cast<std::size_t>(width_));
+        const double share = 1.0 / static_cast<double>(passes_);
+        for (int y = 0; y < out.height(); ++y) {
+            std::fill(row.begin(), row.end(), 0.0);
+            for (std::size_t pass = 0; pass < passes_; ++pass) {
+                const double* from = &color_[4 * index(static_cast<int>(pass), 0, y)];
+                for (std::size_t i = 0; i < row.size(); ++i)
+                    row[i] += from[i] + (1 - from[i | 3]) * static_cast<double>(background_[i % 4]);
+            }
+            for (double& value : row)
+                value *= share;
+            out.setRow(y, row.data(), nullptr);
+        }
+    }
+
+private:
+    int width_ = 0;
+    std::size_t pixels_ = 0, passes_ = 1;
+    std::array<float, 4> background_{};
+    std::vector<double> color_;
 };
 
 // What a TileOp says of a tile that it has finished, if it has a member report().

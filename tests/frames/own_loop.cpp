@@ -63,7 +63,9 @@ struct OwnLoop {
         };
         expectRight("a wrong picture");
 
-        const int bad = fb.layout().tileCount() / 2;
+        int bad = 0; // a tile with an input
+        while (!meets(s.bricks.front(), bad))
+            ++bad;
         const auto throws = [&](const dfb::TileHeader& tile) {
             if (tile.tile == bad)
                 throw std::runtime_error("a renderer that throws");

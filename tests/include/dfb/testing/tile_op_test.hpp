@@ -12,6 +12,7 @@
 #include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -86,10 +87,12 @@ struct TileOutput {
     }
 };
 
-// What the framebuffer does with a tile, with the inputs arriving in this order.
+// What the framebuffer does with a tile in a frame, with the inputs arriving in this order. `written`: how many pixels
+// the operation has set.
 template <class Op>
-TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order, OutputFormat format,
-                     bool withDepth = true, const TileWire& wire = {}, bool dither = false)
+TileOutput runTileOp(Op& op, const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order,
+                     OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false,
+                     std::int64_t* written = nullptr)
 {
     namespace d = dfb::detail;
     const auto pool = MemoryPool::create();
@@ -104,33 +107,39 @@ TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::
     info.minTransmittance = wire.minTransmittance;
     const d::WireCoder coder(wire.precision, d::ActiveByDepth<Op>::value);
     const auto wanted = static_cast<ChannelMask>(d::NeededChannelsOf<Op>::value | (withDepth ? depthChannel : 0));
-    Op op;
     TileOutput out;
-    // Twice: an op is used again from frame to frame.
-    for (int frame = 0; frame < 2; ++frame) {
-        op.newFrame(info);
-        out.faults = {};
-        out.bytes = 0;
-        for (const std::size_t i : order) {
-            Buffer message =
-                d::encodeFragment(*pool, *in.tiles[i], wanted, 0, wire.codec, coder, wire.precision.color, out.faults);
-            out.bytes += message.size();
-            op.add(d::decodeFragment(
-                *pool, std::move(message), in.layout, [&](int) { return in.passes; }, wire.codec, coder));
-        }
-        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
-        const std::size_t stride = width * bytesPerPixel(format);
-        out.color.assign(stride * height, std::byte{0xcd});
-        out.depth.assign(withDepth ? width * height : 0, -7.0f);
-        d::Planes planes;
-        planes.at[d::Color] = out.color.data();
-        planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
-        FinishedTile finished(region, format, planes, width, dither);
-        op.finish(finished);
-        if constexpr (d::HasReport<Op>::value)
-            op.report(out.report);
+    op.newFrame(info);
+    for (const std::size_t i : order) {
+        Buffer message =
+            d::encodeFragment(*pool, *in.tiles[i], wanted, 0, wire.codec, coder, wire.precision.color, out.faults);
+        out.bytes += message.size();
+        op.add(d::decodeFragment(
+            *pool, std::move(message), in.layout, [&](int) { return in.passes; }, wire.codec, coder));
     }
+    const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
+    const std::size_t stride = width * bytesPerPixel(format);
+    out.color.assign(stride * height, std::byte{0xcd});
+    out.depth.assign(withDepth ? width * height : 0, -7.0f);
+    d::Planes planes;
+    planes.at[d::Color] = out.color.data();
+    planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
+    FinishedTile finished(region, format, planes, width, dither);
+    op.finish(finished);
+    if constexpr (d::HasReport<Op>::value)
+        op.report(out.report);
+    if (written)
+        *written = finished.writtenPixels();
     return out;
+}
+
+// The second of two such frames with a new operation: one is used again from frame to frame.
+template <class Op>
+TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order, OutputFormat format,
+                     bool withDepth = true, const TileWire& wire = {}, bool dither = false)
+{
+    Op op;
+    runTileOp(op, in, order, format, withDepth, wire, dither);
+    return runTileOp(op, in, order, format, withDepth, wire, dither);
 }
 
 // Exact pixels: the mean over the passes of what `rule(samples)` makes of the inputs' samples, which are in the order
@@ -183,6 +192,107 @@ ErrorReport compare(const TileInputs<Op::tileSize>& in, const std::vector<Pixel>
             result.wrongBytes += 4;
     }
     return result;
+}
+
+// Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
+// Returns what is wrong, a sentence for each, or nothing: its image must not depend on the order in which inputs come,
+// nor on the frame before; each pixel is set; an image of two passes is the mean of the images of each; empty inputs
+// show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each the
+// generation and source that the operation expects; by default generation 1 and source `layer`. For operations that
+// keep no state.
+template <class Op, class Label>
+std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
+{
+    using Inputs = TileInputs<Op::tileSize>;
+    constexpr int size = Op::tileSize, layers = 3;
+    std::mt19937_64 random(seed);
+    const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f; };
+    // Of `passes` passes, with an image of this size.
+    const auto make = [&](int passes, int width, bool isEmpty) {
+        Inputs in;
+        in.layout = TileLayout(width, size - 1, size);
+        in.passes = passes;
+        in.background = {0.25f, 0.5f, 0.125f, 0.75f};
+        for (int pass = 0; pass < passes; ++pass)
+            for (int layer = 0; layer < layers; ++layer) {
+                auto& tile = in.add(pass, static_cast<std::uint32_t>(layer));
+                label(static_cast<TileHeader&>(tile), layer);
+                const std::uint64_t kind = random() % 3; // sparse, dense, empty
+                for (int y = 0; y < tile.region.height() && kind < 2 && !isEmpty; ++y)
+                    for (int x = 0; x < tile.region.width(); ++x) {
+                        if (kind == 0 && random() % 3 != 0)
+                            continue;
+                        float* rgba = tile.pixel(x, y);
+                        rgba[3] = 0.1f + 0.8f * number();
+                        for (int c = 0; c < 3; ++c)
+                            rgba[c] = rgba[3] * number();
+                        tile.depth[y * size + x] = 1 + number();
+                    }
+            }
+        return in;
+    };
+    // The inputs of one of its passes, as the only one.
+    const auto passOf = [&](Inputs& in, int pass) {
+        Inputs one;
+        one.layout = in.layout;
+        one.background = in.background;
+        for (auto& tile : in.tiles)
+            if (tile->pass == pass) {
+                one.tiles.push_back(std::make_unique<typename Inputs::Tile>(*tile));
+                one.tiles.back()->pass = 0;
+            }
+        return one;
+    };
+    const auto run = [](const Inputs& in, const std::vector<std::size_t>& order) {
+        Op op;
+        return runTileOp(op, in, order, OutputFormat::RGBA32F);
+    };
+    bool hasOrder = false, hasMemory = false, hasHoles = false, hasOtherMean = false, hasOtherBackground = false;
+    for (int round = 0; round < 20; ++round) {
+        Inputs in = make(2, size - round % 3, false);
+        const TileOutput expected = run(in, in.order());
+        auto order = in.order();
+        std::shuffle(order.begin(), order.end(), random);
+        hasOrder = hasOrder || !(run(in, order) == expected);
+
+        Op used;
+        std::int64_t written = 0;
+        const Inputs before = make(3, size, false);
+        runTileOp(used, before, before.order(), OutputFormat::RGBA32F);
+        const TileOutput again = runTileOp(used, in, in.order(), OutputFormat::RGBA32F, true, {}, false, &written);
+        hasMemory = hasMemory || !(again == expected);
+        const std::int64_t pixels = static_cast<std::int64_t>(in.region().width()) * in.region().height();
+        hasHoles = hasHoles || written != pixels;
+
+        const Inputs first = passOf(in, 0), second = passOf(in, 1);
+        const TileOutput a = run(first, first.order()), b = run(second, second.order());
+        const Inputs nothing = make(2, size, true);
+        const TileOutput empty = run(nothing, nothing.order());
+        for (std::size_t i = 0; i < 4 * static_cast<std::size_t>(pixels); ++i) {
+            const float mean = 0.5f * (a.value(i) + b.value(i));
+            // Each of the three values is rounded to float once.
+            hasOtherMean = hasOtherMean || !(std::fabs(expected.value(i) - mean) <= 2 * 0x1p-23f * std::fabs(mean));
+        }
+        for (std::size_t i = 0; i < empty.color.size() / sizeof(float); ++i)
+            hasOtherBackground = hasOtherBackground || empty.value(i) != nothing.background[i % 4];
+    }
+    std::string text;
+    if (hasOrder)
+        text += "The image depends on the order in which inputs come. ";
+    if (hasMemory)
+        text += "The image depends on the frame before. ";
+    if (hasHoles)
+        text += "Not each pixel is set once. ";
+    if (hasOtherMean)
+        text += "The image of two passes is not the mean of the images of each. ";
+    if (hasOtherBackground)
+        text += "Where there is nothing the background does not show. ";
+    return text;
+}
+template <class Op>
+std::string checkTileOp(std::uint64_t seed = 1)
+{
+    return checkTileOp<Op>([](TileHeader&, int) {}, seed);
 }
 
 } // namespace dfb::testing
