@@ -82,7 +82,19 @@ foreach(_component IN LISTS _others)
 endforeach()
 
 # The library compiled once, by the stranger's project: of the package, with core alone, and of the sources.
-dfb_add_package_test(find_package_compiled HOW find_package EXPECT ${_others} OPTIONS -DFRAME=ON -DCOMPILED=ON)
+# With MPI it also builds what a stranger writes from the documentation alone.
+set(_door "")
+if(TARGET dfb::mpi)
+  set(_door -DDOOR=ON)
+endif()
+dfb_add_package_test(find_package_compiled HOW find_package EXPECT ${_others}
+  OPTIONS -DFRAME=ON -DCOMPILED=ON ${_door})
+if(_door)
+  set_tests_properties(package.find_package_compiled PROPERTIES FIXTURES_SETUP dfb_door)
+  dfb_add_mpi_run(package.door RANKS 1 3 LABELS package
+    COMMAND ${CMAKE_CURRENT_BINARY_DIR}/package/find_package_compiled/door)
+  set_tests_properties(package.door.np1 package.door.np3 PROPERTIES FIXTURES_REQUIRED dfb_door)
+endif()
 dfb_add_package_test(find_package_core_compiled HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy
   OPTIONS -DFRAME=ON -DCOMPILED=ON)
 dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
