@@ -2,7 +2,7 @@
 
 #include "everywhere.hpp"
 
-#include <memory>
+#include <chrono>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -21,7 +21,9 @@ struct OwnLoop {
         Result result;
         scene::Scene s = scene::makeScene(5);
         s.passes = 2;
-        OwnFrameBuffer<Transport> fb(communicator, scene::configOf(s));
+        auto config = scene::configOf(s);
+        config.quiet = std::chrono::milliseconds(5);
+        OwnFrameBuffer<Transport> fb(communicator, config);
         const auto mine = scene::bricksOf(s, fb.rank(), fb.size());
         const auto meets = [&](const dfb::Brick& brick, int tile) {
             return !dfb::intersection(scene::FlatCamera().project(brick.bounds, s.width, s.height),
