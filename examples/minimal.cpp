@@ -1,7 +1,7 @@
 // The shortest complete program: every rank has one brick with a glass ball in it; rank 0 writes the picture.
 //   mpirun -n 4 minimal        writes minimal.ppm
-#include <cmath>
 #include <dfb/dfb.hpp>
+#include <cmath>
 #include <fstream>
 
 int main(int argc, char** argv)
