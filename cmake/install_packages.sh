@@ -1,8 +1,8 @@
 #!/bin/sh
-# sh cmake/install_packages.sh [clang|bench]
+# sh cmake/install_packages.sh [clang|bench|docs]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that: on Debian and Ubuntu with apt-get; elsewhere says
-# what is missing and exits with 1. Quick when nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "docs" what the site needs: on Debian and
+# Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -25,6 +25,9 @@ tools() {
     fi
     if [ "$with" = clang ] && ! echo 'int main() {}' | clang++ -fsanitize=thread -x c++ - -o /dev/null 2>/dev/null; then
         echo clang libclang-rt-dev
+    fi
+    if [ "$with" = docs ] && ! have doxygen; then
+        echo doxygen doxygen-awesome-css
     fi
 }
 

@@ -26,6 +26,12 @@ add_test(NAME guard.docs
   COMMAND ${CMAKE_COMMAND} -DROOT=${PROJECT_SOURCE_DIR} -P ${CMAKE_CURRENT_SOURCE_DIR}/guards/docs.cmake)
 set_tests_properties(guard.readme guard.architecture guard.docs PROPERTIES LABELS guard)
 
+# The site comes without a warning; Doxygen warns of links that lead nowhere.
+if(TARGET docs)
+  add_test(NAME guard.site COMMAND Doxygen::doxygen ${PROJECT_BINARY_DIR}/site/Doxyfile)
+  set_tests_properties(guard.site PROPERTIES LABELS guard)
+endif()
+
 # The blocks of code in docs/ compile.
 if(TARGET dfb::mpi AND TARGET dfb::snappy)
   include(guards/doc_blocks/blocks.cmake)

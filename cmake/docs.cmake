@@ -1,0 +1,27 @@
+# Target docs: a site of docs/ and the headers, in <build>/site/html. A warning of Doxygen, or a link that leads nowhere, is
+# an error. Doxygen 1.9.1 or later; with doxygen-awesome-css it looks better.
+find_package(Doxygen 1.9.1 QUIET)
+if(NOT DOXYGEN_FOUND)
+  return()
+endif()
+set(DFB_SITE ${PROJECT_BINARY_DIR}/site)
+find_file(DFB_SITE_STYLE doxygen-awesome.css PATHS /usr/share /usr/local/share PATH_SUFFIXES doxygen-awesome-css NO_DEFAULT_PATH)
+mark_as_advanced(DFB_SITE_STYLE)
+if(NOT DFB_SITE_STYLE)
+  set(DFB_SITE_STYLE "")
+endif()
+
+# A page for each example
+file(GLOB examples RELATIVE ${PROJECT_SOURCE_DIR}/examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp)
+set(pages "")
+foreach(example IN LISTS examples)
+  string(APPEND pages "/** @example ${example} */\n")
+endforeach()
+file(WRITE ${DFB_SITE}/examples.dox "${pages}")
+
+configure_file(${PROJECT_SOURCE_DIR}/docs/site/Doxyfile.in ${DFB_SITE}/Doxyfile @ONLY)
+add_custom_target(docs
+  COMMAND ${CMAKE_COMMAND} -E remove_directory ${DFB_SITE}/html
+  COMMAND Doxygen::doxygen ${DFB_SITE}/Doxyfile
+  COMMENT "Writing ${DFB_SITE}/html/index.html"
+  VERBATIM)
