@@ -32,15 +32,21 @@ if(TARGET docs)
   set_tests_properties(guard.site PROPERTIES LABELS guard)
 endif()
 
-# The blocks of code in docs/ compile.
+# The blocks of code in docs/ compile, and the operations there are right.
 if(TARGET dfb::mpi AND TARGET dfb::snappy)
   include(guards/doc_blocks/blocks.cmake)
   dfb_write_doc_blocks(_doc_blocks ${PROJECT_SOURCE_DIR} ${CMAKE_CURRENT_BINARY_DIR})
   add_library(dfb_doc_blocks OBJECT ${_doc_blocks})
-  target_link_libraries(dfb_doc_blocks PRIVATE dfb_developer)
-  target_include_directories(dfb_doc_blocks PRIVATE ${CMAKE_CURRENT_SOURCE_DIR}/guards/doc_blocks)
-  target_compile_options(dfb_doc_blocks PRIVATE -O0)
   set_target_properties(dfb_doc_blocks PROPERTIES UNITY_BUILD ON UNITY_BUILD_BATCH_SIZE 0)
+  add_executable(test_documented guards/doc_blocks/operations.cpp)
+  foreach(target IN ITEMS dfb_doc_blocks test_documented)
+    target_link_libraries(${target} PRIVATE dfb_developer)
+    target_include_directories(${target} PRIVATE
+      ${CMAKE_CURRENT_SOURCE_DIR}/guards/doc_blocks ${CMAKE_CURRENT_BINARY_DIR}/doc_blocks)
+    target_compile_options(${target} PRIVATE -O0)
+  endforeach()
+  add_test(NAME guard.documented_operations COMMAND test_documented)
+  set_tests_properties(guard.documented_operations PROPERTIES LABELS guard)
 endif()
 
 # Every header compiles alone, with a second inclusion after it. A header that is the door of a dependency does so

@@ -1,6 +1,6 @@
-# dfb_write_doc_blocks(<variable> <source dir> <binary dir>): writes each ```cpp block of docs/*.md that is no whole program
-# into a function of its own, in a .cpp file for each page; sets the variable to these files. context.hpp declares the
-# names that docs/recipes.md introduces in words.
+# dfb_write_doc_blocks(<variable> <source dir> <binary dir>): writes each ```cpp block of docs/*.md into a function of its
+# own, in <binary dir>/doc_blocks/<page>.cpp, and a block that is a struct into <binary dir>/doc_blocks/<struct>.hpp. Sets
+# the variable to the .cpp files. context.hpp declares the names that docs/recipes.md introduces in words.
 function(dfb_write_doc_blocks variable root binary_dir)
   file(GLOB pages CONFIGURE_DEPENDS ${root}/docs/*.md)
   set_property(DIRECTORY APPEND PROPERTY CMAKE_CONFIGURE_DEPENDS ${pages})
@@ -19,7 +19,13 @@ function(dfb_write_doc_blocks variable root binary_dir)
       string(SUBSTRING "${text}" 0 ${end} block)
       string(SUBSTRING "${text}" ${end} -1 text)
       math(EXPR number "${number} + 1")
-      string(APPEND code "void ${name}${number}();\nvoid ${name}${number}()\n{\n${block}}\n\n")
+      if(block MATCHES "^struct ([A-Za-z]+)")
+        file(CONFIGURE OUTPUT ${binary_dir}/doc_blocks/${CMAKE_MATCH_1}.hpp CONTENT
+          "// From docs/${name}.md\n#pragma once\n\n#include \"context.hpp\"\n\nnamespace doc {\n\n@block@\n}\n" @ONLY)
+        string(APPEND code "} // namespace doc\n#include \"${CMAKE_MATCH_1}.hpp\"\nnamespace doc {\n\n")
+      else()
+        string(APPEND code "void ${name}${number}();\nvoid ${name}${number}()\n{\n${block}}\n\n")
+      endif()
       string(FIND "${text}" "\n```cpp\n" begin)
     endwhile()
     if(number GREATER 0)

@@ -1,13 +1,21 @@
-// What the blocks of code in docs/ take as given; see docs/recipes.md. Nothing of this is linked or run.
+// What the blocks of code in docs/ take as given; see docs/recipes.md. Of this only the operations are run.
 #pragma once
 
 #include <dfb/dfb.hpp>
 
+#include <dfb/testing/tile_op_test.hpp>
+
+#include <algorithm>
+#include <array>
 #include <chrono>
+#include <cmath>
+#include <cstddef>
 #include <cstdint>
 #include <cstdio>
 #include <memory>
 #include <optional>
+#include <string>
+#include <tuple>
 #include <vector>
 
 namespace doc {
@@ -34,6 +42,7 @@ extern dfb::PerspectiveCamera camera;
 extern dfb::WallLayout layout;
 extern dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb;
 extern int width, height;
+extern std::vector<dfb::Box3> allBounds;
 extern std::vector<std::uint8_t> pixels;
 extern std::vector<float> depths;
 extern const RenderPixel renderPixel;

@@ -25,6 +25,9 @@
 
 namespace dfb::testing {
 
+template <class Op>
+inline constexpr int tileSizeOf = dfb::detail::TileSizeOf<Op>::value;
+
 // One tile of an image, and the inputs that it gets.
 template <int Size>
 struct TileInputs {
@@ -90,7 +93,7 @@ struct TileOutput {
 // What the framebuffer does with a tile in a frame, with the inputs arriving in this order. `written`: how many pixels
 // the operation has set.
 template <class Op>
-TileOutput runTileOp(Op& op, const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order,
+TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order,
                      OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false,
                      std::int64_t* written = nullptr)
 {
@@ -134,7 +137,7 @@ TileOutput runTileOp(Op& op, const TileInputs<Op::tileSize>& in, const std::vect
 
 // The second of two such frames with a new operation: one is used again from frame to frame.
 template <class Op>
-TileOutput runTileOp(const TileInputs<Op::tileSize>& in, const std::vector<std::size_t>& order, OutputFormat format,
+TileOutput runTileOp(const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order, OutputFormat format,
                      bool withDepth = true, const TileWire& wire = {}, bool dither = false)
 {
     Op op;
@@ -174,7 +177,7 @@ std::vector<Pixel> referenceOf(const TileInputs<Size>& in)
 
 // All formats and the depth against exact pixels; a wrong depth counts as 4 wrong bytes.
 template <class Op>
-ErrorReport compare(const TileInputs<Op::tileSize>& in, const std::vector<Pixel>& expected)
+ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixel>& expected)
 {
     const auto order = in.order();
     const TileOutput floats = runTileOp<Op>(in, order, OutputFormat::RGBA32F);
@@ -195,16 +198,16 @@ ErrorReport compare(const TileInputs<Op::tileSize>& in, const std::vector<Pixel>
 }
 
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
-// Returns what is wrong, a sentence for each, or nothing: its image must not depend on the order in which inputs come,
-// nor on the frame before; each pixel is set; an image of two passes is the mean of the images of each; empty inputs
-// show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each the
+// Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
+// the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
+// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each the
 // generation and source that the operation expects; by default generation 1 and source `layer`. For operations that
 // keep no state.
 template <class Op, class Label>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
 {
-    using Inputs = TileInputs<Op::tileSize>;
-    constexpr int size = Op::tileSize, layers = 3;
+    using Inputs = TileInputs<tileSizeOf<Op>>;
+    constexpr int size = tileSizeOf<Op>, layers = 3;
     std::mt19937_64 random(seed);
     const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f; };
     // Of `passes` passes, with an image of this size.
