@@ -459,7 +459,7 @@ private:
     dfb::FrameReport renderAdaptively(int frame, const dfb::World& world, ProgressLine& progress)
     {
         if (!sampler_)
-            sampler_.emplace(fb_->layout(), dfb::SamplingSettings{o_.adaptive, std::min(8, o_.spp), o_.spp, 64});
+            sampler_.emplace(fb_->layout(), dfb::SamplingConfig{o_.adaptive, std::min(8, o_.spp), o_.spp, 64});
         else
             sampler_->reset();
         std::optional<dfb::FrameReport> sum;

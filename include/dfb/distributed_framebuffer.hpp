@@ -294,6 +294,11 @@ public:
     // frames, as the next two.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
+    // Collective, outside frames. Returns a copy of the display rank's image() on every rank; empty if that is. For
+    // programs in which every rank shows or stores the image. Waits for all ranks; the bytes of the image go along a
+    // tree of the ranks. Throws OutOfMemory, TransportError.
+    Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(); }
+
     // Which frame image() is of, as in FrameReport::frame; -1 if it is empty.
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
 

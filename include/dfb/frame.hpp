@@ -88,8 +88,10 @@ struct FrameConfig {
     // Samples a pixel, each a pass. With a tile operation that keepsState they are those that follow the last frame's,
     // see accumulationId; with any other, from 0 on.
     int passes = 1;
-    // Not null: in place of `passes`, the samples of each tile, by its index; see sampling.hpp. Only with a tile
-    // operation that keepsState may a tile have none or not begin with sample 0.
+    // Not null: the samples of each tile, by its index, in place of `passes`; see sampling.hpp. A tile with none is not
+    // rendered, and the image keeps its pixels from the last frame. The last frame must then have ended well. An
+    // operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1 and a
+    // pixel operation that is pointwise.
     SamplePlan samples;
     // For an ErrorBudget: no pixel has more inputs than this in a pass; 0: not known, taken for 65536. Loops that know
     // better say so themselves.

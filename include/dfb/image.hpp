@@ -167,6 +167,22 @@ public:
     const std::uint32_t* primitiveId() const { return detail::idsOf(plane(detail::PrimitiveId, "primitive ids")); }
     const std::uint32_t* instanceId() const { return detail::idsOf(plane(detail::InstanceId, "instance ids")); }
 
+    // Calls use(bytes, count) for each plane that there is: colour, then depth, then the auxiliary channels.
+    template <class Use>
+    void forEachPlane(const Use& use) const
+    {
+        for (std::size_t c = 0; c < detail::channelCount; ++c)
+            if (!planes_[c].empty())
+                use(planes_[c].data(), planeBytes(c));
+    }
+    template <class Use>
+    void forEachPlane(const Use& use)
+    {
+        for (std::size_t c = 0; c < detail::channelCount; ++c)
+            if (!planes_[c].empty())
+                use(planes_[c].data(), planeBytes(c));
+    }
+
     // Gives its memory away; there is nothing in it then.
     std::array<Buffer, detail::channelCount> release() noexcept { return std::move(planes_); }
 
@@ -189,6 +205,12 @@ private:
             throw InvalidArgument(std::string("this image has no ") + what
                                   + " (only the display rank has an image, in the format it was configured for, and "
                                     "after a frame that ended well)");
+    }
+
+    std::size_t planeBytes(std::size_t c) const noexcept
+    {
+        const std::size_t words = 4 * static_cast<std::size_t>(detail::channelWords[c]);
+        return pixelCount() * (c == detail::Color ? bytesPerPixel(format_) : words);
     }
 
     const std::byte* plane(detail::Channel channel, const char* what) const

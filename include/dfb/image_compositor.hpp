@@ -127,6 +127,10 @@ public:
     // holds until the next start(). Pixels that nobody has show FrameConfig::background, at a depth of +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
+    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Waits
+    // for all ranks. Throws OutOfMemory, TransportError.
+    Image imageOnAllRanks() { return engine_->imageOnAllRanks(); }
+
     // Collective. Pictures have this size from now on; image() is empty. Throws InvalidArgument if a picture is open,
     // or on all ranks if the size cannot be.
     void resize(int width, int height);

@@ -184,7 +184,104 @@ struct Sizes {
     }
 };
 
+// Every rank gets the image, with its depth, if it asks for it; and none if there is none.
+struct EverywhereTheImage {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5);
+        for (const int display : {0, 1}) {
+            auto config = scene::configOf(s);
+            config.image.depth = true;
+            WindowFrameBuffer<Transport> probe(communicator, config);
+            config.image.displayRank = std::min(display, probe.size() - 1);
+            WindowFrameBuffer<Transport> fb(communicator, config);
+            result.expect(fb.imageOnAllRanks().empty(), "an image before the first frame");
+            const auto report = scene::renderLoop(fb, s, scene::Loop::Declared);
+            const dfb::Image image = fb.imageOnAllRanks();
+            if (image.empty() || !image.hasDepth()) {
+                result.expect(false, "no image");
+                return result;
+            }
+            const scene::Picture picture(image, report);
+            result.expect(scene::wrongValues(picture, scene::referenceOf(s)) == 0, "a wrong picture");
+            if (fb.isDisplayRank())
+                result.expect(picture.hash() == scene::Picture(fb.image(), report).hash(), "not the same picture");
+        }
+        return result;
+    }
+};
+
+// A frame of a region renders the tiles that meet it; the others keep what they show, whatever the scene is now.
+struct RegionOfInterest {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        scene::Scene first = scene::makeScene(5), second = scene::makeScene(6);
+        second.width = first.width, second.height = first.height;
+        second.background = {0.5f, 0.25f, 0.125f, 1}; // of the region alone
+        WindowFrameBuffer<Transport> fb(communicator, scene::configOf(first));
+        const dfb::Region region{20, 17, 41, 33};
+        const auto render = [&](const scene::Scene& s, bool all) {
+            const dfb::World world(scene::bricksOf(s, fb.rank(), fb.size()));
+            dfb::DataParallelLoop loop(fb, world);
+            dfb::FrameConfig frame = scene::paramsOf(s);
+            if (!all)
+                frame.samples = dfb::samplesIn(fb.layout(), region, frame.passes);
+            std::atomic<int> outside{0};
+            loop.render(
+                scene::FlatCamera(),
+                [&](const dfb::Brick& brick, auto& tile) {
+                    outside += !all && intersection(region, tile.region).empty();
+                    scene::renderBrick(s, brick, tile);
+                },
+                frame);
+            result.expect(outside == 0, "a tile outside the region is rendered");
+        };
+        const auto pixels = [&] {
+            const float* rgba = fb.isDisplayRank() ? fb.image().rgba32f() : nullptr;
+            return rgba ? std::vector<float>(rgba, rgba + 4 * fb.image().pixelCount()) : std::vector<float>();
+        };
+        render(second, true);
+        const std::vector<float> all = pixels();
+        render(first, true);
+        const std::vector<float> before = pixels();
+        for (int i = 0; i < 2; ++i) {
+            render(second, false);
+            const std::vector<float> after = pixels();
+            int wrong = 0;
+            for (int tile = 0; fb.isDisplayRank() && tile < fb.layout().tileCount(); ++tile) {
+                const dfb::Region r = fb.layout().region(tile);
+                const std::vector<float>& expected = intersection(region, r).empty() ? before : all;
+                for (int y = r.y0; y < r.y1; ++y) {
+                    const auto at = static_cast<std::size_t>(4 * (y * first.width + r.x0));
+                    wrong += std::memcmp(&after[at], &expected[at], 16 * static_cast<std::size_t>(r.width())) != 0;
+                }
+            }
+            result.expect(wrong == 0, std::to_string(wrong) + " wrong rows");
+            result.expect(!fb.isDisplayRank() || all != before, "two scenes that are one");
+        }
+        auto frame = fb.begin();
+        frame.cancel();
+        scene::outcomeOf([&] { frame.end(); });
+        const std::string text = scene::outcomeOf([&] { render(second, false); });
+        result.expect(text.find("the last frame failed") != std::string::npos, "after a failed frame: " + text);
+        render(first, true);
+        result.expect(pixels() == before, "the next whole frame");
+        return result;
+    }
+};
+
 } // namespace
+
+TEST_CASE("imageOnAllRanks() gives each rank the display rank's image", "[window]")
+{
+    everywhere<EverywhereTheImage>();
+}
+
+TEST_CASE("A frame of a region leaves the rest of the image alone", "[window]") { everywhere<RegionOfInterest>(); }
 
 TEST_CASE("isDone() waits for nobody, and end() after it waits no more, also in frames that fail", "[window]")
 {

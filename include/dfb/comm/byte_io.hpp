@@ -107,6 +107,11 @@ public:
         const auto* first = reinterpret_cast<const char*>(take(length));
         return std::string(first, length);
     }
+    void getBytes(std::byte* to, std::size_t count)
+    {
+        const std::byte* from = take(count);
+        std::copy(from, from + count, to);
+    }
     // The same when any are.
     void end() const
     {

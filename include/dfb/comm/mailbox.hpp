@@ -414,8 +414,7 @@ public:
             const auto byteCount = in.get<std::uint64_t>();
             in.require(whose == from && byteCount <= in.left());
             result.emplace_back(static_cast<std::size_t>(byteCount));
-            for (std::byte& byte : result.back())
-                byte = in.get<std::byte>();
+            in.getBytes(result.back().data(), result.back().size());
         }
         in.end();
         return result;

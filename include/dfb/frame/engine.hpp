@@ -31,6 +31,7 @@ public:
     virtual const std::vector<int>& ownedTiles() const noexcept = 0;
     virtual const Image& image() const noexcept = 0;
     virtual std::int64_t imageFrame() const noexcept = 0;
+    virtual Image imageOnAllRanks() = 0;
     virtual bool isComplete(int tile) const = 0;
     virtual bool poll() = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;

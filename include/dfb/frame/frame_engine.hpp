@@ -369,6 +369,23 @@ public:
         });
     }
 
+    Image imageOnAllRanks() override
+    {
+        std::vector<std::byte> mine;
+        image().forEachPlane(
+            [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
+        const auto all = mailbox_->allGather(mine);
+        const std::vector<std::byte>& displayed = all[static_cast<std::size_t>(config_.image.displayRank)];
+        if (displayed.empty())
+            return {};
+        Image copy(*pool_, layout().width(), layout().height(), config_.image.format,
+                   TilePipeline::imageChannels(config_));
+        ByteReader in(displayed.data(), displayed.size());
+        copy.forEachPlane([&](std::byte* bytes, std::size_t count) { in.getBytes(bytes, count); });
+        in.end();
+        return copy;
+    }
+
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) override
     {
         return mailbox_->allGather(own);
@@ -714,11 +731,22 @@ private:
         for (const TileSamples& t : *params.samples) {
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
                 failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
-            if (!traits().keepsState && (t.count == 0 || t.first > 0))
-                failArgument("this tile operation keeps nothing over frames: each tile needs samples, from 0");
-            if ((t.first > 0 || t.count == 0) && !accumulates(params))
-                failArgument("what was accumulated is of no use, as the last frame failed or had another "
-                             "accumulationId: begin again with sample 0 of each tile");
+            if (traits().keepsState) {
+                if ((t.first > 0 || t.count == 0) && !accumulates(params))
+                    failArgument("what was accumulated is of no use, as the last frame failed or had another "
+                                 "accumulationId: begin again with sample 0 of each tile");
+                continue;
+            }
+            if (t.first > 0)
+                failArgument("this tile operation keeps nothing over frames: samples of a tile begin with 0");
+            if (t.count > 0)
+                continue;
+            if (outcome_->lastFailed())
+                failArgument("a tile without samples keeps its pixels, but the last frame failed: render all tiles");
+            if (config_.framesInFlight > 1)
+                failArgument("a tile without samples keeps its pixels: this needs framesInFlight = 1");
+            if (!traits().pixelOpIsPointwise)
+                failArgument("a tile without samples keeps its pixels, but the pixel operation wants all tiles");
         }
     }
 

@@ -438,8 +438,12 @@ public:
         std::vector<double> row;
         for (int tile = 0; tile < layout_.tileCount(); ++tile) {
             auto& s = state_[static_cast<std::size_t>(tile)];
-            if (s == TileState::Received || (s == TileState::Background && same) || (s == TileState::Old && kept(tile)))
+            if (s == TileState::Received || (s == TileState::Background && same))
                 continue;
+            if (s != TileState::Undefined && kept(tile)) {
+                s = TileState::Old; // of another background
+                continue;
+            }
             const Region region = layout_.region(tile);
             const Place place = inImage(image_.planesAt(0), region);
             FinishedTile out(region, settings_.format, place.planes, place.stride, settings_.dither);

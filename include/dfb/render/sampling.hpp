@@ -1,5 +1,5 @@
-// AdaptiveSampler: how many samples each tile gets in the next frame, from what the owners said of the last ones
-// (section 4.1.1 of the paper).
+// Plans of samples: a part of the image, and AdaptiveSampler, which gives each tile samples by its error (section 4.1.1
+// of the paper).
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -15,7 +15,19 @@
 
 namespace dfb {
 
-struct SamplingSettings {
+// For FrameConfig::samples: only the tiles that meet `region` are rendered, with `passes` samples a pixel; the image
+// keeps the others. Throws InvalidArgument for less than 1 pass.
+inline SamplePlan samplesIn(const TileLayout& layout, const Region& region, int passes = 1)
+{
+    if (passes < 1)
+        detail::failArgument("a region with %d passes", passes);
+    std::vector<TileSamples> plan;
+    for (int tile = 0; tile < layout.tileCount(); ++tile)
+        plan.push_back({0, !intersection(region, layout.region(tile)).empty() ? passes : 0});
+    return std::make_shared<const std::vector<TileSamples>>(std::move(plan));
+}
+
+struct SamplingConfig {
     // A tile is done when its TileReport::error, a standard error in units of colour, is at most this. 0: never.
     double maxError = 0;
     int firstSamples = 8;  // of each tile, before its error is believed; at least 2
@@ -34,11 +46,11 @@ struct SamplingSettings {
 // A frame that throws FrameError must be followed by reset(): what was accumulated is lost.
 class AdaptiveSampler {
 public:
-    // Throws InvalidArgument for settings that cannot be.
-    AdaptiveSampler(const TileLayout& layout, const SamplingSettings& settings) : layout_(layout), settings_(settings)
+    // Throws InvalidArgument for a configuration that cannot be.
+    AdaptiveSampler(const TileLayout& layout, const SamplingConfig& config) : layout_(layout), config_(config)
     {
-        if (settings.firstSamples < 2 || settings.maxSamples < settings.firstSamples || settings.frameSamples < 1
-            || !(settings.maxError >= 0))
+        if (config.firstSamples < 2 || config.maxSamples < config.firstSamples || config.frameSamples < 1
+            || !(config.maxError >= 0))
             detail::failArgument(
                 "sampling goes from 2 first samples or more up to as many at least, in frames of 1 or more");
         reset();
@@ -115,7 +127,7 @@ private:
         for (std::size_t t = 0; t < taken_.size(); ++t)
             plan_[t] = {taken_[t], 0};
         for (std::size_t t = 0; t < taken_.size(); ++t)
-            plan_[t].count = std::min(wanted(t), settings_.maxSamples) - taken_[t];
+            plan_[t].count = std::min(wanted(t), config_.maxSamples) - taken_[t];
         // What is rare may not have been seen yet: a tile beside one that needs many samples gets a quarter of what
         // that one has, so that an edge that only just reaches into it is not lost.
         for (int row = 0; row < layout_.tilesY(); ++row)
@@ -126,7 +138,7 @@ private:
                     for (int x = std::max(0, column - 1); x <= std::min(layout_.tilesX() - 1, column + 1); ++x)
                         most = std::max(most, taken_[static_cast<std::size_t>(layout_.tileAt(x, y))]);
                 const int count = std::max(plan_[tile].count, most / 4 - taken_[tile]);
-                plan_[tile].count = error_[tile] == untouched ? 0 : std::clamp(count, 0, settings_.frameSamples);
+                plan_[tile].count = error_[tile] == untouched ? 0 : std::clamp(count, 0, config_.frameSamples);
             }
     }
 
@@ -134,19 +146,19 @@ private:
     // most twice what it has, since an error from few samples is itself uncertain.
     int wanted(std::size_t t) const
     {
-        if (taken_[t] < settings_.firstSamples)
-            return settings_.firstSamples;
-        if (error_[t] <= settings_.maxError && settings_.maxError > 0)
+        if (taken_[t] < config_.firstSamples)
+            return config_.firstSamples;
+        if (error_[t] <= config_.maxError && config_.maxError > 0)
             return taken_[t];
-        if (settings_.maxError == 0)
-            return settings_.maxSamples;
-        const double ratio = error_[t] / settings_.maxError;
+        if (config_.maxError == 0)
+            return config_.maxSamples;
+        const double ratio = error_[t] / config_.maxError;
         const double needed = static_cast<double>(taken_[t]) * std::min(2.0, ratio * ratio);
         return static_cast<int>(std::min(std::ceil(needed), 2e9));
     }
 
     TileLayout layout_;
-    SamplingSettings settings_;
+    SamplingConfig config_;
     std::uint64_t accumulationId_ = 0;
     std::vector<int> taken_;    // per tile
     std::vector<double> error_; // per tile
