@@ -1,8 +1,8 @@
 #!/bin/sh
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
-# benchmarks but bench_messaging and bench_gather: their tables go to docs/performance.md and bench/README.md, all figures to
-# bench/results. Half an hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
+# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results, one table to
+# docs/performance.md. Half an hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
 # of a program, is to start it there, 4 ranks at best, one on each.
 # The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
 set -eu
@@ -39,7 +39,10 @@ cmake --build --preset release --parallel "$jobs" --target bench_error_time benc
     bench_scaling bench_skip bench_paper bench_kernels
 
 mkdir -p "$results"
-rm -f "$results"/*
+find "$results" -type f ! -name messaging.md ! -name gather.md -exec rm -f {} +
+for name in kernels compositing overlap paper scaling skip; do
+    printf '# Results of bench_%s\n\n' "$name" >"$results/$name.md"
+done
 
 "$bench"/bench_kernels --json "$results/kernels.json" --table "$results/kernels.md"
 
@@ -87,27 +90,16 @@ else
     echo "run.sh: no --launcher: nothing was measured over a network"
 fi
 
-# between FILE NAME TABLE...: what FILE has between the marks of NAME is what was measured.
-between() {
-    file=$1 name=$2
-    shift 2
-    awk -v name="$name" -v tables="$*" '
-        $0 == "<!-- end of " name " -->" { skip = 0 }
-        !skip { print }
-        $0 == "<!-- " name ": written by bench/run.sh -->" {
-            skip = 1
-            count = split(tables, table, " ")
-            for (i = 1; i <= count; ++i)
-                while ((getline line < table[i]) > 0) print line
-            print ""
-        }' "$file" >"$file.new"
-    mv "$file.new" "$file"
-}
-between docs/performance.md error_time "$results/error_time.4.md" "$results/error_time.8.md"
-between bench/README.md compositing "$results/compositing.md"
-between bench/README.md overlap "$results/overlap.md"
-between bench/README.md scaling "$results/scaling.md"
-between bench/README.md skip "$results/skip.md"
-between bench/README.md paper "$results/paper.md"
-between bench/README.md kernels "$results/kernels.md"
+# What docs/performance.md has between its two marks is what was measured.
+awk -v tables="$results/error_time.4.md $results/error_time.8.md" '
+    $0 == "<!-- end of error_time -->" { skip = 0 }
+    !skip { print }
+    $0 == "<!-- error_time: written by bench/run.sh -->" {
+        skip = 1
+        count = split(tables, table, " ")
+        for (i = 1; i <= count; ++i)
+            while ((getline line < table[i]) > 0) print line
+        print ""
+    }' docs/performance.md >docs/performance.md.new
+mv docs/performance.md.new docs/performance.md
 exit "$status"

@@ -71,7 +71,7 @@ public:
         }
 
         // Hands over a rendered tile; the active pixels leave for the owner at once, and `tile` can be used again.
-        // From any thread. Waits only while this rank has more under way than messagePoolBytes, and meanwhile runs
+        // From any thread. Waits only while this rank has more under way than messages.poolBytes, and meanwhile runs
         // tasks of the executor (with Progress::Caller it waits only on a thread that may poll). Throws
         // InvalidArgument, with nothing sent, for a tile of another frame, an index, region or pass that the frame does
         // not have, a negative generation or number of children. What is wrong with it as an input comes out of end().

@@ -186,7 +186,7 @@ struct FrameReport {
     // verdict.
     std::int64_t lateMessages = 0;
     std::int64_t repeatedMessages = 0; // all: came twice, dropped since the last verdict
-    std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messagePoolBytes
+    std::int64_t peakInboxBytes = 0;   // all: most that one rank's inbox held, of what counts on messages.poolBytes
     std::int64_t peakMemoryBytes = 0;  // all: most that one rank's framebuffer ever held in message and image memory
 };
 
