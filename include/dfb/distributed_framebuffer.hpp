@@ -1,6 +1,6 @@
-// DistributedFrameBuffer: tiles of many ranks become one image, each tile on its own: it goes to its owner as
-// soon as it is set, the tile operation makes the finished tile when all its inputs have come, the pixel operation
-// post-processes it, and it goes to the display rank (section 3 of the paper).
+// DistributedFrameBuffer: makes one image of the tiles that many ranks render, each tile on its own. setTile() sends an
+// input to the owner of the tile. When all inputs of a tile have come, the tile operation makes the finished tile, the
+// pixel operation post-processes it, and it goes to the display rank (section 3 of the paper).
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -19,8 +19,8 @@
 
 namespace dfb {
 
-// One object per rank; construction and destruction are collective over the communicator. begin() and end() are called
-// by one thread at a time.
+// One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
+// begin() and end().
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
     static_assert(detail::checkTileOp<TileOp>());
@@ -38,7 +38,7 @@ public:
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 
-    // A frame that has begun. Leaving its scope without end() cancels it on all ranks.
+    // A frame that has begun. If it is destroyed before end(), the frame fails on all ranks.
     class Frame {
     public:
         Frame(Frame&& other) noexcept
@@ -55,14 +55,15 @@ public:
 
         std::int64_t number() const noexcept { return number_; }
 
-        // Makes `tile` this frame's tile of that index and pass: all pixels cleared, generation 0, no children, source
-        // this rank, part 0. Throws InvalidArgument for an index or a pass that the frame does not have.
+        // Prepares `tile` for a tile and a pass of this frame: clears all pixels, and sets generation 0, no children,
+        // this rank as source, and part 0. Any thread. Waits for nothing. Throws InvalidArgument for an index or a pass
+        // that the frame does not have.
         void start(Tile& tile, int tileIndex, int pass = 0) const
         {
             static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
             tile.clear(engine_->sent());
         }
-        // The same for a view, of nothing yet.
+        // Prepares a view, whose planes are null then: point them to your pixels. Threads and exceptions as above.
         void start(TileView& tile, int tileIndex, int pass = 0) const
         {
             const TileHeader header = engine_->headerOf(tileIndex, pass);
@@ -70,83 +71,84 @@ public:
             static_cast<TileHeader&>(tile) = header;
         }
 
-        // Hands over a rendered tile; the active pixels leave for the owner at once, and `tile` can be used again.
-        // From any thread. Waits only while this rank has more under way than messages.poolBytes, and meanwhile runs
-        // tasks of the executor (with Progress::Caller it waits only on a thread that may poll). Throws
-        // InvalidArgument, with nothing sent, for a tile of another frame, an index, region or pass that the frame does
-        // not have, a negative generation or number of children. What is wrong with it as an input comes out of end().
-        // In a frame that has failed: does nothing.
+        // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when it returns. Does
+        // nothing in a frame that has failed. Any thread. Waits only while this rank has more under way than
+        // messages.poolBytes, and runs tasks of the executor meanwhile; with Progress::Caller only a thread that may
+        // poll waits. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or
+        // pass that the frame does not have, and for a negative generation or number of children. An input that does
+        // not fit the others makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
-        // The same for pixels that lie elsewhere, and are not looked at any more when it returns. Throws
-        // InvalidArgument, too, if a channel that has to travel is null.
+        // Sends pixels that lie in your own memory; they are not read any more when it returns. Threads, waiting and
+        // exceptions as above. Throws InvalidArgument also if a channel that has to travel is null.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
-        // What nobody can see need not be rendered, with an operation that says so (TileOp::opaqueHides()): true if an
-        // opaque input of that tile, of a lower generation, is known to have been sent by this rank or another.
-        // setTile() drops what is hidden. From any thread, as the next two.
+        // Whether an input of that tile and generation cannot be seen and need not be rendered: this rank knows of an
+        // opaque input of a lower generation. False unless the operation has opaqueHides(). setTile() drops hidden
+        // inputs. Any thread. Waits for nothing.
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
-        // Whether `tile`, which has been set, hides those of a higher generation: if so, let the ranks know that have
-        // any.
+        // Whether `tile`, which has been set, hides the inputs of higher generations. If it does, call hide() for the
+        // ranks that have such inputs. Any thread. Waits for nothing.
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
-        // Lets `rank` know that inputs from this generation on cannot be seen. What it has sent by then is dropped by
-        // the owner, and counted as late if the frame is over. Throws InvalidArgument where everything counts.
+        // Tells `rank` that inputs of this generation and higher ones cannot be seen. The owner drops those that come
+        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument unless the operation has opaqueHides()
+        // for this frame.
         void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
 
-        // Only with FrameConfig::declared: each rank says once in each frame which inputs of generation 1 it will send,
-        // in each pass; children that these announce need no declaration; it may say so after it sent some. A rank
-        // without any calls it with none. An input that turns out empty must be sent all the same; it costs a header.
-        // A rank that declares what it declared last sends nothing for it, but for its part of a reduction; otherwise
-        // it tells the owners that it touches or touched, as far as it is news to them. Waits for nothing. Throws
-        // InvalidArgument, with nothing declared, for a tile outside the image, a second time in a frame, and in a
-        // frame that was not begun so; without it, the frame fails in end().
+        // Declares the inputs of generation 1 that this rank will send in each pass. In a frame with
+        // FrameConfig::declared every rank must call it once, with an empty list if it has no inputs; else end() fails
+        // the frame. It may come after the first setTile(). Children that these inputs announce are not declared. A
+        // declared input must be sent even if it is empty; it then costs a header. A list equal to that of the last
+        // frame costs no manifest. By one thread. Waits for nothing. Throws InvalidArgument, with nothing declared, for
+        // a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-        // As FrameConfig::maxLayers, for who knows it only now; may differ between ranks. Before the first setTile().
+        // Sets FrameConfig::maxLayers for this rank's inputs, if it is not known before begin(). Ranks may differ. Call
+        // it before the first setTile().
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
-        // How many samples a tile gets in this frame, and which.
+        // The samples that a tile gets in this frame. Any thread.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
-        // A range of jobs for this rank out of [0, count), all of which every rank could do; over all ranks each comes
-        // up once. Empty: there are no more, or the frame has failed. `count` must be the same on all ranks and calls;
-        // only by the thread that began the frame, and not in a task: waits for the answer of another rank, which is
-        // asked while the range before is worked on. Throws TransportError.
+        // Returns the next range of jobs for this rank, out of [0, count) for all ranks together; each job goes to one
+        // rank. An empty range: there are no more, or the frame has failed. `count` must be the same on all ranks and
+        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the answer of
+        // another rank, which was asked in the call before. Throws TransportError.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
-        // Adds to what FrameReport::figures has for this key, on all ranks. For what a renderer measures and all ranks
-        // must know alike, such as the cost of a brick: it travels with the verdict. From any thread.
+        // Adds `value` to the sum over all ranks that FrameReport::figures will have for this key. For measurements
+        // that all ranks must know, such as the cost of a brick. It travels with the verdict. Any thread.
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
-        // An input of that tile was simplified, which may have changed a pixel of one pass by `bound`; for
-        // FrameReport::mergeErrorBound. From any thread.
+        // Notes that an input of that tile was simplified, and that a pixel of one pass may be off by `bound` (colour)
+        // for it; see FrameReport::mergeErrorBound. Any thread.
         void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
-        // Whether the frame has failed on some rank: rendering on is of no use. From any thread.
+        // Whether the frame has failed on some rank, as far as this rank knows. Then rendering on is of no use. Any
+        // thread. Waits for nothing.
         bool failed() const noexcept { return engine_->failed(); }
 
-        // Calls body(), as what a loop of your own does between begin() and end(), or one tile of it. An exception of
-        // it goes to abort() and no further, so that end() throws FrameError with its text on all ranks, this one
-        // included: whoever calls this calls end() as well, whatever becomes of it. False if there was one. From any
-        // thread, on one rank or all; waits for no other rank. Without it an exception that ends the frame's scope
-        // tells the other ranks only that the frame was left.
+        // Calls body(), the work of a loop of your own or a part of it. An exception of body() goes to abort(), and
+        // end() throws a FrameError with its text on all ranks, also on this one. So call end() in any case. Returns
+        // false if there was an exception. Any thread. Waits for no other rank. Throws nothing.
         template <class Body>
         bool guard(const Body& body)
         {
             return guardAbout(body, nullptr);
         }
-        // The same for body() that renders `tile`: the error names it, and with FrameConfig::allowPartial the frame
-        // goes on without it alone. Its number is looked at when there is an exception.
+        // Calls body(), which renders `tile`: the error names that tile, and with FrameConfig::allowPartial the frame
+        // goes on without it. The tile's index is read when there is an exception.
         template <class Body>
         bool guard(const Body& body, const TileHeader& tile)
         {
             return guardAbout(body, &tile);
         }
 
-        // Calls job(i, tile) for each i in [0, count), on all workers of the executor and this thread, each with a tile
-        // of its own: a Tile, or a TileView if that is asked for. The job calls start(tile, ...), renders, and calls
-        // setTile(tile). Returns when all jobs have. An exception of a job makes the frame fail as guard() does; then
-        // no other job begins. With allowPartial the frame goes on without the tile that it was about.
+        // Calls job(i, tile) for each i in [0, count), on this thread and the workers of the executor. Each thread has
+        // a tile of its own: a Tile, or a TileView if that is the template argument. The job calls start(tile, ...),
+        // renders, and calls setTile(tile). Waits until all jobs have returned. Throws nothing: an exception of a job
+        // makes the frame fail as in guard(), and no other job begins; with FrameConfig::allowPartial the frame goes on
+        // without that job's tile.
         template <class WorkerTile = Tile, class Job>
         void forEachTile(std::int64_t count, const Job& job)
         {
@@ -167,8 +169,8 @@ public:
             });
         }
 
-        // Calls render(tile) for each of these tiles and each of its passes, with a tile that start() has made ready;
-        // render(tile) calls setTile(tile). Threads and exceptions as above.
+        // Calls render(tile) for each pass of each of these tiles, after start(). render(tile) calls setTile(tile).
+        // Threads, waiting and exceptions as above.
         template <class Render>
         void forEachTile(const std::vector<int>& tiles, const Render& render)
         {
@@ -181,23 +183,22 @@ public:
             });
         }
 
-        // Makes the frame fail on all ranks, with the text of this exception; with FrameConfig::allowPartial it goes on
-        // without what the exception was about. `tileIndex`: the tile that it was about, if it was about one; the error
-        // will name it. From any thread.
+        // Makes the frame fail on all ranks, with the text of this exception. `tileIndex`: the tile that it concerns,
+        // which the error names, or -1. With FrameConfig::allowPartial the frame goes on without that tile. Any thread.
+        // Waits for nothing.
         void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(reason, tileIndex); }
 
-        // Makes the frame fail on all ranks with ErrorKind::Cancelled: nobody needs it any more. end() is called all
-        // the same; tiles that are set meanwhile are dropped, those that come late counted. From any thread, also
-        // during end() or after it, when it does nothing.
+        // Makes the frame fail on all ranks with ErrorKind::Cancelled, because nobody needs it any more. Call end() all
+        // the same. Tiles that are set later are dropped. Does nothing after end(). Any thread, also during end().
+        // Waits for nothing.
         void cancel() const { engine_->cancel(number_); }
 
-        // Collective; for several framebuffers, in the same order on all ranks. This rank's last setTile() must have
-        // returned by then: what has not been sent when all ranks are in end() counts as missing. Waits until all tiles
-        // of all ranks are finished and the image is complete on the display rank, or the frame has failed, as it does
-        // when nothing is under way that could complete it (MissingInput). Throws FrameError, the same
-        // on every rank, or TransportError; in both cases the frame is over, and after a FrameError the framebuffer can
-        // begin the next. Throws InvalidArgument on a thread that may not call MPI (see Progress): the frame is still
-        // open then.
+        // Ends the frame. Collective; with several framebuffers, in the same order on all ranks. This rank's last
+        // setTile() must have returned: an input that is not sent when all ranks are in end() counts as missing. Waits
+        // until all tiles of all ranks are finished and the display rank has the image, or until the frame has failed.
+        // It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput). Throws FrameError,
+        // the same on every rank, or TransportError; the frame is over then, and after a FrameError the next may begin.
+        // Throws InvalidArgument on a thread that may not call MPI (see Progress); the frame is still open then.
         FrameReport end()
         {
             engine_->requireProgress();
@@ -208,17 +209,17 @@ public:
         }
 
         // Whether end() would return without waiting for other ranks: the frame is complete everywhere, or has failed.
-        // For programs that have something else to do meanwhile, such as a window: call it again and again, then end().
-        // Waits for nobody. The first call begins the end of the frame on this rank, as end() does: this rank's last
-        // setTile() must have returned. Moves messages where no thread does, and keeps FrameConfig::timeout. A frame
-        // that timed out or is partial may still take a moment in end(). Throws InvalidArgument as end() does.
+        // For programs that do something else meanwhile, such as a window: call it again and again, then end(). The
+        // first call begins the end of the frame on this rank, so this rank's last setTile() must have returned. Moves
+        // messages if no thread does, and keeps to FrameConfig::timeout. Waits for nothing. end() may still take a
+        // moment if the frame timed out or is partial. Throws InvalidArgument as end() does.
         bool isDone()
         {
             engine_->requireProgress();
             return engine_->isDone();
         }
 
-        // end() if isDone(), otherwise nothing. Throws what end() throws.
+        // Ends the frame if isDone(); otherwise returns nothing. Waits for nothing. Throws what end() throws.
         std::optional<FrameReport> tryEnd() { return isDone() ? std::optional<FrameReport>(end()) : std::nullopt; }
 
     private:
@@ -242,21 +243,23 @@ public:
         bool isOpen_ = true;
     };
 
-    // Collective. Throws InvalidArgument on every rank if the configuration is wrong on any or differs between ranks,
+    // Makes a connection over the communicator and a framebuffer on it. Collective. Waits for all ranks. Throws
+    // InvalidArgument on every rank if the configuration is wrong on any rank or differs between ranks, and
     // TransportError if the transport cannot be used.
     DistributedFrameBuffer(const Communicator& communicator, Config config, PixelOp pixelOp = {})
         : DistributedFrameBuffer(communicator, std::move(config), NetworkConfig(), std::move(pixelOp))
     {
     }
 
-    // The same with a network configuration, for the connection of this framebuffer alone.
+    // Does so with a network configuration of your own.
     DistributedFrameBuffer(const Communicator& communicator, Config config, NetworkConfig network, PixelOp pixelOp = {})
         : DistributedFrameBuffer(connect<Transport>(communicator, std::move(network)), std::move(config),
                                  std::move(pixelOp))
     {
     }
 
-    // The same over a connection that several framebuffers share; they are made in the same order on all ranks.
+    // Makes a framebuffer on a connection, which several may share. All ranks make them in the same order. Collective;
+    // waits and throws as above.
     DistributedFrameBuffer(std::shared_ptr<Connection> connection, Config config, PixelOp pixelOp = {})
         : connection_(std::move(connection))
     {
@@ -276,7 +279,7 @@ public:
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
     DistributedFrameBuffer& operator=(const DistributedFrameBuffer&) = delete;
 
-    // Collective. No frame may be open.
+    // Collective. No frame may be open. Waits for all ranks.
     ~DistributedFrameBuffer() = default;
 
     int rank() const noexcept { return engine().rank(); }
@@ -288,35 +291,31 @@ public:
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well or partial. It is there until that frame's
-    // memory is needed again: until as many begin() after the frame's own as there may be frames in flight. After that,
-    // and before the first such frame, it is empty, as it always is elsewhere. By the thread that begins and ends
-    // frames, as the next two.
+    // On the display rank: the image of the last frame that ended well or partial. It is valid until its memory is
+    // needed again: until begin() has been called config.framesInFlight times after the begin() of its frame. Before
+    // the first frame, after that, and on other ranks it is empty. By the thread that begins and ends frames.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
-    // Collective, outside frames. Returns a copy of the display rank's image() on every rank; empty if that is. For
-    // programs in which every rank shows or stores the image. Waits for all ranks; the bytes of the image go along a
-    // tree of the ranks. Throws OutOfMemory, TransportError.
+    // Returns a copy of the display rank's image() on every rank; empty if that is. Its bytes go along a tree of the
+    // ranks. Collective, outside frames. Waits for all ranks. Throws OutOfMemory, TransportError.
     Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(); }
 
-    // Which frame image() is of, as in FrameReport::frame; -1 if it is empty.
+    // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
 
-    // On the display rank: whether image() has that tile. It has all of a frame that ended well, see
-    // FrameConfig::allowPartial.
+    // On the display rank: whether image() has that tile. After a frame that ended well it has all; see
+    // FrameConfig::allowPartial. Thread as above.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
-    // With Progress::Caller, moves messages, unless on a thread that may not be in MPI; with an executor that has no
-    // workers, runs the tasks that wait. True if there was anything. Call it now and then while rendering what takes
-    // long (setTile() does it, too), so that compositing goes on meanwhile, and no other rank waits in vain for what
-    // this one has to say. Otherwise there is no need to. Waits for nothing.
+    // Moves messages with Progress::Caller, if this thread may call MPI, and runs waiting tasks if the executor has no
+    // workers. Returns whether there was anything to do. Call it now and then during long work without setTile(), so
+    // that compositing goes on and other ranks need not wait. In all other cases there is no need to. Any thread. Waits
+    // for nothing.
     bool poll() { return engine().poll(); }
 
-    // Begins a frame. Every rank calls it with the same parameters, at its own time: no rank waits for another. Throws
-    // InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` cannot be. Frames begin
-    // and end in the same order on all ranks, and with several in flight also each begin() before or after the same
-    // end(): setTile() may wait for room that a rank makes only when it has begun that frame, too. The oldest must end
-    // before one too many begins.
+    // Begins a frame. Every rank calls it, with an equal `params`. All ranks call begin() and end() in the same order,
+    // because setTile() may wait for room that another rank makes only when it has begun that frame. Waits for no other
+    // rank. Throws InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` cannot be.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
@@ -327,9 +326,9 @@ public:
         return Frame(this, &engine);
     }
 
-    // Collective, outside frames. Images have this size from now on; image() is empty until the next frame has ended.
-    // Operations begin anew, and frames are numbered from 1 again. Throws InvalidArgument, with nothing changed: on
-    // this rank if a frame is open, on all ranks if the size cannot be or differs.
+    // Changes the size of the image. image() is empty until the next frame has ended, operations begin anew, and frames
+    // are numbered from 1 again. Collective, outside frames. Waits for all ranks. Throws InvalidArgument, with nothing
+    // changed: on this rank if a frame is open, on all ranks if the size cannot be or differs between ranks.
     void resize(int width, int height)
     {
         for (const auto& engine : engines_)
@@ -343,15 +342,17 @@ public:
 
     using Reduce = dfb::Reduce;
 
-    // Collective, outside frames: combines `values` element by element over all ranks; the result is the same
-    // everywhere; a sum that is too large wraps around. For a user's own figures, or to agree on whether all ranks
-    // could load their data. Throws InvalidArgument on every rank if their numbers of values differ.
+    // Combines `values` element by element over all ranks, and returns the result on all. A sum that is too large wraps
+    // around. For figures of your own, or to agree on whether all ranks could load their data. Collective, outside
+    // frames. Waits for all ranks. Throws InvalidArgument on every rank if the numbers of values differ, and
+    // TransportError.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
         return engine().allReduce(values, how);
     }
 
-    // Collective, outside frames: the bytes of each rank, by rank, on all ranks.
+    // Returns the bytes of each rank, by rank, on all ranks. Collective, outside frames. Waits for all ranks. Throws
+    // TransportError.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
     {
         return engine().allGather(bytes);

@@ -131,8 +131,8 @@ public:
         return row;
     }
 
-    // The same without the channels beyond colour and depth, which are left as they are; false if the row has no
-    // pixels. To be followed by advance(row).
+    // Goes to the next row, of colour and depth alone: the other channels of `result` stay as they are. Returns false
+    // if the row has no pixels. advance(row) must follow.
     bool next(FragmentRow& result)
     {
         const int row = row_++;

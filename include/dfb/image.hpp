@@ -256,8 +256,8 @@ inline int ditherUnorm8(float value, double threshold) noexcept
     return below + (scaled - below > threshold ? 1 : 0);
 }
 
-// The same for an sRGB level. The way is that of light, so that the mean is right for an eye that sees no single pixel;
-// in levels it differs by less than 1/128.
+// The sRGB level at or below `value`, or the next if it is more than `threshold` of the way there. The way is measured
+// in light, so that the mean is right for an eye that sees no single pixel; in levels it differs by less than 1/128.
 inline int ditherSrgb8(float value, double threshold)
 {
     static const std::array<double, 256> light = [] {

@@ -88,8 +88,8 @@ public:
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
     const FrameBufferConfig& config() const noexcept { return engine_->config(); }
 
-    // Whether image() has its lowest row first, as OpenGL takes it; not so at first. The same on all ranks, and not
-    // while a picture is open.
+    // Sets whether image() has its lowest row first, as OpenGL takes it. The default is its top row. All ranks must
+    // give the same, while no picture is open.
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
     // Collective. Makes one picture of the images of all ranks; start() and end() in one. `place` is for

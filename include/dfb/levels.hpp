@@ -29,7 +29,7 @@ inline std::uint8_t toUnorm8(double value) noexcept
     return static_cast<std::uint8_t>(static_cast<int>((clamped * 255.0 + shift) - shift));
 }
 
-// The same for a value that is known to about 100 bits. What is nearer to a tie than that is one.
+// Rounds a value that is known to about 100 bits. A value that is nearer to a tie than that counts as the tie.
 inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
 {
     if (!(value.high > 0.0))
@@ -63,9 +63,9 @@ inline const std::array<double, 255>& srgbThresholds()
     return table;
 }
 
-// The same thresholds by the upper bits of the value: its exponent from 2^-13 on and 7 bits of the mantissa are its
-// cell. No cell has more than one threshold, and none is near a cell's edge, so that one comparison decides and the
-// cell's own threshold is the only one that the value can be near to. Of a table of 13 * 128 + 1 cells.
+// The thresholds as a table by the upper bits of the value: the exponent from 2^-13 on and 7 bits of the mantissa give
+// one of 13 * 128 + 1 cells. No cell has more than one threshold, and none is near a cell's edge. So one comparison
+// decides, and a value can be near to the threshold of its own cell only.
 class SrgbCells {
 public:
     static constexpr std::uint32_t first = 114u << 7;  // the upper 16 bits of 2^-13, below the first threshold
@@ -240,7 +240,7 @@ inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexc
     return farthest;
 }
 
-// The same of float.
+// Rounds floats.
 inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexcept
 {
     constexpr int block = 64;
@@ -254,7 +254,8 @@ inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexce
     return farthest;
 }
 
-// The same of `count` pixels, with sRGB levels but for alpha. A colour that is near a threshold counts as a tie.
+// Makes sRGB levels of the colours of `count` pixels, and linear ones of their alpha. A colour that is near a threshold
+// counts as a tie.
 template <class Real>
 double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
 {

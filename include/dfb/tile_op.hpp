@@ -52,7 +52,7 @@
 
 namespace dfb {
 
-// What a TileOp is told of the tile and the frame.
+// What newFrame() is told of the tile and the frame.
 struct TileInfo {
     int rank = 0; // that owns the tile
     std::int64_t frame = 0;
@@ -127,8 +127,8 @@ public:
         return farthest;
     }
 
-    // The same for pixels [x, x + count) of the row, of an image with colour and depth at most, and not dithered; every
-    // pixel must be set once.
+    // Sets pixels [x, x + count) of row y, in place of setRow(), in an image without dithering and without auxiliary
+    // channels. Every pixel must be set once.
     double setPixels(int x, int y, int count, const double* rgba, const float* depth)
     {
         const std::size_t first = pixelAt(x, y);
@@ -138,7 +138,8 @@ public:
         std::byte* color = to_.at[detail::Color];
         return color ? convertPixels(rgba, count, format_, color + first * bytesPerPixel(format_)) : 0;
     }
-    // The same without depth, for floats, which are rounded as they are: the exact values, but for -0, which becomes 0.
+    // Sets the colour of pixels [x, x + count) of row y from floats, which a float image gets as they are; -0 becomes
+    // 0.
     void setPixels(int x, int y, int count, const float* rgba)
     {
         overwrites(x, y, count);
@@ -154,8 +155,8 @@ public:
         for (int i = 0; i < 4 * count; ++i)
             out[i] = rgba[i] + 0.0f;
     }
-    // The same with the background, as it is stored: bytesPerPixel(format()) bytes. Depth becomes +infinity. What is
-    // known to be the background already is not written.
+    // Sets pixels [x, x + count) of row y to the background, which is given as it is stored: bytesPerPixel(format())
+    // bytes. Depth becomes +infinity. Pixels that are known to be background already are not written.
     void fillPixels(int x, int y, int count, const std::byte* stored)
     {
         if (background_)
@@ -165,9 +166,9 @@ public:
     }
     std::int64_t writtenPixels() const noexcept { return writtenPixels_; }
 
-    // What setRow() has made of a row; null if the colour is not wanted.
+    // The stored colour of row y, after setRow(); null if colour is not wanted.
     const std::byte* colorRow(int y) const noexcept { return rowOf(detail::Color, bytesPerPixel(format_), y); }
-    // The same of depth, and of the auxiliary channels.
+    // The stored depth and auxiliary channels of row y, after setRow(); null where not wanted.
     const float* depthRow(int y) const noexcept { return detail::floatsOf(rowOf(detail::Depth, y)); }
     AuxRow auxRow(int y) const noexcept
     {
@@ -176,7 +177,7 @@ public:
                 detail::idsOf(rowOf(detail::InstanceId, y))};
     }
 
-    // For 8-bit formats, after setRow(): another level for value i in [0, 4 * width()) of row y.
+    // Replaces value i in [0, 4 * width()) of row y by another 8-bit level, after setRow().
     void setLevel(int y, int i, std::uint8_t level)
     {
         const std::size_t pixel = static_cast<std::size_t>(y) * stride_;

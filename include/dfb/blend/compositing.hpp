@@ -31,7 +31,7 @@ struct FrontId {
     bool isThere() const noexcept { return id != noId; }
 };
 
-// The same for a position. No depth of a layer is NaN.
+// The position of the nearest layer, and its depth; NaN before the first. No layer has a depth of NaN.
 struct FrontPosition {
     float at[3] = {0, 0, 0};
     float depth = std::numeric_limits<float>::quiet_NaN();
@@ -163,8 +163,8 @@ inline bool closeOpaque(CompositeRow& row, int x, int count)
     return t[0] == 0.0 && std::all_of(t, t + count, [](double value) { return value == 0.0; });
 }
 
-// The same for the auxiliary channels that `row` has; to be called before over(), of which it needs what was there
-// before. `aux`: of the first pixel. `anyAlpha`: pixels with alpha 0 have position and ids as well.
+// Blends the auxiliary channels that `row` has. Call it before over(), since it needs the alpha from before. `aux`: of
+// the first pixel. `anyAlpha`: pixels with alpha 0 have position and ids as well.
 inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux,
                     bool anyAlpha = false)
 {
@@ -262,7 +262,7 @@ inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::
             takeNearest(nearest, end - begin, l.color, l.depth);
 }
 
-// The same with all that a row may have.
+// Blends all channels that a row may have.
 inline void blendFully(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                        const std::vector<int>& order)
 {

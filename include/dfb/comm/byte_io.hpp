@@ -112,13 +112,13 @@ public:
         const std::byte* from = take(count);
         std::copy(from, from + count, to);
     }
-    // The same when any are.
+    // Throws Error (MalformedMessage) when bytes are left.
     void end() const
     {
         if (left_ > 0)
             fail("a control message is too long", 0);
     }
-    // And when what was read cannot be.
+    // Throws Error (MalformedMessage) unless what was read can be.
     void require(bool canBe) const
     {
         if (!canBe)

@@ -1,5 +1,5 @@
-// Mailbox: the messages of one object on all ranks: an inbox that is emptied by tasks, messages with and without
-// credit, reductions, and waiting without spinning.
+// Mailbox: sends and receives the messages of one object that exists on all ranks, such as a framebuffer. Tasks of the
+// executor empty its inbox. It has messages with and without credit, reductions, and waiting without spinning.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -28,17 +28,17 @@
 
 namespace dfb::detail {
 
-// What the messages are handed to; it knows what they mean.
+// The object that the messages are for.
 class MailboxOwner {
 public:
-    // In a task; several at once, in any order. Reductions come here too, to be let through with receiveReduction();
-    // but for those of reduce().
+    // Takes a message. Called in tasks, for several messages at once and in any order. Messages of reductions come
+    // here, too, and are passed on to receiveReduction(); those of reduce() do not.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    // A message of whatever kind, perhaps not even for this object: what it cannot fail for, it leaves to
-    // keepDamage().
+    // Is told of a message that could not be read. Nobody knows its kind, or for whom it was. If this cannot make a
+    // frame fail, it calls keepDamage().
     virtual void undecodable(int source, const ErrorInfo& error) = 0;
-    virtual void work(int) {} // what submitWork() was given
-    virtual void polled() {}  // messages have moved while this rank waits and nobody else would move them
+    virtual void work(int) {} // runs the work of submitWork(number), in a task
+    virtual void polled() {}  // called by wait() after it has moved messages itself
 
 protected:
     ~MailboxOwner() = default;
@@ -48,7 +48,7 @@ class Mailbox final : private MessageReceiver {
 public:
     using Bytes = ReductionTable::Bytes;
     using Clock = std::chrono::steady_clock;
-    // Of reduce(), and of rounds that only look whether anything is under way; the handler uses others as well.
+    // The scopes of reduce(), and of rounds that check whether anything is under way. The handler has others.
     static constexpr std::uint32_t ownScope = 0, quietScope = ~std::uint32_t{0};
 
     // `poolBytes`: see FlowControl.
@@ -68,15 +68,15 @@ public:
                           sendReduction(to, key, up, bytes);
                       })
     {
-        inbox_.reserve(256); // how many wait at once depends on time: mostly no more
+        inbox_.reserve(256); // usually no more wait at once
     }
 
-    // From here on the handler is called. Collective, in the same order for all objects of a connection.
+    // Begins to call the handler. Collective, in the same order for all objects of a connection.
     void start() { connection_->attach(*this, address_); }
 
     ~Mailbox() { stop(); }
 
-    // Afterwards the handler is not called any more.
+    // Ends the calls of the handler, and waits for those under way.
     void stop()
     {
         connection_->detach(address_);
@@ -98,7 +98,7 @@ public:
     Connection& connection() noexcept { return *connection_; }
     Executor& executor() const noexcept { return *executor_; }
 
-    // Credits are counted from here again; see FlowControl. No message with credit may be in a task.
+    // Begins to count credit anew; see FlowControl. No message with credit may be in a task.
     void newEpoch(std::int64_t number)
     {
         epoch_ = number;
@@ -107,7 +107,7 @@ public:
     }
     FlowControl& flow() noexcept { return flow_; }
 
-    // Messages that say little pass at once; from any thread; to this rank as well.
+    // Sends a small message at once, without credit; also to this rank itself. Any thread.
     void send(int destination, Buffer&& message)
     {
         if (destination == rank()) {
@@ -127,7 +127,7 @@ public:
         send(destination, makeMessage(*connection_->pool(), header, body.data(), body.size()));
     }
 
-    // The same with a body of plain bytes.
+    // Sends a message whose body is a trivially copyable struct.
     template <class Body>
     void sendBody(int destination, MessageKind kind, std::int64_t number, const Body& body)
     {
@@ -136,7 +136,7 @@ public:
         send(destination, kind, number, Bytes(first, first + sizeof body));
     }
 
-    // Messages that carry pixels need credit of their receiver, and are kept until they have it. Never blocks.
+    // Sends a message with pixels. It needs credit of its receiver, and is kept here until it has it. Never blocks.
     void sendWithCredit(int destination, Buffer&& message)
     {
         if (destination == rank()) {
@@ -151,10 +151,10 @@ public:
         return kind == MessageKind::Fragment || kind == MessageKind::FinishedTiles;
     }
 
-    // Returns when what this rank has sent, and nobody has taken out of an inbox yet, is no more than a pool, or
-    // `over()`. Runs waiting tasks meanwhile, so that ranks that wait for each other's inboxes get on. On a thread that
-    // could not make progress it returns at once. False if nobody takes anything for as long as `limit`, unless that is
-    // 0.
+    // Waits until the messages that this rank has sent, and that nobody has taken out of an inbox yet, have no more
+    // than poolBytes, or until over(). Runs waiting tasks meanwhile, so that ranks that wait for each other get on.
+    // Returns at once on a thread that cannot make progress. Returns false if nobody takes anything for as long as
+    // `limit`, unless that is 0.
     bool waitForRoom(FunctionRef<bool()> over, std::chrono::milliseconds limit)
     {
         std::size_t before = flow_.underWay();
@@ -185,23 +185,23 @@ public:
         return true;
     }
 
-    // For calls that wait, before anything has happened: throws InvalidArgument on a thread that could not make the
-    // progress that it would wait for.
+    // Throws InvalidArgument on a thread that cannot make the progress that it is going to wait for. Calls that wait
+    // begin with it.
     void requireProgress() const
     {
         if (connection_->needsCaller() && !connection_->mayPoll())
             failArgument("at this thread level of MPI calls that wait belong to the thread that initialised it");
     }
 
-    // Takes note that this message of the epoch has been taken.
+    // Counts a message of the epoch as taken.
     void countTaken(int source, const MessageHeader& header, const Buffer& message)
     {
         if (source != rank() && carriesOn(header.kind, message))
             ++takenOn_;
     }
 
-    // The messages of the epoch that make who takes them do something, at a moment at which this object rests: no task
-    // of it is queued or runs, and nothing waits to be sent. Nothing if it does not rest.
+    // Returns how many messages of the epoch have been sent and taken, of those that make their receiver do something.
+    // Returns nothing unless this object rests: no task of it is queued or runs, and nothing waits to be sent.
     std::optional<MessageCounts> countsAtRest()
     {
         const MessageCounts counts{sentOn_, takenOn_};
@@ -212,10 +212,11 @@ public:
         }
         if (!flow_.allSent() || !connection_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
             return std::nullopt;
-        return counts; // they were these when there was no task
+        return counts; // they did not change while there was no task
     }
 
-    // Takes a message about credit of the current epoch. False if it is none. Throws Error (MalformedMessage).
+    // Takes a message about credit of the current epoch. Returns false if it is another one. Throws Error
+    // (MalformedMessage).
     bool receiveCredit(int source, const MessageHeader& header, const Buffer& message)
     {
         if (header.kind == MessageKind::CreditRequest)
@@ -227,7 +228,7 @@ public:
         return true;
     }
 
-    // Message bytes and messages to other ranks since the start.
+    // Bytes and number of the messages to other ranks since the start.
     std::int64_t bytesSent() const noexcept { return bytesSent_; }
     std::int64_t messagesSent() const noexcept { return messagesSent_; }
 
@@ -241,7 +242,7 @@ public:
         });
     }
 
-    // The same for the handler's work(number); takes no memory.
+    // Runs the handler's work(number) on the executor. Allocates nothing.
     void submitWork(int number)
     {
         submitToExecutor([this, number] {
@@ -252,7 +253,7 @@ public:
 
     ReductionTable& reductions() noexcept { return reductions_; }
 
-    // What a ReduceUp or ReduceDown message belongs to, and what it brings.
+    // The key and the bytes of a ReduceUp or ReduceDown message.
     static ReductionKey keyOf(const MessageHeader& header, const Buffer& message)
     {
         return {scopeOf(message), header.number};
@@ -267,8 +268,8 @@ public:
         reductions_.receive(source, keyOf(header, message), header.kind == MessageKind::ReduceUp, bytesOf(message));
     }
 
-    // Nobody knows what a message was that could not be read. Where it may have been for what this rank has not begun
-    // yet, that fails: the next frame, which takes this, or the next reduce().
+    // Keeps the error of a message that could not be read. It may have been for something that this rank has not begun
+    // yet, which then fails: the next frame, or the next reduce().
     void keepDamage(int source, const ErrorInfo& error)
     {
         const std::lock_guard<std::mutex> lock(damageMutex_);
@@ -280,7 +281,7 @@ public:
         return std::exchange(damage_, std::nullopt);
     }
 
-    // For a message of rank `source` that nothing goes on without.
+    // Ends the connection because of a message of rank `source` without which nothing can go on.
     void giveUp(int source, ErrorInfo error)
     {
         error.rank = rank();
@@ -288,7 +289,7 @@ public:
         connection_->giveUp(error);
     }
 
-    // Wakes those in wait(), to ask again.
+    // Makes all threads in wait() check their condition again.
     void notify()
     {
         {
@@ -298,8 +299,8 @@ public:
         connection_->interrupt();
     }
 
-    // Waits until `ready()`, which must not lock what is held while calling notify(); makes progress if that is the
-    // caller's business. False if `deadline` has passed before. Throws TransportError.
+    // Waits until ready(), which must not take a lock that a caller of notify() holds. Moves messages if no thread
+    // does. Returns false if `deadline` passes before. Throws TransportError.
     bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
         const auto over = [&] { return failed() || ready(); };
@@ -320,7 +321,8 @@ public:
                 lock.lock();
             }
         } else {
-            // Also when all is over what was just queued must leave, such as a result for ranks below in the tree.
+            // Messages that were just queued must leave also when this is over, such as results for ranks below in the
+            // tree.
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
                 if (!executor_->help() && !connection_->poll() && !over())
@@ -336,9 +338,9 @@ public:
         return isReady;
     }
 
-    // Collective: combines `own` over all ranks and waits for the result. Throws TransportError, also when a message
-    // could not be read that may have been a part of this: when there is no result after a second, or `peerTimeout`
-    // if it came before this rank was here; InvalidArgument, see requireProgress().
+    // Combines `own` over all ranks, and returns the result. Collective. Waits for all ranks. Throws InvalidArgument as
+    // requireProgress() does, and TransportError; also if a message could not be read that may have been a part of
+    // this, and there is no result within a second, or within peerTimeout if the message came before this call.
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
         requireProgress();
@@ -372,7 +374,8 @@ public:
         return result->bytes;
     }
 
-    // Collective: combines `values` element by element. Throws InvalidArgument on all ranks if their numbers differ.
+    // Combines `values` element by element over all ranks. Collective. Throws InvalidArgument on all ranks if the
+    // numbers of values differ.
     template <class Operation>
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
     {
@@ -394,7 +397,7 @@ public:
         return reduced;
     }
 
-    // Collective: what each rank has given, by rank. The numbers of bytes may differ.
+    // Returns the bytes of each rank, by rank; their numbers may differ. Collective.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
     {
         ByteWriter out; // of each rank: which it is, the size, the bytes
@@ -448,8 +451,8 @@ private:
         return damage_.has_value();
     }
 
-    // For a moment a waiting thread does by itself what those do that would otherwise have to be woken, each of which
-    // may wait for a core then. Gives up when nothing has come for some time, or when others need the core.
+    // For a moment a waiting thread runs tasks and moves messages itself: threads that it would have to wake may wait
+    // for a core. Gives up when nothing has come for some time, or when others need the core.
     void waitAwake(FunctionRef<bool()> over)
     {
         if (!connection_->hasProgressThread())
@@ -478,7 +481,7 @@ private:
             ++tasks_;
         }
         executor_->submit(std::move(task));
-        if (!executor_->hasWorkers()) // whoever waits is to run it
+        if (!executor_->hasWorkers()) // a thread that waits runs it
             notify();
     }
 
@@ -486,7 +489,7 @@ private:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         --tasks_;
-        if (isEnding_) // others wait for what tasks do, and are told
+        if (isEnding_) // otherwise nobody waits for the end of a task itself
             changed_.notify_all();
     }
 
@@ -498,7 +501,8 @@ private:
             ++sentOn_;
     }
 
-    // Whether a message makes who takes it do something for its frame. Credit does so only for what waits for it.
+    // Whether a message makes its receiver do something for its frame. Credit does not: it only lets waiting messages
+    // go, which count themselves.
     static bool carriesOn(MessageKind kind, const Buffer& message)
     {
         switch (kind) {
@@ -540,7 +544,7 @@ private:
         enqueue(source, header, std::move(message));
     }
 
-    // A message only goes into the inbox here; a task takes it out.
+    // Puts a message into the inbox; a task takes it out.
     void enqueue(int source, const MessageHeader& header, Buffer&& message)
     {
         {
@@ -570,14 +574,14 @@ private:
                 }
             }
         } catch (const Error& e) {
-            giveUp(a.source, e.info()); // nothing goes on without it
+            giveUp(a.source, e.info()); // a rank waits for this reduction in any case
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
-    // Of reductions of reduce(): this rank is at the last one that it has begun, and who is at the next one has got the
-    // result of that through this rank.
+    // Checks the number of a message of reduce(). It belongs to the last one that this rank has begun, or to the next
+    // if this rank has passed on the result of the last.
     void requireCanBe(const MessageHeader& header)
     {
         const std::int64_t begun = reductionCount_, number = header.number;

@@ -1,51 +1,51 @@
-// The contract of a transport: how bytes get from rank to rank. A transport is passive: whoever needs progress
-// calls poll(). It knows nothing of tiles.
+// The contract of a transport: how bytes get from rank to rank. A transport is passive: it makes progress only when
+// somebody calls poll(). It knows nothing of tiles.
 //
-//   using Communicator = ...;                    what a user has: a group of ranks, and which of them is this one
-//   static constexpr const char* name;           for reports
+//   using Communicator = ...;                   what a program has: a group of ranks, and which of them this one is
+//   static constexpr const char* name;          for reports
 //   T(const Communicator&, std::shared_ptr<MemoryPool>, Progress);
-//                                                collective over the communicator; messages of two transports on one
-//                                                communicator do not mix; throws TransportError
+//                                               collective over the communicator. Messages of two transports on one
+//                                               communicator do not mix. Throws TransportError
 //   int rank() const; int size() const;
-//   bool needsPolling() const;                   false: messages are delivered without poll()
-//   bool mayPoll() const;                        whether the calling thread may call poll()
-//   bool wakesOnArrival() const;                 nap() ends by itself when a message has come that needs poll(), from
-//                                                whichever rank; a few polls may be needed to bring it
-//   void start(TransportHandler&);               from here on the handler is called
-//   void send(int destination, Buffer&&);        after start(); any thread; never blocks; destination is another rank;
-//                                                reliable, in any order; of any size, 0 included. To a rank that has
-//                                                stopped: nothing happens
-//   bool poll();                                 between start() and stop(), one thread at a time; never blocks; moves
-//                                                what can be moved; true if something was; calls the handler
-//   bool quiet() const;                          any thread; nothing waits to be sent: what was sent arrives although
-//                                                this rank polls no more
-//   void nap(std::chrono::nanoseconds limit);    the thread that polls; sleeps until poll() has something to send,
-//                                                interrupt() is called, or `limit` has passed
-//   void interrupt();                            any thread; ends the nap under way, else the next one
-//   void stop(bool orderly);                     once, after start(), when no thread is in another member; afterwards
-//                                                the handler is not called. Orderly: this rank expects nothing more;
-//                                                what it has sent still reaches the ranks that have not called stop().
-//                                                May wait until all ranks have called it or the handler has failed().
-//                                                Else: waits for nobody; other ranks may get fail(), and what was under
-//                                                way may be lost
+//   bool needsPolling() const;                  false: messages are delivered without poll()
+//   bool mayPoll() const;                       whether the calling thread may call poll()
+//   bool wakesOnArrival() const;                whether nap() ends when a message arrives that needs poll(). A few
+//                                               polls may be needed to deliver it
+//   void start(TransportHandler&);              from now on the handler may be called
+//   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks. To another rank. Messages
+//                                               arrive once, in any order; they may have any size, also 0. A message to
+//                                               a rank that has stopped is dropped
+//   bool poll();                                between start() and stop(), one thread at a time. Never blocks. Sends
+//                                               and receives what it can, and calls the handler. Returns whether there
+//                                               was anything
+//   bool quiet() const;                         any thread. Nothing waits to be sent: all messages will arrive although
+//                                               this rank does not poll any more
+//   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until there is something to send,
+//                                               interrupt() is called, or `limit` has passed
+//   void interrupt();                           any thread. Ends the nap under way, or else the next one
+//   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
+//                                               the handler is not called. Orderly: this rank expects no more messages;
+//                                               what it has sent reaches all ranks that have not called stop(); it may
+//                                               wait until all ranks have called it or the handler has failed(). Not
+//                                               orderly: it waits for nobody; other ranks may get fail(), and messages
+//                                               under way may be lost
 //
-// And, if other ranks can see memory of this one (see comm/mpi_transport.hpp):
-//   bool lendsTo(int other) const;  std::int32_t placeOf(const std::byte* block) const;
+// Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp):
+//   bool lendsTo(int other) const;              std::int32_t placeOf(const std::byte* block) const;
 //   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
 //
-// And, if a thread of the library's own may not always poll (without this it always may):
+// Optional, if a thread of the library's own may not always poll:
 //   static bool mayHaveThread(const Communicator&);
-//                                                whether the constructor accepts Progress::Thread on this rank; never
-//                                                throws. Progress::Auto becomes Thread or Caller by it, so that the
-//                                                constructor gets no Auto
+//                                               whether the constructor takes Progress::Thread on this rank. Never
+//                                               throws. It makes Thread or Caller of Progress::Auto, which the
+//                                               constructor never gets
 //
-// And, if it knows (without this a rank has its processors for itself):
-//   int sharingRanks() const;                    how many ranks may run on processors that this one may run on, this one
-//                                                included
+// Optional, if ranks may share processors:
+//   int sharingRanks() const;                   how many ranks, this one included, may run on this rank's processors
 //
-// And, if it can end the job of which the ranks are processes:
-//   void abort(const std::string& text);         between start() and stop(), or in waiting(), on the thread that polls;
-//                                                says why on standard error and ends all ranks; does not return
+// Optional, if it can end the job whose processes the ranks are:
+//   void abort(const std::string& text);        between start() and stop(), or in waiting(), on the thread that polls.
+//                                               Prints why on standard error and ends all ranks. Does not return
 //
 // Messages may outlive the transport.
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
@@ -66,33 +66,33 @@
 
 namespace dfb {
 
-// Who calls poll() of a transport that needs it. Ranks may differ.
+// Which thread moves messages. Ranks may differ.
 enum class Progress {
-    // Thread where the transport allows it, else Caller: with MPI the thread level decides, on each rank.
+    // Thread if the transport allows it, else Caller. With MPI the thread level of each rank decides.
     Auto,
-    // A thread of the library's own. MPI must have been initialised with MPI_THREAD_MULTIPLE.
+    // A thread of the library's own. With MPI it needs MPI_THREAD_MULTIPLE.
     Thread,
-    // The calls of the user: DistributedFrameBuffer::poll(), Frame::setTile(), and those that wait (the constructor,
-    // Frame::end(), ...). Messages move only in those calls. At MPI_THREAD_SINGLE and MPI_THREAD_FUNNELED those that
-    // wait belong to the thread that initialised MPI; at MPI_THREAD_SERIALIZED no other thread may be in MPI meanwhile.
+    // The program's own threads: messages move in DistributedFrameBuffer::poll(), in Frame::setTile(), and in calls
+    // that wait, such as the constructor and Frame::end(). At MPI_THREAD_SINGLE and MPI_THREAD_FUNNELED only the thread
+    // that initialised MPI may make calls that wait; at MPI_THREAD_SERIALIZED no other thread may call MPI meanwhile.
     Caller
 };
 
-// Where a transport delivers. The calls are quick, never block, may come from any thread, and must not call the
-// transport.
+// Gets what a transport delivers. Its members are quick and never block. Any thread may call them. They must not call
+// the transport.
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;
     virtual void fail(const ErrorInfo& error) = 0; // the transport cannot go on
-    virtual bool failed() const = 0;               // it cannot, or another rank has said that it cannot
-    // Called over and over by a stop() that waits for other ranks, on its thread: here, alone, send() may be called.
+    virtual bool failed() const = 0;               // it cannot, or another rank has said so
+    // Called repeatedly by a stop() that waits for other ranks, on its thread. It may call send().
     virtual void waiting() {}
 
 protected:
     ~TransportHandler() = default;
 };
 
-// nap() and interrupt() for transports that have nothing better to sleep on.
+// nap() and interrupt() on a condition variable, for transports that have nothing better.
 class NapSignal {
 public:
     void nap(std::chrono::nanoseconds limit)
@@ -189,7 +189,7 @@ struct LimitsThreads<T, std::void_t<decltype(T::mayHaveThread(std::declval<const
     : std::true_type {
 };
 
-// What Progress::Auto is with this transport.
+// Thread or Caller for Progress::Auto.
 template <class T>
 Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communicator& communicator)
 {
@@ -245,9 +245,8 @@ constexpr bool checkTransport()
 
 } // namespace detail
 
-// Link: a transport of any type, behind one abstract class. What uses it is no template.
-//
-// Its members are those of the contract in comm/transport.hpp.
+// Link: a transport of any type behind an abstract class, so that its users are no templates. Its members are those of
+// the contract above.
 class Link {
 public:
     virtual ~Link() = default;
@@ -265,8 +264,7 @@ public:
     virtual void interrupt() = 0;
     virtual void stop(bool orderly) = 0;
 
-    // What a transport may leave out. Without it other ranks see no memory of this one, a rank has its processors for
-    // itself, and the job cannot be ended.
+    // The optional members. A transport without them lends no memory, shares no processors, and cannot end the job.
     virtual bool lendsTo(int other) const = 0;
     virtual std::int32_t placeOf(const std::byte* block) const = 0;
     virtual std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const = 0;

@@ -224,7 +224,7 @@ public:
         return isOpen;
     }
 
-    // The same for work of whichever frame is open.
+    // Enters whichever frame is open.
     bool enterAny()
     {
         const std::lock_guard<std::mutex> lock(mutex_);

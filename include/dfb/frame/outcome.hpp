@@ -87,7 +87,7 @@ public:
         return inTime;
     }
 
-    // The same where the frame cannot go on, whether or not it may be partial.
+    // Fails the frame, also if it may be partial, because it cannot go on.
     bool failWhole(const ErrorInfo& reason)
     {
         const OpenFrame::Failure failure = frame_.fail(placed(reason));

@@ -1,6 +1,6 @@
-// Verdict: what the one reduction per frame carries: whether any rank failed, and which error all ranks report;
-// and the figures of the frame that are sums or maxima over the ranks. Agreement: the same for what a framebuffer is
-// made with.
+// Verdict: the content of the reduction that ends each frame. It says whether any rank failed and which error all ranks
+// report, and has the figures of the frame that are sums or maxima over the ranks. Agreement: the content of the
+// reduction with which a framebuffer is made; it says whether all ranks have the same configuration.
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
@@ -30,7 +30,7 @@
 
 namespace dfb::detail {
 
-// An exception as a record; `where` fills in what the exception does not say.
+// Makes a record of an exception. `where` fills in what the exception does not say.
 inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& where)
 {
     ErrorInfo info;
@@ -59,7 +59,7 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     return info;
 }
 
-// An error that is about what has not come.
+// Whether an error says that something has not come.
 inline bool isMissing(ErrorKind kind) noexcept
 {
     return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
@@ -67,8 +67,8 @@ inline bool isMissing(ErrorKind kind) noexcept
 
 struct Verdict {
     std::optional<ErrorInfo> error;
-    FrameTerms terms;      // what begin() was given; the same on all ranks
-    std::string differing; // what of it is not, in words
+    FrameTerms terms;      // the parameters of begin(), which should be the same on all ranks
+    std::string differing; // which of them differ, in words
     enum Sum {
         BytesSent,
         MessagesSent,
@@ -80,17 +80,17 @@ struct Verdict {
         AlphaOutsidePixels, // outside [0, 1]
         CompressedLinks,
         InputsLeft,      // sent, less those that have come
-        TilesEndedEarly, // they needed no more, although more was to come
+        TilesEndedEarly, // finished before all their inputs had come
         sumCount
     };
     enum Maximum { PeakMemoryBytes, RenderNs, PeakInboxBytes, TotalNs, maximumCount };
     std::array<std::int64_t, sumCount> sums{};
     std::array<std::int64_t, maximumCount> maxima{};
     double wireErrorBound = 0;            // a maximum
-    std::vector<Figure> tileErrors;       // by tile; no two ranks have the same
+    std::vector<Figure> tileErrors;       // by tile; each tile is of one rank
     std::vector<Figure> figures;          // by key; sums
     std::vector<Figure> mergeErrors;      // by tile; sums
-    std::vector<std::int32_t> incomplete; // tiles that their owners have not finished, of a frame that may be partial
+    std::vector<std::int32_t> incomplete; // tiles of a partial frame that their owners have not finished
 
     SmallBytes bytes() const
     {
@@ -141,7 +141,7 @@ struct Verdict {
         return v;
     }
 
-    // Whether what it says of tiles is of tiles that there are.
+    // Whether all tiles that it names are in the image.
     bool fits(int tileCount) const
     {
         const auto count = static_cast<std::uint64_t>(tileCount);
@@ -150,7 +150,7 @@ struct Verdict {
                && std::all_of(incomplete.begin(), incomplete.end(), [=](auto tile) { return tile < tileCount; });
     }
 
-    // What is the same on all ranks.
+    // Sets the figures of `report` that are the same on all ranks.
     void addTo(FrameReport& report) const
     {
         report.bytesSent = sums[BytesSent];
@@ -177,7 +177,7 @@ struct Verdict {
         report.tilesIncomplete = static_cast<std::int64_t>(incomplete.size());
     }
 
-    // Two lists by key become one; values of the same key are added.
+    // Merges two lists that are ordered by key, and adds the values of equal keys.
     static std::vector<Figure> merged(const std::vector<Figure>& a, const std::vector<Figure>& b)
     {
         std::vector<Figure> all;
@@ -186,7 +186,7 @@ struct Verdict {
                    [](const Figure& x, const Figure& y) { return x.key < y.key; });
         return summed(std::move(all));
     }
-    // The same of one list that is ordered by key.
+    // Adds the values of equal keys in a list that is ordered by key.
     static std::vector<Figure> summed(std::vector<Figure> all)
     {
         std::size_t count = 0;
@@ -200,7 +200,7 @@ struct Verdict {
         return all;
     }
 
-    // `what`: "" as long as only this is known, that something differs.
+    // `what`: which parameters differ, or "" if only the hashes are known to differ.
     static ErrorInfo disagreement(const std::string& what = "")
     {
         ErrorInfo info;
@@ -210,8 +210,8 @@ struct Verdict {
         return info;
     }
 
-    // An input that its owner did not wait for, and that came too late, may have had its place taken by another. What
-    // comes to a tile that needs no more may be too late as well: then nothing can be said.
+    // The error of inputs that came when their tiles were finished: another input may have been taken in their place.
+    // Nothing can be said if a tile was finished early, since its inputs may be late, too.
     std::optional<ErrorInfo> strayInputs() const
     {
         const std::int64_t count = sums[TilesEndedEarly] == 0 ? sums[InputsLeft] : 0;
@@ -225,7 +225,7 @@ struct Verdict {
         return info;
     }
 
-    // How much an error says about why the frame failed.
+    // How much an error says about why the frame failed: more is better.
     static int weight(const ErrorInfo& e)
     {
         if (e.kind == ErrorKind::Cancelled)
@@ -235,8 +235,8 @@ struct Verdict {
         return !isMissing(e.kind) ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
-    // Of several errors, one that says most, if it can be also which rank is waited for, and the one of the lowest
-    // rank; of what is missing, all.
+    // Picks the error that all ranks report: the one that says most; of equal ones one that says which rank is waited
+    // for; then that of the lowest rank. Texts about missing inputs are joined.
     static ErrorInfo chosen(const ErrorInfo& a, const ErrorInfo& b)
     {
         constexpr std::size_t mostText = 2000;
@@ -261,7 +261,7 @@ struct Verdict {
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
         if (!a.differing.empty())
-            a.error = disagreement(a.differing); // whatever else came of it
+            a.error = disagreement(a.differing); // other errors follow from it
         for (std::size_t i = 0; i < a.sums.size(); ++i)
             a.sums[i] = static_cast<std::int64_t>(static_cast<std::uint64_t>(a.sums[i])
                                                   + static_cast<std::uint64_t>(b.sums[i]));
@@ -277,11 +277,11 @@ struct Verdict {
     }
 };
 
-// What one rank was made with, or what was wrong with it; combined, whether all are fine and alike.
+// The configuration of one rank, or what is wrong with it. Combined: whether all are right and the same.
 struct Agreement {
     bool fine = true;
     std::string text; // of Settings; or what is wrong
-    int rank = 0;     // whose; the lowest of those that are alike; -1 if what is wrong is that two differ
+    int rank = 0;     // the lowest rank that has it; -1 if two ranks differ
 
     // Names and values, a line each.
     class Settings {
@@ -342,7 +342,7 @@ struct Agreement {
         return {true, s.text(), rank};
     }
 
-    // Of a result that is not fine.
+    // The exception for a result that is not fine.
     [[noreturn]] void refuse() const
     {
         ErrorInfo info;
@@ -389,7 +389,7 @@ private:
     static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
     static constexpr char separator = '=';
 
-    // As few digits as tell it from all others.
+    // The fewest digits that give this value back.
     template <class Value>
     static std::string digitsOf(Value value)
     {
@@ -403,7 +403,7 @@ private:
         return digits;
     }
 
-    // Types are compared by the names that all compilers have for them, and shown as they are written.
+    // Types are compared by their mangled names, and shown demangled.
     static std::string readable(const std::string& name, const std::string& value)
     {
         if (name != tileOperation && name != pixelOperation)
@@ -413,7 +413,7 @@ private:
         return written ? written.get() : value;
     }
 
-    // What is not the same in both, in words.
+    // Which settings differ, in words.
     static std::string difference(const Agreement& a, const Agreement& b)
     {
         const auto as = settingsOf(a.text), bs = settingsOf(b.text);
@@ -441,8 +441,9 @@ private:
     }
 };
 
-// Collective. What all ranks were made with, or what is wrong. Then no rank returns before all know it: the first that
-// throws it may take the connection along, and who has not heard of the reason by then would get another error.
+// Finds out whether all ranks have the same configuration, and returns it, or what is wrong. Collective. If something
+// is wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
+// heard the reason by then would report another error.
 inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
 {
     const auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
@@ -450,7 +451,7 @@ inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
         try {
             mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
         } catch (const TransportError&) {
-            // So one has gone, which it does when all know.
+            // One rank has left already, so all know.
         }
     }
     return all;

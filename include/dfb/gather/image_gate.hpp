@@ -79,7 +79,7 @@ struct ImagePlaces {
     std::array<std::int32_t, channelCount> planes{};
 };
 
-// The same as pointers; null until it is known.
+// Gate and planes as pointers; null until they are known.
 struct SharedImage {
     ImageGate* gate = nullptr;
     Planes planes;

@@ -57,7 +57,7 @@ struct Moments {
     }
     // Mean over the channels of the variance of the samples, unbiased; 0 for fewer than 2.
     double variance() const noexcept { return count > 1 ? m2 / (4 * static_cast<double>(count - 1)) : 0; }
-    // The same of the mean: the square of its standard error.
+    // The variance of the mean: the square of its standard error.
     double varianceOfMean() const noexcept { return count > 1 ? variance() / static_cast<double>(count) : 0; }
 };
 

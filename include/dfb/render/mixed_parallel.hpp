@@ -215,7 +215,7 @@ struct MixedWork {
     }
 };
 
-// The same in a known order.
+// The work of an OrderedLoop: that of a MixedParallelLoop in a known order.
 struct OrderedWork : MixedWork {
     std::vector<int> place;             // of each brick, from the front
     std::vector<int> firstPair;         // of each tile, or -1
@@ -384,10 +384,10 @@ private:
     std::vector<TileInput> inputs_; // that this rank declares
 };
 
-// The same for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing and wait for no
-// manifest. What an opaque tile hides is not sent, nor rendered by those who have heard of it in time: ranks that had
-// to do with that in the last frame begin with the tiles of which they have the front. Only where one order is right
-// for all rays of a frame: not with an extended lens or several eyes.
+// The mixed-parallel loop for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing
+// and wait for no manifest. Tiles that an opaque one hides are not sent, and not rendered by ranks that hear of it in
+// time. Ranks that hid others or were hidden in the last frame begin with the tiles of which they have the front. Use
+// it only if one order is right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:

@@ -23,7 +23,8 @@ struct SharedBrick {
     std::vector<int> ranks;
 };
 
-// The same on all ranks. Memory and time to make it: proportional to the bricks of all ranks.
+// The bricks of all ranks, and who holds them; equal on all ranks. Takes memory and time in proportion to the number of
+// all bricks.
 class SharedWorld {
 public:
     // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks

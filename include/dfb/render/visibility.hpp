@@ -276,7 +276,7 @@ void forEachTile(const std::vector<Projection>& projections, const TileLayout& l
         forEachTile(projection, layout, found);
 }
 
-// The same as visibleTiles(), into memory that is there already. `boundsOf(b)`: of brick b.
+// visibleTiles() into memory that is there already. `boundsOf(b)`: the bounds of brick b.
 template <class BoundsOf, class Camera>
 void findVisibleTiles(std::size_t brickCount, const BoundsOf& boundsOf, const Camera& camera, const TileLayout& layout,
                       std::vector<BrickInTile>& result)
@@ -315,7 +315,7 @@ std::vector<BrickInTile> visibleTiles(const World& world, const Camera& camera, 
 
 namespace detail {
 
-// The same as inputsOf(), into memory that is there already.
+// inputsOf() into memory that is there already.
 inline void findInputs(const World& world, const std::vector<BrickInTile>& pairs, std::vector<TileInput>& result)
 {
     result.clear();

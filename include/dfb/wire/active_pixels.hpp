@@ -57,7 +57,7 @@ inline std::uint64_t activePixelBits(const float* rgba, int count)
     return findActivePixels(rgba, count);
 }
 
-// The same of pixels of 8 bits a channel.
+// Finds the active ones of pixels with 8 bits a channel.
 DFB_INLINE std::uint64_t findActiveBytes(const std::byte* rgba, int count)
 {
     std::uint64_t bits = 0;
