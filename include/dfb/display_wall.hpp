@@ -1,5 +1,5 @@
-// DisplayWall: finished tiles straight from their owners to the ranks that drive the displays (section 4.4 of the
-// paper). The framebuffer's own image format is None: no rank gets the pixels of another's displays.
+// DisplayWall: sends finished tiles from their owners straight to the ranks that drive the displays (section 4.4 of the
+// paper). The framebuffer's own image format is None: a rank gets the pixels of its own displays only.
 #pragma once
 
 #include <dfb/comm/connection.hpp>
@@ -42,19 +42,20 @@ struct ToWall {
 // at most `poolBytes` each.
 class DisplayWall {
 public:
-    // Collective, in the same order as the framebuffers of the connection. `format`: of the displays' images. Throws
-    // InvalidArgument on all ranks if the layout is none, is not the same on all, or some rank has no memory for it.
+    // Makes a wall whose displays show images in `format`. Collective, in the same order as the framebuffers of the
+    // connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong or differs between
+    // ranks, or if a rank has no memory for it.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
-    // Collective. After the framebuffers whose pixel operation sends here.
+    // Collective. Destroy the framebuffers that send to it first.
     ~DisplayWall();
 
     const WallLayout& layout() const noexcept { return layout_; }
 
-    // A configuration of the wall's size whose image goes nowhere else.
+    // The configuration of a framebuffer of the wall's size, whose image goes to the wall alone.
     FrameBufferConfig frameBufferConfig() const
     {
         FrameBufferConfig config;
@@ -64,20 +65,19 @@ public:
         return config;
     }
 
-    // Collective, after the frame of that number has ended on all ranks: returns when all displays have it, which is
-    // the moment to show it on all of them. Throws Error, the same on all ranks, if some display has not got all of it
-    // within `timeout` (TimedOut; 0: no limit), if no rank has sent all of it, as of a frame that ended partial or
-    // failed (MissingInput), or if a part of it, or of a later frame, was not to be believed (MalformedMessage). What
-    // the displays show stays. Whatever the limit, waits for all ranks to call it, as
-    // allReduce() does. Throws TransportError.
+    // Waits until all displays have the frame of that number, which is the moment to show it on all of them.
+    // Collective, after the frame has ended. Throws Error, the same on all ranks; the displays then show what they
+    // showed before: TimedOut if a display has not got all of the frame within `timeout` (0: no limit); MissingInput if
+    // the ranks have not sent all of it, because it ended partial or failed; MalformedMessage if a part of it cannot be
+    // right. Waits for all ranks to call it, whatever the limit. Throws TransportError.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
-    // What this rank's display shows: the last frame that was finished well, which stays until the next one is. Empty
-    // before the first. Throws InvalidArgument if another rank drives it. By the thread that calls finish(), as the
-    // next.
+    // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before
+    // the first. By the thread that calls finish(). Throws InvalidArgument if another rank drives the display.
     const Image& image(int display) const;
 
-    // Which frame all displays show, as in FrameReport::frame; the same on all ranks. -1 before the first.
+    // The number of the frame that all displays show, as in FrameReport::frame; -1 before the first. By the thread that
+    // calls finish().
     std::int64_t imageFrame() const noexcept;
 
     // Called by ToWall, from any thread.
@@ -110,7 +110,10 @@ DFB_COMPILED_ONCE DisplayWall::DisplayWall(std::shared_ptr<Connection> connectio
 }
 DFB_COMPILED_ONCE DisplayWall::~DisplayWall() = default;
 
-DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::milliseconds timeout) { wall_->finish(frame, timeout); }
+DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::milliseconds timeout)
+{
+    wall_->finish(frame, timeout);
+}
 DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
 DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }

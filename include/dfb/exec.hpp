@@ -30,10 +30,10 @@ public:
     Executor(const Executor&) = delete;
     Executor& operator=(const Executor&) = delete;
 
-    // Number of workers, at least 1.
+    // The number of workers, at least 1.
     virtual int concurrency() const noexcept = 0;
 
-    // False if tasks are run by those threads alone that are in help() or parallelFor().
+    // Whether tasks run by themselves. False: only threads in help() or parallelFor() run them.
     virtual bool hasWorkers() const noexcept { return true; }
 
     // From any thread.
@@ -46,8 +46,7 @@ public:
         wake();
     }
 
-    // Runs one task that waits, on the calling thread, so that it does something useful while it waits. False if there
-    // is none.
+    // Runs one waiting task on the calling thread. For threads that wait themselves. Returns false if there is none.
     bool help() { return runOne(); }
     bool hasTasks() // that wait; from any thread
     {
@@ -55,9 +54,9 @@ public:
         return !tasks_.empty();
     }
 
-    // Calls body(i) for i in [0, count), in no particular order, from several workers at once. The calling thread
-    // waits; called from inside a task the loop runs right there. Rethrows the first exception of a body, after
-    // which bodies not yet begun are not run.
+    // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Waits until all have
+    // returned. In a task, the loop runs on the thread of that task. Rethrows the first exception of a body; after it
+    // no other body begins.
     void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
     {
         if (count == 0)
@@ -219,9 +218,9 @@ private:
     std::vector<std::thread> threads_;
 };
 
-// No threads of its own: loops run on the thread that calls parallelFor(), tasks there between two iterations, in
-// setTile(), poll(), or on a thread that waits for a frame. For ranks that have one core each. With Progress::Caller,
-// too, all that a rank does is done by the threads that call it; while none does, other ranks may wait.
+// No threads of its own. Loops run on the thread that calls parallelFor(). Tasks run there between two iterations, in
+// setTile(), in poll(), and on a thread that waits for a frame. For ranks that have one core each. With
+// Progress::Caller as well, the library does nothing while the program does not call it, and other ranks may wait.
 class CallerExecutor final : public Executor {
 public:
     CallerExecutor() = default;

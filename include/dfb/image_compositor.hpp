@@ -1,4 +1,4 @@
-// ImageCompositor: one picture out of images that ranks have rendered already. No camera, no bricks, no tiles:
+// ImageCompositor: makes one picture of images that the ranks have rendered already. No camera, no bricks, no tiles:
 //
 //   dfb::ImageCompositor compositor(communicator, dfb::ImageBlend::Nearest, {width, height});
 //   dfb::InputImage mine(pixels, depths);
@@ -36,9 +36,9 @@ enum class ImageBlend : std::uint8_t {
     InOrder  // images blended front to back in an order of the ranks; no depth is needed
 };
 
-// The image that a rank has rendered, where it lies in memory. It is read by ImageCompositor::start() and not changed.
+// The image that a rank has rendered, in the program's own memory. ImageCompositor::start() reads it.
 struct InputImage {
-    // No image: this rank has nothing to show.
+    // This rank has nothing to show.
     InputImage() = default;
     // 4 bytes or floats a pixel, and a depth for each pixel. Null depths: none, for ImageBlend::InOrder.
     explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
@@ -60,14 +60,15 @@ struct InputImage {
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
 };
 
-// One object per rank. Construction, destruction and resize() are collective. Members are called by one thread at a
-// time; the work is done on all threads of config.executor.
+// One object per rank. Construction, destruction and resize() are collective. One thread at a time may call members;
+// they work on all threads of config.executor.
 class ImageCompositor {
 public:
-    // config.image says what the display rank gets. Throws what the constructor of DistributedFrameBuffer throws.
+    // Makes a compositor on a connection. config.image: the picture of the display rank. Throws what the constructor of
+    // DistributedFrameBuffer throws.
     ImageCompositor(std::shared_ptr<Connection> connection, ImageBlend blend, FrameBufferConfig config);
 #if defined(DFB_HAS_MPI)
-    // Over a connection of its own.
+    // Makes a compositor on a connection of its own.
     ImageCompositor(MPI_Comm communicator, ImageBlend blend, FrameBufferConfig config, NetworkConfig network = {})
         : ImageCompositor(connect<MpiTransport>(communicator, std::move(network)), blend, std::move(config))
     {
@@ -76,7 +77,7 @@ public:
 
     ImageCompositor(const ImageCompositor&) = delete;
     ImageCompositor& operator=(const ImageCompositor&) = delete;
-    // A picture that is open fails on all ranks.
+    // An open picture fails on all ranks.
     ~ImageCompositor()
     {
         if (isOpen_)
@@ -92,22 +93,22 @@ public:
     // give the same, while no picture is open.
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
-    // Collective. Makes one picture of the images of all ranks; start() and end() in one. `place` is for
-    // ImageBlend::InOrder: this rank's place in the order, 0 in front, another for each rank.
+    // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
+    // rank's place in the order, 0 in front, a different one on each rank. Collective. Waits and throws as end().
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {})
     {
         start(image, place, frame);
         return end();
     }
-    // For the other ways to blend.
+    // Does so for the other ways to blend, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
     {
         return composite(image, -1, frame);
     }
 
-    // Reads this rank's image and sends it; when it returns, the memory may be used again. Waits for no other rank,
-    // unless this one has too much under way (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open.
-    // What is wrong with the image comes out of end() on all ranks.
+    // Reads this rank's image and sends it. Its memory may be used again when this returns. Waits for another rank only
+    // if this one has too much under way (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open. If
+    // the image is wrong, end() throws on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
 
@@ -119,20 +120,20 @@ public:
         return isOpen_ && engine_->isDone();
     }
 
-    // Collective. Waits until the picture is complete on the display rank. Throws what Frame::end() throws: FrameError,
-    // the same on all ranks, after which the next picture can be made; or TransportError.
+    // Ends the picture. Collective. Waits until it is complete on the display rank. Throws what Frame::end() throws: a
+    // FrameError, the same on all ranks, after which the next picture can be made; or TransportError.
     FrameReport end();
 
-    // The last picture, on the display rank; empty elsewhere, before the first picture, and after one that failed. It
-    // holds until the next start(). Pixels that nobody has show FrameConfig::background, at a depth of +infinity.
+    // The last picture, on the display rank, until the next start(). Empty on other ranks, before the first picture,
+    // and after one that failed. Pixels that no image has show FrameConfig::background, at a depth of +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
     // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Waits
     // for all ranks. Throws OutOfMemory, TransportError.
     Image imageOnAllRanks() { return engine_->imageOnAllRanks(); }
 
-    // Collective. Pictures have this size from now on; image() is empty. Throws InvalidArgument if a picture is open,
-    // or on all ranks if the size cannot be.
+    // Changes the size of the picture; image() is empty then. Collective. Waits for all ranks. Throws InvalidArgument
+    // if a picture is open, or on all ranks if the size cannot be.
     void resize(int width, int height);
 
 private:

@@ -1,5 +1,5 @@
-// Connection: a communicator's messages for any number of framebuffers: which object a message is for, that it
-// comes once and whole, and progress of the transport (section 3.2 of the paper).
+// Connection: carries the messages of any number of framebuffers over one communicator. It finds the object that a
+// message is for, checks that each message comes once and whole, and moves messages (section 3.2 of the paper).
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -36,21 +36,20 @@ struct NetworkConfig {
     bool checksums = false;
     // True: ranks of one node hand messages over in memory that both see. False: all messages go through MPI.
     bool sharedMemory = true;
-    // A rank is lost if nothing has been heard of it for this long while messages are expected: it has ended, is
-    // stopped or cannot be reached. Needs a progress thread on both ranks. 0: this rank neither looks for lost ranks
-    // nor is looked for. Otherwise 100 ms or more; framebuffers refuse less. It also limits the wait for what an
-    // unreadable message may have been; then 0 means no limit, unless the frame has a time-out.
+    // A rank counts as lost if nothing has been heard of it for this long while messages are expected. It may have
+    // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank neither looks for lost ranks
+    // nor is looked for. Otherwise 100 ms or more; framebuffers refuse less. It also limits how long a reduction waits
+    // after a message that could not be read; then 0 means no limit, unless the frame has a time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
-    // Called on a rank that has found another one lost: on one neighbour of the lost rank, or on several, once each, by
-    // a thread of the library. It must be quick and must not throw. All ranks then get a TransportError with the lost
-    // rank in ErrorInfo::rank. Null: the job ends instead, with MPI_Abort and the error on standard error, as MPI does
-    // not go on without a rank.
+    // Called when a rank is lost, by a thread of the library, once on one or several of the other ranks. It must be
+    // quick and must not throw. All ranks then get a TransportError with the lost rank in ErrorInfo::rank. Null: the
+    // job ends with MPI_Abort, and the error on standard error, as MPI does not go on without a rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 
 namespace detail {
 
-// An object that messages are for. The calls are quick, never block, and come from any thread, several at once.
+// An object that gets messages. Its members are quick and never block. Any thread may call them, several at once.
 class MessageReceiver {
 public:
     virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
@@ -99,9 +98,8 @@ private:
 
 } // namespace detail
 
-// A framebuffer makes one of its own unless it is given one; framebuffers that share it share its progress thread and
-// its buffers. They must be made in the same order on all ranks, and gone before it. All members may be called from
-// any thread unless they say otherwise.
+// Framebuffers on one connection share its progress thread and its buffers. They must be made in the same order on all
+// ranks, and destroyed before it. Any thread may call any member, unless it says otherwise.
 class Connection final : private TransportHandler {
 public:
     // See connect(). `pool`: the one that the link has.
@@ -122,7 +120,8 @@ public:
         }
     }
 
-    // While an exception passes it waits for nobody, as the other ranks may not be on their way here, and tells them.
+    // Waits for the other ranks, unless an exception is passing: they may never come here then, so it tells them and
+    // leaves.
     ~Connection()
     {
         if (std::uncaught_exceptions() > exceptions_)
@@ -132,25 +131,26 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
-    // What it was made with, but for Progress::Auto, in place of which is what it has become.
+    // The configuration that it was made with; Progress::Auto is replaced by Thread or Caller.
     const NetworkConfig& config() const noexcept { return config_; }
     const std::shared_ptr<MemoryPool>& pool() const noexcept { return pool_; }
 
-    // How many threads this rank should render and composite with: the processors that the calling thread may run on,
-    // divided by the ranks that may run there, too, those of this connection on this node; at least 1. What a
-    // framebuffer has that is given no executor.
+    // How many threads this rank should use: the processors that the calling thread may run on, divided by the number
+    // of this connection's ranks on this node that may run there, too; at least 1. A framebuffer that is given no
+    // executor makes so many.
     int threadShare() const noexcept
     {
         return dfb::threadShare(Processors::ofThisThread().count(), link_->sharingRanks());
     }
 
-    // Moves messages; true if any moved. With a progress thread there is no need to call it, and on a thread that may
-    // not be in MPI it does nothing. Never blocks.
+    // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
+    // may not call MPI. Never blocks.
     bool poll() { return !progress_.running() && link_->mayPoll() && progress_.tryPoll(); }
 
     // ---- for the objects that it serves
 
-    // Gives the receiver an address, which is the same on all ranks, and then what has come for it already.
+    // Gives the receiver an address, which is the same on all ranks, and then the messages that have come for it
+    // already.
     void attach(detail::MessageReceiver& receiver, std::uint32_t& address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -167,7 +167,7 @@ public:
         stray_.reset();
     }
 
-    // Afterwards the receiver is not called any more; what comes for it is dropped.
+    // Ends the calls of the receiver. Messages that come for it are dropped.
     void detach(std::uint32_t address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -192,8 +192,8 @@ public:
         link_->send(destination, std::move(message));
     }
 
-    // Whether another rank sees memory of this one; where a block of pool() lies there, -1: nowhere; and what lies in
-    // such a place of another rank, null: this one does not see it.
+    // Whether another rank sees memory of this one; the place of a block of pool() there, or -1; and the memory at a
+    // place of another rank, or null.
     bool isSeenBy(int other) const { return other != rank() && link_->lendsTo(other); }
     std::int32_t placeOf(const std::byte* block) const { return link_->placeOf(block); }
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const
@@ -201,14 +201,14 @@ public:
         return link_->blockAt(other, place, byteCount);
     }
 
-    // All ranks have found that they were set up alike, which includes `checksums`; from any thread, any number of
-    // times. Before, what they say to find out may have a checksum or not; see checkChecksum().
+    // Notes that all ranks have the same configuration, `checksums` included. Before that, messages may come with or
+    // without a checksum; see checkChecksum(). Any number of times.
     void setAlike() noexcept { isAlike_ = true; }
 
-    // Messages that came twice, since the start; they are dropped.
+    // How many messages came twice and were dropped, since the start.
     std::int64_t duplicates() const noexcept { return duplicates_; }
 
-    // In words, which ranks have sent messages that did not arrive although later ones did; may be empty.
+    // A text that says which ranks have sent messages that did not arrive although later ones did. May be empty.
     std::string lost() const
     {
         const std::lock_guard<std::mutex> lock(peersMutex_);
@@ -220,7 +220,7 @@ public:
         return text;
     }
 
-    // Messages may come from now on, or no more; as often false as true.
+    // Says that messages may come from now on (true), or no more (false). Each true is followed by one false.
     void expectMessages(bool expect)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -228,7 +228,7 @@ public:
         progress_.expectMessages(expecting_ > 0);
     }
 
-    // As long as it lives, messages are looked for often.
+    // While an object of this type exists, the connection looks for messages often.
     class Hurry {
     public:
         explicit Hurry(Connection& connection) : progress_(connection.progress_) { progress_.hurry(true); }
@@ -240,11 +240,12 @@ public:
         ProgressThread& progress_;
     };
 
-    // For a thread that waits: moves messages in place of the progress thread, where there is one. True if any moved.
+    // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
+    // moved.
     bool helpProgress() { return progress_.tryPoll(); }
     bool hasProgressThread() const noexcept { return progress_.running(); }
 
-    // Whether poll() is what the calling thread must do while it waits, and whether somebody else does so.
+    // Whether a thread that waits must call poll() itself; and whether a progress thread does.
     bool needsCaller() const noexcept { return link_->needsPolling() && !progress_.running(); }
     bool mayPoll() const noexcept { return link_->mayPoll(); }
     bool quiet() const { return link_->quiet(); }
@@ -264,7 +265,8 @@ public:
         throw TransportError(*failure_);
     }
 
-    // This rank cannot go on: says so to the others, so that nobody waits for it. False if it has failed before.
+    // Tells the other ranks that this one cannot go on, so that nobody waits for it. Returns false if it has failed
+    // before.
     bool giveUp(const ErrorInfo& error)
     {
         if (!setFailure(error))
@@ -531,7 +533,8 @@ private:
                              [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
 };
 
-// Collective, like the end of what it returns: connects the ranks of a communicator. Throws TransportError.
+// Connects the ranks of a communicator. Collective, as is the destruction of what it returns. Waits for all ranks.
+// Throws TransportError.
 template <class Transport = MpiTransport>
 std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})
 {

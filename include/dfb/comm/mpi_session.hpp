@@ -1,4 +1,4 @@
-// MpiSession: MPI from its beginning to its end, for programs that do not manage it themselves.
+// MpiSession: initialises and finalises MPI, for programs that do not do so themselves.
 //
 //   int main(int argc, char** argv)
 //   {
@@ -22,19 +22,19 @@ namespace dfb {
 
 class MpiSession {
 public:
-    // Initialises MPI at the highest thread level that it has: with MPI_THREAD_MULTIPLE messages move by themselves
+    // Initialises MPI at the highest thread level that it has. With MPI_THREAD_MULTIPLE messages move by themselves
     // (see Progress). Throws TransportError if MPI has been initialised or finalised before.
     MpiSession(int& argc, char**& argv) : MpiSession(argc, argv, MPI_THREAD_MULTIPLE, MPI_THREAD_SINGLE) {}
 
-    // At this level, or a higher one. Throws TransportError, too, if MPI does not have it.
+    // Initialises MPI at this thread level or a higher one. Throws TransportError also if MPI does not have it.
     MpiSession(int& argc, char**& argv, int level) : MpiSession(argc, argv, level, level) {}
 
     MpiSession(const MpiSession&) = delete;
     MpiSession& operator=(const MpiSession&) = delete;
 
-    // Collective: waits for all ranks, then finalises MPI, unless that has been done. Not so if an exception ends the
-    // life of this object: the other ranks may wait for what never comes, and only the end of the job helps them.
-    // Whoever catches the exception can still report it; when this process exits it aborts the job, with code 1.
+    // Waits for all ranks, then finalises MPI, unless that has been done. Collective. If an exception destroys this
+    // object, it waits for nobody, as other ranks may wait for messages that never come. The program can still report
+    // the exception; when the process exits, it aborts the job with code 1.
     ~MpiSession()
     {
         int finalized = 0;
@@ -47,9 +47,8 @@ public:
             abortJob();
     }
 
-    // For who goes on after a TransportError: other ranks may have gone, and MPI_Finalize would wait for them for ever.
-    // The end of this object then waits for nobody, and when this process exits it aborts the job, with code 1, as
-    // after an exception.
+    // Call it to go on after a TransportError. Other ranks may have gone, and MPI_Finalize would wait for them for
+    // ever. The destructor then waits for nobody, and when the process exits, it aborts the job with code 1.
     void giveUp() noexcept { isGivenUp_ = true; }
 
     int rank() const noexcept { return rank_; }

@@ -224,13 +224,12 @@ public:
     static constexpr ChannelMask neededChannels = Channels & (colorChannel | depthChannel | farChannel);
 };
 
-// Blends inputs in the order of their generation, front to back: for where there is an order of the bricks that is
-// right for all pixels of a tile. Nothing is sorted, and no depth travels unless the image has it. The tree is a list:
-// each input announces 1 child but the last, which announces none; a tile without any has one empty input of generation
-// 0. See OrderedLoop.
+// Blends inputs in the order of their generation, front to back. Use it if one order of the bricks is right for all
+// pixels of a tile. It sorts nothing, and no depth travels unless the image has it. The tree is a list: each input
+// announces one child, the last none. A tile without inputs has an empty one of generation 0. See OrderedLoop.
 //
-// Of a tile of one pass that has no more than a colour, what is behind an opaque input does not count, nor does the
-// tile wait for it.
+// In a tile with one pass and no channel but colour, inputs behind an opaque one do not count, and the tile does not
+// wait for them.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:
@@ -282,10 +281,10 @@ private:
     int opaque_ = none;            // the first that is
 };
 
-// Keeps of each pixel the input that is nearest by (depth, source, part), for opaque geometry: what has a depth below
-// +infinity is there, also if it is black or its alpha 0, and what has not is not, whatever its colour. Inputs behind
-// the nearest are not blended, whatever its alpha; it is laid over the background by that. Depth, position and ids are
-// those of the nearest. Accepts any tree.
+// Keeps the nearest input of each pixel, by (depth, source, part); for opaque geometry. A pixel is active if its depth
+// is below +infinity, also if it is black or transparent; without a depth it is empty, whatever its colour. The nearest
+// is laid over the background by its alpha; inputs behind it are not blended. Depth, position and ids are those of the
+// nearest. Accepts any tree.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");

@@ -177,10 +177,10 @@ public:
             detail::failArgument("a pixel has 1 to 65535 segments");
     }
 
-    // As DataParallelLoop::start(), but `renderBrick(brick, deep)` adds the segments of the pixels of
-    // deep.header().region to the empty DeepTile. FrameReport::mergeErrorBound is how much merging what is too many may
-    // have changed a pixel. The first segments of a brick's pixels announce the others as children: a pixel with one
-    // costs what it costs without.
+    // Does what DataParallelLoop::start() does, but renderBrick(brick, deep) adds the segments of the pixels of
+    // deep.header().region to the empty DeepTile. FrameReport::mergeErrorBound says how far a pixel may be off because
+    // segments were merged. The first segments of a brick's pixels announce the others as children, so pixels with one
+    // segment cost nothing extra.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
                                                     FrameConfig params = {},
@@ -212,7 +212,7 @@ public:
         return frame;
     }
 
-    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    // Renders a whole frame: start() and Frame::end(). Collective. Waits and throws as both do.
     template <class Camera, class RenderBrick>
     FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},

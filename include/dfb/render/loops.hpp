@@ -31,9 +31,8 @@ struct InPlace {
     }
 };
 
-// For any loop in place of what renders, where the pixels are there already, as in an image that a rank has made by
-// itself: `find` gets a TileView in place of a Tile, and says where the pixels of view.region are. Nothing is copied
-// into a tile.
+// Makes a renderer for any loop out of pixels that are there already, such as an image that a rank has made by itself.
+// find(view) gets a TileView and points its planes to the pixels of view.region. Nothing is copied into a tile.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -126,8 +125,8 @@ inline std::int64_t scatteringStride(std::int64_t count)
 
 } // namespace detail
 
-// One per rank, for any number of frames, which find its memory there; by one thread at a time. The framebuffer must
-// outlive it.
+// One object per rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it.
+// The framebuffer must outlive it.
 template <class FrameBuffer>
 class ImageParallelLoop {
 public:
@@ -137,13 +136,13 @@ public:
     {
     }
 
-    // This rank renders these tiles, in this order; over all ranks each tile of the image is rendered once.
+    // Gives this rank these tiles, in this order. The lists of all ranks must have each tile of the image once.
     ImageParallelLoop(FrameBuffer& fb, std::vector<int> tiles) : fb_(fb), tiles_(std::move(tiles)) {}
 
-    // Renders this rank's share and returns the frame, which is to be ended; collective with WorkDistribution::Dynamic.
-    // `renderTile(tile)` is called from several threads at once, for each pass with its own tile.pass and tile.sample;
-    // it writes the pixels of tile.region into the cleared tile. Throws what FrameBuffer::begin() throws; an exception
-    // of renderTile becomes a FrameError of Frame::end() on all ranks.
+    // Begins a frame, renders this rank's share, and returns the frame: call end(). renderTile(tile) writes the pixels
+    // of tile.region into the cleared tile. Several threads call it at once, for each pass with its own tile.pass and
+    // tile.sample. Waits for its share, with WorkDistribution::Dynamic also for other ranks. Throws what
+    // FrameBuffer::begin() throws. An exception of renderTile comes out of Frame::end() on all ranks, as a FrameError.
     template <class RenderTile>
     [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
@@ -186,7 +185,7 @@ public:
         return frame;
     }
 
-    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    // Renders a whole frame: start() and Frame::end(). Collective. Waits and throws as both do.
     template <class RenderTile>
     FrameReport render(const RenderTile& renderTile, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
@@ -238,19 +237,20 @@ private:
 
 } // namespace detail
 
-// One per rank, for any number of frames, which find its memory there; by one thread at a time. Framebuffer and world
-// must outlive it; the world may change between frames. Every brick must be in the world of one rank only.
+// One object per rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it.
+// Framebuffer and world must outlive it. The world may change between frames. Each brick must be in the world of one
+// rank only.
 template <class FrameBuffer>
 class DataParallelLoop {
 public:
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
-    // Renders all bricks of the world into the tiles that they may project to, and returns the frame, which is to be
-    // ended. `renderBrick(brick, tile)` is called from several threads at once, for each pass with its own tile.pass;
-    // it writes colour and depth of the pixels of tile.region that rays meet within brick.bounds into the cleared tile,
-    // depth growing away from the camera. Unlike in Listing 3 the owners do not count the bricks that project to their
-    // tiles: each rank declares what it will send, so the two cannot disagree. Throws what FrameBuffer::begin()
-    // throws; an exception of renderBrick becomes a FrameError of Frame::end() on all ranks.
+    // Begins a frame, renders all bricks of the world into the tiles that they may project to, and returns the frame:
+    // call end(). renderBrick(brick, tile) writes colour and depth of the pixels of tile.region into the cleared tile,
+    // as far as their rays are within brick.bounds; depth grows away from the camera. Several threads call it at once,
+    // for each pass with its own tile.pass. Unlike in Listing 3, each rank declares its inputs, so that owners need not
+    // know the bricks. Waits for this rank's share. Throws what FrameBuffer::begin() throws. An exception of
+    // renderBrick comes out of Frame::end() on all ranks, as a FrameError.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
                                                     FrameConfig params = {},
@@ -266,7 +266,7 @@ public:
         return frame;
     }
 
-    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    // Renders a whole frame: start() and Frame::end(). Collective. Waits and throws as both do.
     template <class Camera, class RenderBrick>
     FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},

@@ -1,14 +1,14 @@
-// MixedParallelLoop (Listing 5 of the paper): bricks that several ranks hold are rendered into each tile by one of
-// them, the tile-brick owner. With one rank per brick it is data-parallel rendering, with all bricks on all ranks
-// image-parallel rendering. OrderedLoop: the same with bricks in a known order, without sorting.
+// MixedParallelLoop (Listing 5 of the paper): of the ranks that hold a brick, one renders it into a tile: the
+// tile-brick owner. With one rank per brick this is data-parallel rendering; with all bricks on all ranks,
+// image-parallel rendering. OrderedLoop: the same for bricks in a known order, without sorting.
 //
 // A tile-brick owner is any type with
 //   int operator()(const SharedBrick& brick, int tile, int pass);      the rank, one of brick.ranks
-// and, if it decides from what it knows of all,
+// and, if it decides about all pairs of brick and tile together,
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
-//                                  called before: all pairs of the frame, and of each how many passes it has. The
-//                                  frame's report then has the cost of each pair, for the next plan.
-// It must decide alike on all ranks. A rank that does not hold the brick makes the frame fail.
+//                                  called before: all pairs of the frame, and the number of passes of each. The frame's
+//                                  report then has the cost of each pair, for the next plan.
+// It must decide alike on all ranks. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -29,9 +29,9 @@
 
 namespace dfb {
 
-// Deals the tiles of a brick to the ranks that hold it (section 4.3 of the paper); with `sharePasses` each pass of each
-// tile. Tiles are mixed first: taken as they come they would be dealt out in columns where the image is some multiple
-// of the ranks wide, and neighbours cost alike.
+// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper), or with `sharePasses` the
+// passes of its tiles. Tiles are mixed first: in their own order, ranks would get whole columns of some images, and
+// neighbours cost alike.
 struct RoundRobinBricks {
     bool sharePasses = false;
 
@@ -43,10 +43,9 @@ struct RoundRobinBricks {
     }
 };
 
-// Deals them so that all ranks have equally much to do, going by what the same brick and tile have cost in the last
-// frame; where that is not known, by the mean of the brick, then of all. Call update() after each frame. Passes are
-// dealt one by one. The cost is what `renderBrick` returns, or else the time it took, summed over the ranks by the
-// verdict.
+// Deals the passes of tiles so that all ranks have equally much to do. It goes by the cost of the same brick and tile
+// in the last frame; if that is not known, by the mean of the brick, or of all bricks. Call update() after each frame.
+// The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
     void update(const FrameReport& report)
@@ -320,9 +319,9 @@ void hideBehind(const Frame& frame, const SharedWorld& world, const std::vector<
 
 } // namespace detail
 
-// As DataParallelLoop, with bricks that several ranks may hold: for each tile and pass `owner` says which of them
-// renders it. The image is that of data-parallel rendering bit for bit, whoever renders what. Framebuffer, world and
-// owner must outlive it.
+// A DataParallelLoop for bricks that several ranks may hold. For each tile and pass `owner` picks the rank that renders
+// the brick. The image is that of data-parallel rendering, bit for bit, whichever ranks it picks. Framebuffer, world
+// and owner must outlive it.
 template <class FrameBuffer, class TileBrickOwner>
 class MixedParallelLoop {
 public:
@@ -331,7 +330,7 @@ public:
     {
     }
 
-    // As DataParallelLoop::start(); `renderBrick(brick, tile)` may return what it has cost, a number in any unit.
+    // Does what DataParallelLoop::start() does. renderBrick(brick, tile) may return its cost, a number in any unit.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
                                                     FrameConfig params = {},
@@ -367,7 +366,7 @@ public:
         return frame;
     }
 
-    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    // Renders a whole frame: start() and Frame::end(). Collective. Waits and throws as both do.
     template <class Camera, class RenderBrick>
     FrameReport render(const Camera& camera, const RenderBrick& renderBrick, const FrameConfig& params = {},
                        const typename FrameBuffer::TileFrameData& tileData = {},
@@ -396,8 +395,8 @@ public:
     {
     }
 
-    // As MixedParallelLoop::start(); `order` is the bricks front to back, by their place in world.bricks(), as from
-    // visibilityOrder().
+    // Does what MixedParallelLoop::start() does. `order`: the bricks front to back, by their place in world.bricks(),
+    // as visibilityOrder() returns them.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                                     const RenderBrick& renderBrick, FrameConfig params = {},
@@ -432,7 +431,7 @@ public:
         return frame;
     }
 
-    // Collective. The same, and ends the frame. Throws what Frame::end() throws.
+    // Renders a whole frame: start() and Frame::end(). Collective. Waits and throws as both do.
     template <class Camera, class RenderBrick>
     FrameReport render(const Camera& camera, const std::vector<int>& order, const RenderBrick& renderBrick,
                        const FrameConfig& params = {}, const typename FrameBuffer::TileFrameData& tileData = {},

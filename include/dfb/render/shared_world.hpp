@@ -1,5 +1,5 @@
-// SharedWorld: the bricks of all ranks, and who holds which: what is needed where several ranks hold the same brick,
-// or where one must know what is in front of what.
+// SharedWorld: the bricks of all ranks, and which ranks hold each. For bricks that several ranks hold, and for orders
+// of bricks from front to back.
 #pragma once
 
 #include <dfb/render/cameras.hpp>
@@ -27,8 +27,9 @@ struct SharedBrick {
 // all bricks.
 class SharedWorld {
 public:
-    // Collective, outside frames. Bricks with the same id on several ranks are one. Throws InvalidArgument on all ranks
-    // if their bounds differ, or if what comes from a rank is no World.
+    // Gathers the bricks of all ranks. Bricks with the same id are one. Collective, outside frames. Waits for all
+    // ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if a rank sends no
+    // World.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {

@@ -57,8 +57,8 @@ struct Brick {
     const Box3& data() const noexcept { return dataBounds ? *dataBounds : bounds; }
 };
 
-// What this rank holds; ranks may hold none. Ghost bricks are copies of what others hold, seen by secondary rays alone:
-// they are neither projected nor declared nor rendered. Not for use by several threads while bricks are added.
+// The bricks of this rank; there may be none. Ghost bricks are copies of bricks of other ranks, for secondary rays
+// alone: they are neither projected nor declared nor rendered. While bricks are added, no other thread may use it.
 class World {
 public:
     World() = default;
