@@ -87,15 +87,26 @@ inline const char* nameOf(Waiting waiting)
                                         : "MPI test+nap";
 }
 
+// The CPU time that this thread has spent in sched_yield() while it waited: no work of the system that is measured.
+inline double& yieldedSeconds()
+{
+    static thread_local double seconds = 0;
+    return seconds;
+}
+
 // What to do between tests.
 class Idler {
 public:
     explicit Idler(Waiting waiting) : waiting_(waiting) {}
     void idle()
     {
-        if (waiting_ == Waiting::Yield)
+        if (waiting_ == Waiting::Yield) {
+            const double before = threadCpuSeconds();
             sched_yield();
-        else if (Clock::now() - since_ > std::chrono::microseconds(5))
+            yieldedSeconds() += threadCpuSeconds() - before;
+            return;
+        }
+        if (Clock::now() - since_ > std::chrono::microseconds(5))
             std::this_thread::sleep_for(std::chrono::microseconds(50));
     }
     void busy() { since_ = Clock::now(); }

@@ -168,7 +168,8 @@ private:
 
 class BrickScene : public Scene {
 public:
-    BrickScene(int ranks, int width, int height) : Scene(ranks, width, height)
+    // `turn`: how far the camera has gone round the cube, in radians.
+    BrickScene(int ranks, int width, int height, double turn = 0) : Scene(ranks, width, height), azimuth_(0.6 + turn)
     {
         for (int left = ranks, axis = 0; left > 1; axis = (axis + 1) % 3) { // 2: 2x1x1, 4: 2x2x1, 8: 2x2x2, 16: 4x2x2
             int factor = 2;
@@ -186,16 +187,16 @@ public:
 private:
     using Vec = std::array<double, 3>;
 
-    static constexpr double azimuth = 0.6, elevation = 0.4;
-    static Vec forward()
+    static constexpr double elevation = 0.4;
+    Vec forward() const
     {
-        return {-std::cos(azimuth) * std::cos(elevation), -std::sin(azimuth) * std::cos(elevation),
+        return {-std::cos(azimuth_) * std::cos(elevation), -std::sin(azimuth_) * std::cos(elevation),
                 -std::sin(elevation)};
     }
-    static Vec right() { return {-std::sin(azimuth), std::cos(azimuth), 0}; }
-    static Vec up()
+    Vec right() const { return {-std::sin(azimuth_), std::cos(azimuth_), 0}; }
+    Vec up() const
     {
-        return {-std::cos(azimuth) * std::sin(elevation), -std::sin(azimuth) * std::sin(elevation),
+        return {-std::cos(azimuth_) * std::sin(elevation), -std::sin(azimuth_) * std::sin(elevation),
                 std::cos(elevation)};
     }
 
@@ -252,6 +253,7 @@ private:
         return true;
     }
 
+    double azimuth_;
     std::array<int, 3> cells_{1, 1, 1};
 };
 

@@ -33,9 +33,10 @@ inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
 
 // ---- figures and tables
 
-// The median absolute deviation says how far from the median half of the samples are at most.
+// The median absolute deviation says how far from the median half of the samples are at most. A quarter of the samples
+// is below `low`, a quarter above `high`.
 struct Figure {
-    double median = 0, deviation = 0;
+    double median = 0, deviation = 0, low = 0, high = 0;
     std::size_t count = 0;
 };
 
@@ -55,6 +56,11 @@ inline Figure figureOf(std::vector<double> samples)
     Figure figure;
     figure.count = samples.size();
     figure.median = medianOf(samples);
+    if (!samples.empty()) {
+        std::sort(samples.begin(), samples.end());
+        figure.low = samples[(samples.size() - 1) / 4];
+        figure.high = samples[samples.size() - 1 - (samples.size() - 1) / 4];
+    }
     for (double& sample : samples)
         sample = std::abs(sample - figure.median);
     figure.deviation = medianOf(samples);

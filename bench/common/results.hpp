@@ -18,7 +18,7 @@ namespace bench {
 struct Result {
     std::string bench, system, config, scene;
     int ranks = 0, width = 0, height = 0;
-    Figure ms, cpuMs;
+    Figure ms, cpuMs, yieldMs;      // yieldMs: of the CPU time, what waiting ranks have given away
     double bytes = 0, messages = 0; // of all ranks, a frame
     double maxError = 0, rmse = 0;
     int levels = 0;              // by which an 8-bit value is off at most
@@ -26,17 +26,21 @@ struct Result {
     std::string commit;
     std::string more{}; // further keys: , "key": value
 
+    // The CPU time that was not given away while waiting.
+    double workMs() const { return cpuMs.median - yieldMs.median; }
+
     std::string json() const
     {
         char text[2048];
-        std::snprintf(text, sizeof text,
-                      R"({"bench": "%s", "system": "%s", "config": "%s", "scene": "%s", "ranks": %d, "width": %d, )"
-                      R"("height": %d, "median_ms": %.4f, "mad_ms": %.4f, "cpu_ms": %.3f, "bytes": %.0f, )"
-                      R"("messages": %.0f, "max_err": %.6g, "rmse": %.6g, "lsb_max": %d, "peak_memory_bytes": %.0f, )"
-                      R"("commit": "%s"%s})",
-                      bench.c_str(), system.c_str(), config.c_str(), scene.c_str(), ranks, width, height, ms.median,
-                      ms.deviation, cpuMs.median, bytes, messages, maxError, rmse, levels, peakMemoryBytes,
-                      commit.c_str(), more.c_str());
+        std::snprintf(
+            text, sizeof text,
+            R"({"bench": "%s", "system": "%s", "config": "%s", "scene": "%s", "ranks": %d, "width": %d, )"
+            R"("height": %d, "median_ms": %.4f, "mad_ms": %.4f, "low_ms": %.4f, "high_ms": %.4f, "cpu_ms": %.3f, "yield_ms": %.3f, "bytes": %.0f, )"
+            R"("messages": %.0f, "max_err": %.6g, "rmse": %.6g, "lsb_max": %d, "peak_memory_bytes": %.0f, )"
+            R"("commit": "%s"%s})",
+            bench.c_str(), system.c_str(), config.c_str(), scene.c_str(), ranks, width, height, ms.median, ms.deviation,
+            ms.low, ms.high, cpuMs.median, yieldMs.median, bytes, messages, maxError, rmse, levels, peakMemoryBytes,
+            commit.c_str(), more.c_str());
         return text;
     }
 };

@@ -17,7 +17,9 @@ namespace bench {
 // bounds but those of the whole image.
 class OverlapScene : public Scene {
 public:
-    OverlapScene(int ranks, int width, int height) : Scene(ranks, width, height), cell_(std::max(4, height / 11))
+    // `turn`: moves the discs.
+    OverlapScene(int ranks, int width, int height, double turn = 0)
+        : Scene(ranks, width, height), cell_(std::max(4, height / 11)), turn_(turn)
     {
         std::vector<int> mixed = order();
         std::sort(mixed.begin(), mixed.end(), [](int a, int b) { return numbersOf(a, 0, 0) < numbersOf(b, 0, 0); });
@@ -43,7 +45,7 @@ private:
     bool shade(int rank, int x, int y, float* rgba, float& depth) const override
     {
         const std::array<double, 4> shift = numbersOf(rank, -1, -1);
-        const double column = (x + 0.5) / cell_ + shift[0], row = (y + 0.5) / cell_ + shift[1];
+        const double column = (x + 0.5) / cell_ + shift[0] + turn_, row = (y + 0.5) / cell_ + shift[1];
         const auto [chance, size, left, above] = numbersOf(rank, static_cast<int>(column), static_cast<int>(row));
         const double radius = 0.2 + 0.25 * size, room = 1 - 2 * radius;
         const double dx = column - std::floor(column) - radius - left * room;
@@ -59,13 +61,15 @@ private:
     std::array<int, 4> viewportOf(const std::array<int, 4>&) const override { return {0, 0, width(), height()}; }
 
     int cell_;
+    double turn_;
 };
 
 // Some ranks have all pixels of the image, all of them translucent; the others have none.
 class DenseScene : public Scene {
 public:
-    DenseScene(int ranks, int width, int height, std::vector<bool> has)
-        : Scene(ranks, width, height), has_(std::move(has))
+    // `turn`: moves what is seen.
+    DenseScene(int ranks, int width, int height, std::vector<bool> has, double turn = 0)
+        : Scene(ranks, width, height), has_(std::move(has)), turn_(turn)
     {
     }
 
@@ -75,12 +79,13 @@ private:
         if (!has_[static_cast<std::size_t>(rank)])
             return false;
         const auto [u, v] = positionOf(x, y);
-        paint(rank, u, v, 0.35 + 0.25 * std::sin(9 * u + rank) * std::sin(11 * v), rgba);
+        paint(rank, u + turn_, v, 0.35 + 0.25 * std::sin(9 * (u + turn_) + rank) * std::sin(11 * v), rgba);
         depth = static_cast<float>(placeOf(rank) + 0.5 + 0.4 * std::sin(5 * u + 2 * v));
         return true;
     }
 
     std::vector<bool> has_;
+    double turn_;
 };
 
 inline const std::vector<std::string>& sceneNames()
@@ -89,22 +94,23 @@ inline const std::vector<std::string>& sceneNames()
     return names;
 }
 
-inline std::unique_ptr<Scene> makeScene(const std::string& name, int ranks, int width, int height)
+// `turn`: how far the camera has moved, in radians.
+inline std::unique_ptr<Scene> makeScene(const std::string& name, int ranks, int width, int height, double turn = 0)
 {
     const auto count = static_cast<std::size_t>(ranks);
     if (name == "bricks")
-        return std::make_unique<BrickScene>(ranks, width, height);
+        return std::make_unique<BrickScene>(ranks, width, height, turn);
     if (name == "overlap")
-        return std::make_unique<OverlapScene>(ranks, width, height);
+        return std::make_unique<OverlapScene>(ranks, width, height, turn);
     if (name == "dense")
-        return std::make_unique<DenseScene>(ranks, width, height, std::vector<bool>(count, true));
+        return std::make_unique<DenseScene>(ranks, width, height, std::vector<bool>(count, true), turn);
     std::vector<bool> has(count, false);
     if (name == "empty")
-        return std::make_unique<DenseScene>(ranks, width, height, has);
+        return std::make_unique<DenseScene>(ranks, width, height, has, turn);
     if (name != "one")
         throw std::invalid_argument("there is no scene " + name);
     has.back() = true; // not rank 0, which gets the image
-    return std::make_unique<DenseScene>(ranks, width, height, has);
+    return std::make_unique<DenseScene>(ranks, width, height, has, turn);
 }
 
 } // namespace bench

@@ -1,7 +1,9 @@
 // Compositing alone: partial images that are ready, in scenes from nothing on any rank to everything on all of them,
 // are made one image by dfb, by IceT and by plain loops, frame by frame in turn.
 //   mpirun -n 4 bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size 1024x1024,...] [--frames 21]
-//   [--systems dfb,icet,plain] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]
+//   [--systems dfb,icet,plain] [--moving] [--reader] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]
+// --moving: each frame is seen from another side than the one before. --reader: rank 0 reads the image within the
+// clock.
 #include "scenes.hpp"
 #include "systems.hpp"
 
@@ -29,6 +31,7 @@ struct Options {
     std::vector<std::string> scenes{"bricks"}, systems{"dfb", "icet", "plain"};
     std::vector<std::array<int, 2>> sizes{{1024, 1024}};
     int frames = 21;
+    bool isMoving = false, isReadInside = false;
     std::string json, table, commit;
     std::string only; // the systems whose name and configuration have one of these, with | between
 
@@ -51,6 +54,10 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     threads.hasThreads = true;
     addDfb<BasicOrderedBlend<128>>(systems, bench::makeConnection(inputs.comm, true), inputs,
                                    "in order, float32, tiles of 128, threads of its own", threads);
+    bench::DfbSettings defaults;
+    defaults.hasDefaultThreads = true;
+    addDfb<dfb::AlphaBlend>(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, "float32, defaults",
+                            defaults);
     addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, tiles of 64", {});
     addDfb<BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
     addOrdered("unorm16", {WireFormat::Unorm16});
@@ -64,7 +71,9 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 
 void addAllPlain(std::vector<System>& systems, const Inputs& inputs)
 {
-    const auto ranks = static_cast<int>(inputs.order.size());
+    if (inputs.isMoving())
+        return;
+    const auto ranks = static_cast<int>(inputs.order().size());
     bench::addDirectSend(systems, inputs);
     const std::vector<int> twos = bench::RadixK::factorsOf(ranks, 2), fours = bench::RadixK::factorsOf(ranks, 4);
     const bool canSwap = std::all_of(twos.begin(), twos.end(), [](int factor) { return factor == 2; });
@@ -80,10 +89,10 @@ void addAllPlain(std::vector<System>& systems, const Inputs& inputs)
 class MemoryNeeds {
 public:
     explicit MemoryNeeds(const Inputs& inputs)
-        : image_(static_cast<double>(inputs.image.depth.size())),
-          all_(image_ * static_cast<double>(inputs.viewports.size()))
+        : image_(static_cast<double>(inputs.image().depth.size())),
+          all_(image_ * static_cast<double>(inputs.viewports().size()))
     {
-        for (const auto& v : inputs.viewports)
+        for (const auto& v : inputs.viewports())
             used_ += static_cast<double>(v[2]) * v[3];
     }
 
@@ -144,6 +153,7 @@ struct Best {
     explicit Best(const std::vector<Result>& results)
         : exact(
             fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, nameOf(dfb::WireFormat::Float32)); })),
+          defaults(fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, "defaults"); })),
           oneLevel(fastestOf(results, [](const Result& r) { return isDfb(r) && r.levels <= 1; })),
           limit(fastestOf(results, [](const Result& r) { return r.system == "limit"; })),
           icetFloat(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "float, "); })),
@@ -154,20 +164,25 @@ struct Best {
     static bool has(const Result& r, const char* text) { return r.config.find(text) != std::string::npos; }
 
     const Result* exact;    // of dfb, whose inputs travel as float32
+    const Result* defaults; // of dfb, whose user has set nothing
     const Result* oneLevel; // of dfb, with 8-bit values that are off by one at most
     const Result* limit;    // what reading and writing memory once take
     const Result *icetFloat, *icetUbyte;
 };
 
-std::string timeText(const Result* r) { return r ? bench::text(r->ms) : "-"; }
+// Median and quartiles.
+std::string timeText(const Result* r)
+{
+    return r ? bench::text(r->ms.median) + " (" + bench::text(r->ms.low) + " to " + bench::text(r->ms.high) + ")" : "-";
+}
 
-// Of time, CPU time and bytes.
+// Of time, CPU time without yields, and bytes.
 std::string ratios(const Result* a, const Result* b)
 {
     if (!a || !b)
         return "-";
     const auto ratio = [](double x, double y) { return y > 0 ? bench::text(x / y) : std::string("-"); };
-    return ratio(a->ms.median, b->ms.median) + ", " + ratio(a->cpuMs.median, b->cpuMs.median) + ", "
+    return ratio(a->ms.median, b->ms.median) + ", " + ratio(a->workMs(), b->workMs()) + ", "
            + ratio(a->bytes, b->bytes);
 }
 
@@ -186,7 +201,10 @@ public:
     void run(const std::string& sceneName, int width, int height)
     {
         const auto scene = bench::makeScene(sceneName, size_, width, height);
-        const Inputs inputs(comm_, *scene, rank_);
+        Inputs inputs(comm_, *scene, rank_);
+        inputs.isReadInside = o_.isReadInside;
+        for (int i = 1; o_.isMoving && i < 4; ++i)
+            inputs.views.emplace_back(comm_, *bench::makeScene(sceneName, size_, width, height, 0.15 * i), rank_);
         bench::ExactImage exact;
         exact.rowStep = rowStepOf(width, height);
         if (rank_ == 0)
@@ -210,7 +228,7 @@ public:
         std::vector<Result> all, floats, bytes;
         for (System& s : systems) {
             s.result.bench = "bench_compositing";
-            s.result.scene = sceneName;
+            s.result.scene = sceneName + (o_.isMoving ? ", moving" : "") + (o_.isReadInside ? ", read" : "");
             s.result.width = width;
             s.result.height = height;
             s.result.commit = o_.commit;
@@ -232,7 +250,7 @@ private:
     }
 
     // All in turns, if they have room in memory together; else some after the others. Returns those that were measured.
-    std::vector<System> measure(std::vector<System> systems, const Inputs& inputs, const bench::ExactImage& exact) const
+    std::vector<System> measure(std::vector<System> systems, Inputs& inputs, const bench::ExactImage& exact) const
     {
         const MemoryNeeds needs(inputs);
         const double room = 0.7 * bench::reduce(comm_, freeMemory(), MPI_MIN);
@@ -259,7 +277,7 @@ private:
                         room / 1e9, groups.size());
         std::vector<System> measured;
         for (std::vector<System>& group : groups) {
-            bench::measureInTurns(comm_, group, o_.frames, exact);
+            bench::measureInTurns(inputs, group, o_.frames, exact);
             giveBackMemory();
             std::move(group.begin(), group.end(), std::back_inserter(measured));
         }
@@ -277,7 +295,7 @@ private:
         std::string title = first.scene + ", " + size + ", " + std::to_string(size_) + " ranks, to " + output;
         if (rowStep > 1)
             title += "; errors are those of every " + std::to_string(rowStep) + "th row";
-        bench::Table table({"", "ms", "CPU ms", "MB sent", "messages", "max error", "RMSE", "levels off"});
+        bench::Table table({"", "ms", "CPU ms", "yields", "MB sent", "messages", "max error", "RMSE", "levels off"});
         for (const Result& r : results) {
             const auto format = [](const char* form, double value) {
                 char text[32];
@@ -285,19 +303,20 @@ private:
                 return std::string(text);
             };
             table.add({r.system + ": " + r.config, bench::text(r.ms), bench::text(r.cpuMs),
-                       format("%.2f", r.bytes / 1e6), format("%.0f", r.messages), format("%.2g", r.maxError),
-                       format("%.2g", r.rmse), std::to_string(r.levels)});
+                       bench::text(r.yieldMs.median), format("%.2f", r.bytes / 1e6), format("%.0f", r.messages),
+                       format("%.2g", r.maxError), format("%.2g", r.rmse), std::to_string(r.levels)});
         }
         table.print(title);
 
         const Best best(results);
-        std::printf("\n%s: ms: dfb float32 %s, dfb within a level %s, IceT float %s, ubyte %s; ratios of time, CPU "
-                    "time, bytes: dfb float32 to IceT float %s, to ubyte %s; dfb within a level to IceT float %s, to "
-                    "ubyte %s\n",
-                    title.c_str(), timeText(best.exact).c_str(), timeText(best.oneLevel).c_str(),
-                    timeText(best.icetFloat).c_str(), timeText(best.icetUbyte).c_str(),
-                    ratios(best.exact, best.icetFloat).c_str(), ratios(best.exact, best.icetUbyte).c_str(),
-                    ratios(best.oneLevel, best.icetFloat).c_str(), ratios(best.oneLevel, best.icetUbyte).c_str());
+        std::printf(
+            "\n%s: ms: dfb float32 %s, defaults %s, within a level %s, IceT float %s, ubyte %s; ratios of time, CPU "
+            "time, bytes: dfb float32 to IceT float %s, to ubyte %s; dfb within a level to IceT float %s, to "
+            "ubyte %s\n",
+            title.c_str(), timeText(best.exact).c_str(), timeText(best.defaults).c_str(),
+            timeText(best.oneLevel).c_str(), timeText(best.icetFloat).c_str(), timeText(best.icetUbyte).c_str(),
+            ratios(best.exact, best.icetFloat).c_str(), ratios(best.exact, best.icetUbyte).c_str(),
+            ratios(best.oneLevel, best.icetFloat).c_str(), ratios(best.oneLevel, best.icetUbyte).c_str());
         std::fflush(stdout);
         if (!o_.table.empty())
             addToTable(best, {first.scene, size, std::to_string(size_), output});
@@ -309,13 +328,14 @@ private:
         const bool isNew = std::ifstream(o_.table).peek() == std::ifstream::traits_type::eof();
         std::ofstream file(o_.table, std::ios::app);
         if (isNew)
-            file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb within a level [ms] | "
+            file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb defaults [ms] | dfb "
+                    "within a level [ms] | "
                     "IceT float [ms] "
                     "| IceT ubyte [ms] | dfb float32 : IceT float | : ubyte | dfb within a level : IceT float "
-                    "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
+                    "| : ubyte |\n|---|---|--:|---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n";
         for (const std::string& text : what)
             file << "| " << text << ' ';
-        for (const Result* r : {best.limit, best.exact, best.oneLevel, best.icetFloat, best.icetUbyte})
+        for (const Result* r : {best.limit, best.exact, best.defaults, best.oneLevel, best.icetFloat, best.icetUbyte})
             file << "| " << timeText(r) << ' ';
         for (const Result* mine : {best.exact, best.oneLevel})
             for (const Result* peer : {best.icetFloat, best.icetUbyte})
@@ -350,7 +370,8 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size WxH,...] "
-        "[--frames N] [--systems dfb,icet,plain] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]",
+        "[--frames N] [--systems dfb,icet,plain] [--moving] [--reader] [--only TEXT] [--json FILE] [--table FILE] "
+        "[--commit ID]",
         {{"--scene", readScenes},
          {"--size", bench::readSizes(o.sizes)},
          {"--systems", readSystems},
@@ -358,7 +379,8 @@ Options optionsOf(int argc, char** argv)
          {"--only", bench::readText(o.only)},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
-         {"--commit", bench::readText(o.commit)}});
+         {"--commit", bench::readText(o.commit)}},
+        {{"--moving", &o.isMoving}, {"--reader", &o.isReadInside}});
     return o;
 }
 

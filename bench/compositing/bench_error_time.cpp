@@ -66,7 +66,7 @@ public:
     void bricks()
     {
         const bench::BrickScene scene(size_, o_.width, o_.height);
-        const Inputs inputs(comm_, scene, rank_);
+        Inputs inputs(comm_, scene, rank_);
         bench::ExactImage exact;
         if (rank_ == 0)
             exact = scene.exact();
@@ -78,7 +78,7 @@ public:
         bench::addIceT(systems, inputs);
 #endif
         bench::keepWanted(systems, o_.only);
-        bench::measureInTurns(comm_, systems, o_.frames, exact);
+        bench::measureInTurns(inputs, systems, o_.frames, exact);
         bench::takeErrorsOfFloats(systems);
         for (System& s : systems) {
             describe(s, "bricks", o_.width, o_.height);

@@ -42,18 +42,32 @@ inline std::vector<std::array<int, 4>> viewportsOf(MPI_Comm comm, const PartialI
     return all;
 }
 
-// What an image is made of.
-struct Inputs {
-    Inputs(MPI_Comm communicator, const Scene& scene, int rank)
-        : comm(communicator), image(scene.render(rank)), viewports(viewportsOf(communicator, image)),
-          order(scene.order())
+// What an image is made of: what one camera sees.
+struct View {
+    View(MPI_Comm comm, const Scene& scene, int rank)
+        : image(scene.render(rank)), viewports(viewportsOf(comm, image)), order(scene.order())
     {
     }
 
-    MPI_Comm comm;
     PartialImage image;                        // of this rank
     std::vector<std::array<int, 4>> viewports; // of all ranks
     std::vector<int> order;                    // the ranks, front to back
+};
+
+// What the frames of a run are made of: a view each, in turn. A camera that stands still has one.
+struct Inputs {
+    Inputs(MPI_Comm communicator, const Scene& scene, int rank) : comm(communicator), views{View(comm, scene, rank)} {}
+
+    MPI_Comm comm;
+    std::vector<View> views;
+    std::size_t frame = 0;     // that is under way
+    bool isReadInside = false; // rank 0 reads the image within the clock
+
+    bool isMoving() const { return views.size() > 1; }
+    const View& view() const { return views[frame % views.size()]; }
+    const PartialImage& image() const { return view().image; }
+    const std::vector<std::array<int, 4>>& viewports() const { return view().viewports; }
+    const std::vector<int>& order() const { return view().order; }
 };
 
 // What makes the image, and what is known of it.
@@ -72,7 +86,7 @@ struct System {
     std::function<Compositor()> start; // collective, as is the end of what it returns
     bool isDefault = false;
     Compositor compositor{};
-    std::vector<double> ms{}, cpuMs{};
+    std::vector<double> ms{}, cpuMs{}, yieldMs{};
     Result result{};
 
     std::string title() const { return name + ": " + config + ", to " + output; }
@@ -92,26 +106,25 @@ inline void keepWanted(std::vector<System>& systems, const std::string& only)
 
 // ---- dfb: inputs that are ready are read where they are
 
-// The boxes of bricks are in pixels.
-struct PixelCamera {
-    dfb::Region project(const dfb::Box3& box, int, int) const
-    {
-        return {static_cast<int>(box.lower.x), static_cast<int>(box.lower.y), static_cast<int>(box.upper.x),
-                static_cast<int>(box.upper.y)};
-    }
-};
-
-// Each rank has one brick.
-inline dfb::World worldOf(const PartialImage& image, int rank)
+// Each rank has one brick, whose box says no more than which rank that is.
+inline dfb::World worldOf(int rank)
 {
     dfb::World world;
-    const auto& v = image.viewport;
-    if (v[2] > 0)
-        world.add({static_cast<std::uint32_t>(rank),
-                   {{static_cast<float>(v[0]), static_cast<float>(v[1]), 0},
-                    {static_cast<float>(v[0] + v[2]), static_cast<float>(v[1] + v[3]), 1}}});
+    const auto x = static_cast<float>(rank);
+    world.add({static_cast<std::uint32_t>(rank), {{x, 0, 0}, {x + 1, 1, 1}}});
     return world;
 }
+
+// Projects a brick to the viewport of its rank.
+struct ViewportCamera {
+    const std::vector<std::array<int, 4>>& viewports;
+
+    dfb::Region project(const dfb::Box3& box, int, int) const
+    {
+        const auto [x, y, columns, rows] = viewports[static_cast<std::size_t>(box.lower.x)];
+        return {x, y, x + columns, y + rows};
+    }
+};
 
 template <class TileOp>
 inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
@@ -122,7 +135,8 @@ struct DfbSettings {
     float minTransmittance = 0;
     bool isDefault = false;
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
-    bool hasThreads = false; // a worker; else the executor has none
+    bool hasThreads = false;        // a worker; else the executor has none
+    bool hasDefaultThreads = false; // those that a framebuffer makes by itself
 };
 
 // Without `hasThreads` what each rank does is done by one thread, as with the other systems.
@@ -140,9 +154,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
 {
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
     struct Renderer {
-        Renderer(const std::shared_ptr<Connection>& sharedConnection, const dfb::FrameBufferConfig& c,
-                 const PartialImage& image)
-            : fb(sharedConnection, c), world(worldOf(image, fb.rank())), shared(fb, world), loop(fb, world),
+        Renderer(const std::shared_ptr<Connection>& sharedConnection, const dfb::FrameBufferConfig& c)
+            : fb(sharedConnection, c), world(worldOf(fb.rank())), shared(fb, world), loop(fb, world),
               orderedLoop(fb, shared, owner)
         {
         }
@@ -156,8 +169,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
     };
     for (const bool toBytes : {false, true}) {
         dfb::FrameBufferConfig c;
-        c.image.width = inputs.image.width;
-        c.image.height = inputs.image.height;
+        c.image.width = inputs.image().width;
+        c.image.height = inputs.image().height;
         c.image.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
         c.precision = settings.wire;
         c.messages.codec = settings.codec;
@@ -168,36 +181,32 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
         s.isDefault = settings.isDefault;
-        s.start = [c, connection, toBytes, hasThreads = settings.hasThreads, from = &inputs.image,
-                   order = inputs.order] {
+        s.start = [c, connection, toBytes, settings, &inputs] {
             dfb::FrameBufferConfig ownConfig = c;
-            if (hasThreads)
+            if (settings.hasThreads)
                 ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
-            else
+            else if (!settings.hasDefaultThreads)
                 ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
-            const auto r = std::make_shared<Renderer>(connection, ownConfig, *from);
+            const auto r = std::make_shared<Renderer>(connection, ownConfig);
             Compositor compositor;
-            compositor.frame = [r, from, order] {
-                const auto renderBrick = dfb::inPlace([from](const dfb::Brick&, auto& view) {
-                    view.stride = static_cast<std::size_t>(from->width);
+            compositor.frame = [r, &inputs] {
+                const PartialImage& image = inputs.image();
+                const auto renderBrick = dfb::inPlace([&image](const dfb::Brick&, auto& view) {
+                    view.stride = static_cast<std::size_t>(image.width);
                     const std::size_t first = static_cast<std::size_t>(view.region.y0) * view.stride
                                               + static_cast<std::size_t>(view.region.x0);
-                    view.color = &from->rgba[4 * first];
-                    view.depth = &from->depth[first];
-                    const auto [left, top, columns, rows] = from->viewport; // as IceT has it
+                    view.color = &image.rgba[4 * first];
+                    view.depth = &image.depth[first];
+                    const auto [left, top, columns, rows] = image.viewport; // as IceT has it
                     view.valid = {left, top, left + columns, top + rows};
                 });
+                const ViewportCamera camera{inputs.viewports()};
                 if constexpr (isOrdered<TileOp>) {
-                    std::vector<int> places; // of bricks in the shared world, which has them by id
-                    for (const int rank : order)
-                        for (std::size_t i = 0; i < r->shared.bricks().size(); ++i)
-                            if (r->shared.bricks()[i].brick.id == static_cast<std::uint32_t>(rank))
-                                places.push_back(static_cast<int>(i));
-                    r->report = r->orderedLoop.render(PixelCamera(), places, renderBrick);
+                    r->report = r->orderedLoop.render(camera, inputs.order(), renderBrick); // bricks are by rank
                 } else {
                     dfb::FrameConfig params;
                     params.maxLayers = r->fb.size();
-                    r->report = r->loop.render(PixelCamera(), renderBrick, params);
+                    r->report = r->loop.render(camera, renderBrick, params);
                 }
             };
             if (toBytes)
@@ -215,7 +224,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
 
 // ---- the peers
 
-// `make(toBytes)` makes a PlainCompositor, in a shared pointer.
+// `make(toBytes)` makes a PlainCompositor, in a shared pointer. They know one view only.
 template <class Make>
 void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::string& config, const Make& make)
 {
@@ -224,11 +233,11 @@ void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::str
         s.name = "plain";
         s.config = config;
         s.output = toBytes ? "8 bit" : "float";
-        s.start = [make, toBytes, image = &inputs.image] {
+        s.start = [make, toBytes, &inputs] {
             const std::shared_ptr<PlainCompositor> plain = make(toBytes);
             const auto out = std::make_shared<const std::byte*>(nullptr);
             Compositor compositor;
-            compositor.frame = [plain, out, image] { *out = plain->composite(image->rgba); };
+            compositor.frame = [plain, out, &inputs] { *out = plain->composite(inputs.image().rgba); };
             if (toBytes)
                 compositor.bytes = [out] { return reinterpret_cast<const std::uint8_t*>(*out); };
             else
@@ -243,8 +252,8 @@ void addPlain(std::vector<System>& systems, const Inputs& inputs, const std::str
 inline void addDirectSend(std::vector<System>& systems, const Inputs& inputs)
 {
     addPlain(systems, inputs, "direct send, float", [&inputs](bool toBytes) {
-        return std::make_shared<DirectSend>(inputs.comm, inputs.order, inputs.viewports, inputs.image.width,
-                                            inputs.image.height, toBytes);
+        return std::make_shared<DirectSend>(inputs.comm, inputs.order(), inputs.viewports(), inputs.image().width,
+                                            inputs.image().height, toBytes);
     });
 }
 
@@ -256,9 +265,11 @@ inline void addMemoryLimit(std::vector<System>& systems, const Inputs& inputs)
         s.config = "inputs read, image written";
         s.output = toBytes ? "8 bit" : "float";
         s.start = [&inputs, toBytes] {
-            const auto limit = std::make_shared<MemoryLimit>(inputs.comm, inputs.viewports, toBytes);
+            const auto limits = std::make_shared<std::vector<MemoryLimit>>();
+            for (const View& view : inputs.views)
+                limits->emplace_back(inputs.comm, view.viewports, toBytes);
             Compositor compositor;
-            compositor.frame = [limit, &inputs] { limit->frame(inputs.image); };
+            compositor.frame = [limits, &inputs] { (*limits)[inputs.frame % limits->size()].frame(inputs.image()); };
             compositor.traffic = [] { return std::make_pair(std::int64_t{0}, std::int64_t{0}); };
             return compositor;
         };
@@ -270,57 +281,68 @@ inline void addRadixK(std::vector<System>& systems, const Inputs& inputs, const 
                       const std::vector<int>& factors)
 {
     addPlain(systems, inputs, name + ", float", [&inputs, factors](bool toBytes) {
-        return std::make_shared<RadixK>(inputs.comm, inputs.order, inputs.viewports, inputs.image.width,
-                                        inputs.image.height, factors, toBytes);
+        return std::make_shared<RadixK>(inputs.comm, inputs.order(), inputs.viewports(), inputs.image().width,
+                                        inputs.image().height, factors, toBytes);
     });
 }
 
 #ifdef DFB_BENCH_HAS_ICET
-// As a user would, whose renderer has floats: for bytes they are converted first; for bytes out of floats, afterwards.
+// IceT with floats, and with bytes that are ready. With floats that become bytes: the image is converted within the
+// clock, or the inputs are; by the library's own conversion, which is faster than a plain loop.
 inline void addIceT(std::vector<System>& systems, const Inputs& inputs)
 {
-    enum class Way { Floats, FloatsToBytes, Bytes };
+    enum class Way { Floats, FloatsToBytes, Bytes, BytesOfFloats };
+    const auto ranks = inputs.viewports().size();
+    const bool isPowerOf2 = (ranks & (ranks - 1)) == 0;
+    const auto convert = [](const float* from, std::size_t count, std::uint8_t* to) {
+        dfb::convertPixels(from, static_cast<int>(count / 4), dfb::OutputFormat::RGBA8,
+                           reinterpret_cast<std::byte*>(to));
+    };
     for (const IceTStrategy& strategy : icetStrategies()) {
         const std::string name = strategy.name;
-        if (name != "direct" && name != "sequential, radix-k" && name != "sequential, binary swap"
-            && name != "sequential, tree")
+        // What "automatic" picks, and swaps of as many ranks as there is no power of 2 of, are others again.
+        if (name.find("automatic") != std::string::npos || (isPowerOf2 && name.find("folding") != std::string::npos))
             continue;
-        for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes}) {
+        for (const Way way : {Way::Floats, Way::FloatsToBytes, Way::Bytes, Way::BytesOfFloats}) {
+            const bool hasBytes = way == Way::Bytes || way == Way::BytesOfFloats;
             IceTSettings settings;
             settings.strategy = strategy.strategy;
             settings.singleImage = strategy.singleImage;
-            settings.ubyte = way == Way::Bytes;
+            settings.ubyte = hasBytes;
             System s;
             s.name = "icet";
-            s.config = (way == Way::Bytes ? "ubyte, " : "float, ") + name;
+            s.config = (way == Way::Bytes           ? "ubyte, "
+                        : way == Way::BytesOfFloats ? "ubyte of floats, "
+                                                    : "float, ")
+                       + name;
             s.output = way == Way::Floats ? "float" : "8 bit";
-            s.start = [settings, way, &inputs] {
-                const PartialImage& image = inputs.image;
-                const auto icet = std::make_shared<IceT>(inputs.comm, settings, image.width, image.height);
-                const std::size_t values = image.rgba.size();
-                const auto converted = std::make_shared<std::vector<std::uint8_t>>(way == Way::Floats ? 0 : values);
+            s.start = [settings, way, hasBytes, convert, &inputs] {
+                const PartialImage& first = inputs.image();
+                const auto icet = std::make_shared<IceT>(inputs.comm, settings, first.width, first.height);
+                const std::size_t values = first.rgba.size();
+                // Of all views if they are to be ready, else of one.
+                const auto bytes = std::make_shared<std::vector<std::vector<std::uint8_t>>>(
+                    way == Way::Floats ? 0 : inputs.views.size(), std::vector<std::uint8_t>(values));
+                for (std::size_t v = 0; way == Way::Bytes && v < inputs.views.size(); ++v)
+                    convert(inputs.views[v].image.rgba.data(), values, (*bytes)[v].data());
                 const auto out = std::make_shared<const void*>(nullptr);
                 Compositor compositor;
                 compositor.frame = [=, &inputs] {
-                    const auto& v = inputs.image.viewport;
-                    const std::vector<float>& rgba = inputs.image.rgba;
-                    const void* input = rgba.data();
-                    if (way == Way::Bytes) {
+                    const auto& v = inputs.image().viewport;
+                    const std::vector<float>& rgba = inputs.image().rgba;
+                    std::uint8_t* const own = bytes->empty() ? nullptr : (*bytes)[inputs.frame % bytes->size()].data();
+                    if (way == Way::BytesOfFloats)
                         for (int y = v[1]; y < v[1] + v[3]; ++y) {
-                            const std::size_t first =
-                                4
-                                * (static_cast<std::size_t>(y) * static_cast<std::size_t>(inputs.image.width)
-                                   + static_cast<std::size_t>(v[0]));
-                            PlainCompositor::convertToBytes(&rgba[first], 4 * static_cast<std::size_t>(v[2]),
-                                                            converted->data() + first);
+                            const auto row = static_cast<std::size_t>(y) * static_cast<std::size_t>(first.width);
+                            const std::size_t at = 4 * (row + static_cast<std::size_t>(v[0]));
+                            convert(&rgba[at], 4 * static_cast<std::size_t>(v[2]), own + at);
                         }
-                        input = converted->data();
-                    }
                     icet->resetTraffic();
-                    *out = icet->composite(input, v.data(), inputs.order);
+                    const void* const input = hasBytes ? static_cast<const void*>(own) : rgba.data();
+                    *out = icet->composite(input, v.data(), inputs.order());
                     if (way == Way::FloatsToBytes && *out) {
-                        PlainCompositor::convertToBytes(static_cast<const float*>(*out), values, converted->data());
-                        *out = converted->data();
+                        convert(static_cast<const float*>(*out), values, own);
+                        *out = own;
                     }
                 };
                 if (way == Way::Floats)
@@ -357,19 +379,39 @@ inline dfb::testing::ErrorReport errorOf(const float* floats, const std::uint8_t
     return report;
 }
 
-// Collective: one frame, from when the first rank begins to when rank 0 has the image.
-inline void timeFrame(MPI_Comm comm, System& s, bool counts)
+// Reads all of an image, as whoever shows or stores it does; returns something that depends on each byte.
+inline std::uint64_t readAll(const void* image, std::size_t byteCount)
+{
+    const auto* bytes = static_cast<const std::byte*>(image);
+    std::uint64_t all = 0;
+    for (std::size_t i = 0; i + sizeof all <= byteCount; i += sizeof all) {
+        std::uint64_t some = 0;
+        std::memcpy(&some, bytes + i, sizeof some);
+        all ^= some;
+    }
+    return all;
+}
+
+// Collective: one frame, from when the first rank begins to when rank 0 has the image; or, if `imagePixels` is not 0,
+// has read it.
+inline void timeFrame(MPI_Comm comm, System& s, bool counts, std::size_t imagePixels = 0)
 {
     meet(comm);
-    const double start = now(), cpuBefore = processCpuSeconds();
+    const double start = now(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
     s.compositor.frame();
-    const double end = now(), cpu = processCpuSeconds() - cpuBefore;
+    static volatile std::uint64_t seen = 0;
+    if (imagePixels > 0 && s.compositor.floats && s.compositor.floats())
+        seen = seen ^ readAll(s.compositor.floats(), 16 * imagePixels);
+    if (imagePixels > 0 && s.compositor.bytes && s.compositor.bytes())
+        seen = seen ^ readAll(s.compositor.bytes(), 4 * imagePixels);
+    const double end = now(), cpu = processCpuSeconds() - cpuBefore, yielded = yieldedSeconds() - yieldedBefore;
     const double first = reduce(comm, start, MPI_MIN);
-    const double cpuOfAll = reduce(comm, cpu, MPI_SUM);
+    const double cpuOfAll = reduce(comm, cpu, MPI_SUM), yieldedByAll = reduce(comm, yielded, MPI_SUM);
     if (!counts)
         return;
     s.ms.push_back(1e3 * (end - first)); // on rank 0, when it has the image
     s.cpuMs.push_back(1e3 * cpuOfAll);
+    s.yieldMs.push_back(1e3 * yieldedByAll);
 }
 
 // Collective: what the last frame of a system has cost, and on rank 0 how exact it is; times, if there are any.
@@ -383,6 +425,7 @@ inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
     r.config = s.config + ", to " + s.output;
     r.ms = figureOf(s.ms);
     r.cpuMs = figureOf(s.cpuMs);
+    r.yieldMs = figureOf(s.yieldMs);
     const auto traffic = s.compositor.traffic();
     r.bytes = static_cast<double>(traffic.first);
     r.messages = static_cast<double>(traffic.second);
@@ -402,13 +445,20 @@ inline void takeResult(MPI_Comm comm, System& s, const ExactImage& exact)
 }
 
 // Collective: starts the systems, each of which has its turn in every frame, takes their results and ends them.
-inline void measureInTurns(MPI_Comm comm, std::vector<System>& systems, int frames, const ExactImage& exact)
+// `exact`: of the first view.
+inline void measureInTurns(Inputs& inputs, std::vector<System>& systems, int frames, const ExactImage& exact)
 {
+    const MPI_Comm comm = inputs.comm;
+    const std::size_t pixels = inputs.isReadInside ? inputs.image().depth.size() : 0;
     for (System& s : systems)
         s.compositor = s.start();
-    for (int frame = -1; frame < frames; ++frame) // the first touches memory
+    const auto views = static_cast<int>(inputs.views.size());
+    const int all = (frames + views - 1) / views * views; // so that the last is of the first view
+    for (int frame = -views; frame <= all; ++frame) {     // before 0: touches memory
+        inputs.frame = static_cast<std::size_t>(frame + views);
         for (std::size_t i = 0; i < systems.size(); ++i)
-            timeFrame(comm, systems[(i + static_cast<std::size_t>(frame + 1)) % systems.size()], frame >= 0);
+            timeFrame(comm, systems[(i + inputs.frame) % systems.size()], frame > 0, pixels);
+    }
     for (System& s : systems)
         takeResult(comm, s, exact);
     for (System& s : systems) {
