@@ -396,14 +396,17 @@ inline std::uint64_t readAll(const void* image, std::size_t byteCount)
 // has read it.
 inline void timeFrame(MPI_Comm comm, System& s, bool counts, std::size_t imagePixels = 0)
 {
+    int rank = 0;
+    MPI_Comm_rank(comm, &rank);
+    const std::size_t readPixels = rank == 0 ? imagePixels : 0;
     meet(comm);
     const double start = now(), cpuBefore = processCpuSeconds(), yieldedBefore = yieldedSeconds();
     s.compositor.frame();
     static volatile std::uint64_t seen = 0;
-    if (imagePixels > 0 && s.compositor.floats && s.compositor.floats())
-        seen = seen ^ readAll(s.compositor.floats(), 16 * imagePixels);
-    if (imagePixels > 0 && s.compositor.bytes && s.compositor.bytes())
-        seen = seen ^ readAll(s.compositor.bytes(), 4 * imagePixels);
+    if (readPixels > 0 && s.compositor.floats && s.compositor.floats())
+        seen = seen ^ readAll(s.compositor.floats(), 16 * readPixels);
+    if (readPixels > 0 && s.compositor.bytes && s.compositor.bytes())
+        seen = seen ^ readAll(s.compositor.bytes(), 4 * readPixels);
     const double end = now(), cpu = processCpuSeconds() - cpuBefore, yielded = yieldedSeconds() - yieldedBefore;
     const double first = reduce(comm, start, MPI_MIN);
     const double cpuOfAll = reduce(comm, cpu, MPI_SUM), yieldedByAll = reduce(comm, yielded, MPI_SUM);

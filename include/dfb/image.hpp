@@ -17,6 +17,10 @@
 #include <numeric>
 #include <string>
 
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
 namespace dfb {
 
 // A half-open rectangle of pixels, [x0, x1) x [y0, y1), row 0 on top.
@@ -76,6 +80,42 @@ template <class Real>
 DFB_AVX2 inline void toFloatsAvx2(const Real* values, int count, float* out) noexcept
 {
     toFloats(values, count, out);
+}
+
+// A pixel as four floats; a float -0 becomes 0.
+#if defined(__SSE2__)
+inline __m128 pixelOf(const double* rgba) noexcept
+{
+    return _mm_movelh_ps(_mm_cvtpd_ps(_mm_loadu_pd(rgba)), _mm_cvtpd_ps(_mm_loadu_pd(rgba + 2)));
+}
+inline __m128 pixelOf(const float* rgba) noexcept { return _mm_add_ps(_mm_loadu_ps(rgba), _mm_setzero_ps()); }
+#endif
+
+// Stores float pixels past the cache, in whole lines of it: `out` is not read soon by this thread, so its lines need
+// not be fetched. storesAreDone() must follow before others may know of them. Returns how many pixels from the first on
+// were stored; the others are left to the caller.
+template <class Real>
+int streamPixels([[maybe_unused]] const Real* rgba, [[maybe_unused]] int count, [[maybe_unused]] float* out) noexcept
+{
+    int stored = 0;
+#if defined(__SSE2__)
+    constexpr std::uintptr_t line = 64;
+    const auto address = reinterpret_cast<std::uintptr_t>(out);
+    if (address % 16 != 0 || count < 16)
+        return 0;
+    for (; (address + 16 * static_cast<std::uintptr_t>(stored)) % line != 0; ++stored)
+        _mm_store_ps(out + 4 * stored, pixelOf(rgba + 4 * stored));
+    for (; stored + 4 <= count; stored += 4)
+        for (int i = 4 * stored; i < 4 * stored + 16; i += 4)
+            _mm_stream_ps(out + i, pixelOf(rgba + i));
+#endif
+    return stored;
+}
+inline void storesAreDone() noexcept
+{
+#if defined(__SSE2__)
+    _mm_sfence();
+#endif
 }
 
 } // namespace detail

@@ -87,6 +87,9 @@ public:
     {
     }
 
+    // Stores float colours past the cache from now on: see streamPixels().
+    void storePastCache() noexcept { isPastCache_ = format_ == OutputFormat::RGBA32F; }
+
     const Region& region() const noexcept { return region_; }
     int width() const noexcept { return region_.width(); }
     int height() const noexcept { return region_.height(); }
@@ -105,7 +108,7 @@ public:
         if (std::byte* color = to_.at[detail::Color]; color) {
             color += first * bytesPerPixel(format_);
             farthest = dither_ ? ditherPixels(rgba, width(), format_, region_.x0, region_.y0 + y, color)
-                               : convertPixels(rgba, width(), format_, color);
+                               : convert(rgba, width(), color);
         }
         const auto set = [&](detail::Channel channel, const auto* from, auto empty) {
             if (!to_.at[channel])
@@ -136,7 +139,7 @@ public:
         if (float* out = detail::floatsOf(to_.at[detail::Depth]))
             std::copy(depth, depth + count, out + first);
         std::byte* color = to_.at[detail::Color];
-        return color ? convertPixels(rgba, count, format_, color + first * bytesPerPixel(format_)) : 0;
+        return color ? convert(rgba, count, color + first * bytesPerPixel(format_)) : 0;
     }
     // Sets the colour of pixels [x, x + count) of row y from floats, which a float image gets as they are; -0 becomes
     // 0.
@@ -152,7 +155,7 @@ public:
             return;
         }
         float* out = detail::floatsOf(color);
-        for (int i = 0; i < 4 * count; ++i)
+        for (int i = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0; i < 4 * count; ++i)
             out[i] = rgba[i] + 0.0f;
     }
     // Sets pixels [x, x + count) of row y to the background, which is given as it is stored: bytesPerPixel(format())
@@ -185,6 +188,12 @@ public:
     }
 
 private:
+    double convert(const double* rgba, int count, std::byte* color) const
+    {
+        const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
+        return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);
+    }
+
     const std::byte* rowOf(std::size_t channel, std::size_t pixelBytes, int y) const noexcept
     {
         const std::byte* first = to_.at[channel];
@@ -225,7 +234,7 @@ private:
     OutputFormat format_;
     detail::Planes to_;
     std::size_t stride_;
-    bool dither_;
+    bool dither_, isPastCache_ = false;
     detail::BackgroundPixels* background_;
     std::int64_t writtenPixels_ = 0;
 };

@@ -138,6 +138,52 @@ TEST_CASE("convertPixels writes each format", "[image]")
     CHECK(out == std::vector<std::byte>(out.size(), std::byte{7}));
 }
 
+namespace {
+
+// How many bytes differ between pixels stored past the cache, with the rest converted, and pixels converted, at a place
+// `first` pixels behind the beginning of a cache line; those around them must stay.
+template <class Real>
+int wrongPastCache(int first, int count)
+{
+    alignas(64) static float plain[4 * 300], past[4 * 300];
+    std::fill(std::begin(plain), std::end(plain), 7.0f);
+    std::fill(std::begin(past), std::end(past), 7.0f);
+    std::vector<Real> rgba;
+    for (int i = 0; i < 4 * count; ++i)
+        rgba.push_back(static_cast<Real>(i % 5 == 0 ? 1e-40 : i % 7 == 0 ? 3e38 : 1.0 / 3 * (i % 11 - 5)));
+    if (count > 20) {
+        rgba[70] = std::numeric_limits<Real>::infinity();
+        rgba[71] = std::numeric_limits<Real>::quiet_NaN();
+    }
+    dfb::convertPixels(rgba.data(), count, dfb::OutputFormat::RGBA32F, reinterpret_cast<std::byte*>(plain + 4 * first));
+    const int stored = dfb::detail::streamPixels(rgba.data(), count, past + 4 * first);
+    dfb::detail::storesAreDone();
+    if (stored < 0 || stored > count)
+        return -1;
+    dfb::convertPixels(rgba.data() + 4 * stored, count - stored, dfb::OutputFormat::RGBA32F,
+                       reinterpret_cast<std::byte*>(past + 4 * (first + stored)));
+    int wrong = 0;
+    for (std::size_t i = 0; i < 4 * 300; ++i)
+        wrong += std::memcmp(&plain[i], &past[i], sizeof plain[i]) != 0;
+    return wrong;
+}
+
+} // namespace
+
+TEST_CASE("Pixels stored past the cache are those of convertPixels(), at every place in a line", "[image]")
+{
+    for (const int first : {4, 5, 6, 7})
+        for (const int count : {0, 1, 15, 16, 17, 18, 19, 20, 33, 64, 255}) {
+            INFO(first << ", " << count);
+            CHECK(wrongPastCache<double>(first, count) == 0);
+            CHECK(wrongPastCache<float>(first, count) == 0);
+        }
+    float value[4] = {-0.0f, 0, 0, 0}, out[4 * 16];
+    std::vector<float> zeros(4 * 16, -0.0f);
+    if (dfb::detail::streamPixels(zeros.data(), 16, out) > 0)
+        CHECK(std::memcmp(out, value + 1, sizeof(float)) == 0); // +0
+}
+
 TEST_CASE("An image shows what it has and says what it has not", "[image]")
 {
     const auto pool = dfb::MemoryPool::create();

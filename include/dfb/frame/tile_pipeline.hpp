@@ -277,7 +277,10 @@ private:
         auto place = gather_.reserve(tile);
         background.newFrame(region.width(), region.height(), place.imageEpoch);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither, &background);
+        if (place.own.empty()) // in the image
+            out.storePastCache();
         table_.finish(tile, out);
+        storesAreDone();
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
 
