@@ -11,6 +11,8 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
 launcher=
+# Each kind of system in its fastest ways
+main_rows="limit|defaults|in order, float32, tiles of 128, to|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
 while [ $# -gt 0 ]; do
     case $1 in
     --quick)
@@ -48,8 +50,10 @@ done
 
 for ranks in 4 8; do
     mpiexec -n "$ranks" "$bench"/bench_error_time --frames "$frames" --commit "$commit" \
-        --json "$results/error_time.json" --svg "$results/error_time.$ranks" --table "$results/error_time.$ranks.md"
+        --json "$results/error_time.json" --table "$results/error_time.$ranks.md"
 done
+/usr/bin/env python3 bench/compositing/plot_error_time.py "$results/error_time.json" "$results" ||
+    echo "run.sh: no pictures of error against time: they need python3 with matplotlib"
 
 # What has been measured at one size tells most; the others show whether it holds.
 for ranks in 2 3 4 8 16; do
@@ -58,8 +62,13 @@ for ranks in 2 3 4 8 16; do
         --json "$results/compositing.json" --table "$results/compositing.md"
 done
 for ranks in 2 4 8; do
+    for way in --moving --reader; do
+        mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,dense --size 1024x1024,2048x2048 $way \
+            --only "$main_rows" --frames "$compositing_frames" --commit "$commit" \
+            --json "$results/compositing.json" --table "$results/compositing.md"
+    done
     mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 2048x2048,4096x4096 \
-        --only "limit|in order, float32, tiles of 128|in order, unorm8|icet: float, direct|icet: ubyte, direct|tree" \
+        --only "$main_rows" \
         --frames 5 --commit "$commit" --json "$results/compositing.json" --table "$results/compositing.md"
 done
 

@@ -32,7 +32,7 @@ tools() {
 }
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
-[ "$with" != bench ] || libraries="$libraries libbenchmark-dev"
+[ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {

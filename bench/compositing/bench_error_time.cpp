@@ -1,7 +1,7 @@
 // Time against error: what every way to send tiles costs and how exact its image is; beside IceT with floats and bytes,
 // and a plain loop in float, on the same partial images in the same run, frame by frame in turn. And what samples cost
 // in a scene with noise.
-//   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--svg FILE] [--table FILE] [--commit
+//   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--table FILE] [--commit
 //   ID]
 #include "systems.hpp"
 
@@ -17,7 +17,7 @@ using bench::System;
 
 struct Options {
     int width = 1024, height = 1024, frames = 21;
-    std::string json, svg, table, commit;
+    std::string json, table, commit;
     std::string only; // the systems whose name and configuration have one of these, with | between
 };
 
@@ -255,14 +255,6 @@ public:
                 if (r.isDefault && !isOnFront(r.result, these))
                     all << "\nNot on the front, though a default: " << r.result.config << ".\n",
                         chosen << "\nNot on the front, though a default: " << r.result.config << ".\n";
-            if (!o_.svg.empty()) {
-                const std::string kind = rows == &floats_ ? "float" : rows == &bytes_ ? "8bit" : "noise";
-                bench::writeSvg(o_.svg + '.' + kind + ".svg",
-                                these.front().scene + ", " + std::to_string(these.front().width) + " x "
-                                    + std::to_string(these.front().height) + ", " + std::to_string(size_)
-                                    + " ranks, to " + rows->front().output + "; * on the Pareto front",
-                                these);
-            }
         }
         for (std::ostringstream* table : {&all, &chosen}) {
             if (kernels_.empty())
@@ -334,12 +326,11 @@ Options optionsOf(int argc, char** argv)
     Options o;
     bench::readOptions(
         argc, argv,
-        "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--svg PREFIX] "
-        "[--table FILE] [--commit ID] [--only TEXT]",
+        "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--table FILE] [--commit ID] "
+        "[--only TEXT]",
         {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--json", bench::readText(o.json)},
-         {"--svg", bench::readText(o.svg)},
          {"--table", bench::readText(o.table)},
          {"--only", bench::readText(o.only)},
          {"--commit", bench::readText(o.commit)}});
