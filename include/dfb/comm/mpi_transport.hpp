@@ -174,6 +174,9 @@ public:
     // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are.
     void nap(std::chrono::nanoseconds limit)
     {
+        napLimit_ = limit;
+        if (Clock::now() - lastWake_.load() < 2 * wakePause) // then send() may not end it
+            limit = std::min(limit, wakePause);
         signal_.nap(limit < std::chrono::milliseconds(10) ? limit * crowding_ / 4 : limit);
     }
     void interrupt() { signal_.interrupt(); }
@@ -188,7 +191,7 @@ public:
             first = outbox_.empty();
             outbox_.push_back({destination, std::move(message)});
         }
-        if (first)
+        if (first && mayWake())
             signal_.interrupt();
     }
 
@@ -414,6 +417,22 @@ private:
         const std::int64_t ranksPerCore = std::int64_t{4} * sharingRanks_ / std::max(1, cores); // in quarters
         crowding_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
+
+    // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile:
+    // to wake the thread that polls for each takes more CPU time than to send it, and they pack better together.
+    bool mayWake()
+    {
+        if (napLimit_.load() < std::chrono::milliseconds(1))
+            return true;
+        const Clock::time_point now = Clock::now();
+        if (now - lastWake_.load() < wakePause)
+            return false;
+        lastWake_ = now;
+        return true;
+    }
+
+    using Clock = std::chrono::steady_clock;
+    static constexpr std::chrono::nanoseconds wakePause{300000};
 
     using Record = detail::PacketRecord;
 
@@ -923,8 +942,10 @@ private:
 
     NapSignal signal_;
     mutable std::mutex mutex_;
-    std::vector<std::pair<int, Buffer>> outbox_; // under mutex_
-    bool sending_ = false;                       // under mutex_; something has left the outbox and not completed
+    std::vector<std::pair<int, Buffer>> outbox_;                                  // under mutex_
+    std::atomic<std::chrono::nanoseconds> napLimit_{std::chrono::nanoseconds(0)}; // of the last nap
+    std::atomic<Clock::time_point> lastWake_{Clock::time_point()};                // by send()
+    bool sending_ = false; // under mutex_; something has left the outbox and not completed
 
     // Only the thread that polls uses these.
     bool failed_ = false, told_ = false, leaving_ = false;

@@ -20,8 +20,8 @@
 //                                               was anything
 //   bool quiet() const;                         any thread. Nothing waits to be sent: all messages will arrive although
 //                                               this rank does not poll any more
-//   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until there is something to send,
-//                                               interrupt() is called, or `limit` has passed
+//   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until soon after there is something to
+//                                               send, interrupt() is called, or `limit` has passed
 //   void interrupt();                           any thread. Ends the nap under way, or else the next one
 //   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
 //                                               the handler is not called. Orderly: this rank expects no more messages;

@@ -773,13 +773,15 @@ private:
             const bool sends = isSender(rank_, round);
             const auto others = [&](int r) { return isSender(r, round) != sends; };
             Ledger ledger = expect(
-                *session_, [&](int r) { return !sends && others(r); }, 1, small);
+                *session_, [&](int r) { return !sends && others(r); }, 3, small);
             session_->poller->napFor(sends ? longNap_ : Clock::duration::zero());
             meet();
             const auto before = Clock::now();
-            if (sends) {
-                idle(std::chrono::milliseconds(10));
-                sendAll(*session_, others, 1, small);
+            for (std::uint64_t number = 0; sends && number < 3; ++number) {
+                idle(std::chrono::microseconds(number == 0 ? 10000 : 100)); // then one soon after another
+                for (int r = 0; r < size_; ++r)
+                    if (r != rank_ && others(r))
+                        send(*session_, r, number, small(number));
             }
             receive(*session_, ledger);
             if (const auto time = Clock::now() - before; time > soon_)
