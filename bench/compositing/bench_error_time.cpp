@@ -31,7 +31,11 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
         addDfb<dfb::OrderedBlend>(systems, connection, inputs, config, settings);
     };
-    add("float32", {WireFormat::Float32, {}, 0, true});
+    DfbSettings defaults;
+    defaults.isDefault = defaults.hasDefaultThreads = true;
+    addDfb<dfb::AlphaBlend>(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, "float32, defaults",
+                            defaults);
+    add("float32", {});
     addOrdered("in order, float32", {WireFormat::Float32, {}, 0, true});
     for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8}) {
         add(nameOf(format), {format});

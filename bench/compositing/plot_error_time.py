@@ -56,7 +56,7 @@ def fastest_of_kinds(results):
 
 def defaults(results):
     """What a program gets that sets nothing."""
-    return [r for r in results if r["system"] == "dfb" and r["config"] == "float32"]
+    return [r for r in results if r["system"] == "dfb" and r["config"] == "float32, defaults"]
 
 
 def draw(results, title, path):
