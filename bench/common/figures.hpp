@@ -36,8 +36,9 @@ inline double threadCpuSeconds() { return cpuSeconds(CLOCK_THREAD_CPUTIME_ID); }
 // The median absolute deviation says how far from the median half of the samples are at most. A quarter of the samples
 // is below `low`, a quarter above `high`.
 struct Figure {
-    double median = 0, deviation = 0, low = 0, high = 0;
+    double median = 0, deviation = 0;
     std::size_t count = 0;
+    double low = 0, high = 0;
 };
 
 inline double medianOf(std::vector<double>& samples)
