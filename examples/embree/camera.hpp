@@ -29,7 +29,8 @@ struct View {
     float domeAngle = 180;
 };
 
-struct Camera {
+// Where the camera is and what it sees, with rays in double.
+struct Pose {
     Vec3 origin;
     Vec3 forward, right, up; // orthonormal
     float tanHalfFov = 0;    // of the vertical angle
@@ -40,7 +41,7 @@ struct Camera {
     {
         const double sx = (2.0 * x / width - 1.0) * static_cast<double>(tanHalfFov) * static_cast<double>(aspect);
         const double sy = (1.0 - 2.0 * y / height) * static_cast<double>(tanHalfFov);
-        return Vec3(normalize(Vec3d(forward) + Vec3d(right) * sx + Vec3d(up) * sy));
+        return rounded(unit(Vec3d(forward) + Vec3d(right) * sx + Vec3d(up) * sy));
     }
 };
 
@@ -79,7 +80,7 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
 
 // The camera of frame `frame` of `frameCount`: a full turn around the centre of `focus` in `frameCount` frames.
 // y is up.
-inline Camera orbitCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
+inline Pose orbitPose(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
 {
     using detail::degree;
     const double azimuth = (static_cast<double>(view.azimuth) + 360.0 * frame / std::max(1, frameCount)) * degree;
@@ -87,12 +88,12 @@ inline Camera orbitCamera(const Focus& focus, const View& view, int frame, int f
     const Vec3d outward(std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
                         std::cos(elevation) * std::cos(azimuth));
     const Vec3d forward = outward * -1.0;
-    const Vec3d right = normalize(cross(forward, Vec3d(0, 1, 0)));
-    Camera camera;
-    camera.origin = Vec3(Vec3d(focus.box.center()) + outward * cameraDistance(focus, view, width, height));
-    camera.forward = Vec3(forward);
-    camera.right = Vec3(right);
-    camera.up = Vec3(cross(right, forward));
+    const Vec3d right = unit(cross(forward, Vec3d(0, 1, 0)));
+    Pose camera;
+    camera.origin = rounded(Vec3d(focus.box.center()) + outward * cameraDistance(focus, view, width, height));
+    camera.forward = rounded(forward);
+    camera.right = rounded(right);
+    camera.up = rounded(cross(right, forward));
     camera.tanHalfFov = static_cast<float>(std::tan(0.5 * static_cast<double>(view.fieldOfView) * degree));
     camera.aspect = static_cast<float>(width) / static_cast<float>(height);
     return camera;
@@ -102,22 +103,22 @@ inline Camera orbitCamera(const Focus& focus, const View& view, int frame, int f
 class FrameCamera {
 public:
     FrameCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
-        : pose_(orbitCamera(focus, view, frame, frameCount, width, height)), width_(width), height_(height),
-          pinhole_(dfb::PerspectiveCamera::along(of(pose_.origin), of(pose_.forward), of(pose_.up), view.fieldOfView))
+        : pose_(orbitPose(focus, view, frame, frameCount, width, height)), width_(width), height_(height),
+          pinhole_(dfb::PerspectiveCamera::along(pose_.origin, pose_.forward, pose_.up, view.fieldOfView))
     {
         const float unit = focus.box.largestExtent();
         const auto orOne = [](float v) { return v > 0 ? v : 1.0f; }; // of a scene without extent
         const float sharp =
             orOne(view.focus > 0 ? view.focus * unit : static_cast<float>(cameraDistance(focus, view, width, height)));
-        const dfb::Vec3 eye = of(pose_.origin), forward = of(pose_.forward), up = of(pose_.up);
+        const Vec3 eye = pose_.origin, forward = pose_.forward, up = pose_.up;
         switch (view.kind) {
         case CameraKind::Perspective: break;
         case CameraKind::DepthOfField:
             lens_ = dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
             break;
         case CameraKind::MotionBlur:
-            lens_ = dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, of(focus.box.center()), {0, 1, 0},
-                                         view.shutter);
+            lens_ =
+                dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, focus.box.center(), {0, 1, 0}, view.shutter);
             break;
         case CameraKind::Stereo:
             lens_ = dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);
@@ -126,7 +127,7 @@ public:
         }
     }
 
-    const Camera& pose() const { return pose_; }
+    const Pose& pose() const { return pose_; }
 
     // The ray through a point of the image, in pixels; false where the camera sees nothing.
     bool ray(double x, double y, const dfb::LensSample& sample, Vec3& origin, Vec3& direction) const
@@ -139,8 +140,8 @@ public:
                     return true;
                 } else {
                     const dfb::Ray ray = lens.ray(x, y, width_, height_, sample);
-                    origin = {ray.origin.x, ray.origin.y, ray.origin.z};
-                    direction = {ray.direction.x, ray.direction.y, ray.direction.z};
+                    origin = ray.origin;
+                    direction = ray.direction;
                     return dot(direction, direction) > 0;
                 }
             },
@@ -160,11 +161,10 @@ public:
     }
 
 private:
-    static dfb::Vec3 of(const Vec3& v) { return {v.x, v.y, v.z}; }
     static std::vector<dfb::Footprint> listOf(std::vector<dfb::Footprint> all) { return all; }
     static std::vector<dfb::Footprint> listOf(dfb::Footprint one) { return {std::move(one)}; }
 
-    Camera pose_;
+    Pose pose_;
     int width_, height_;
     dfb::PerspectiveCamera pinhole_;
     std::variant<std::monostate, dfb::ThinLensCamera, dfb::OrbitBlurCamera, dfb::StereoCamera, dfb::DomeCamera> lens_;

@@ -113,7 +113,7 @@ inline std::vector<Vec3> vertexNormals(const Mesh& mesh)
     std::vector<Vec3> normals;
     normals.reserve(sums.size());
     for (const Vec3d& sum : sums)
-        normals.push_back(Vec3(normalize(sum)));
+        normals.push_back(rounded(unit(sum)));
     return normals;
 }
 

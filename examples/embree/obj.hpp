@@ -36,7 +36,7 @@ inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* not
             const auto at = [&v](int i) { return static_cast<float>(v[i]); };
             detail::addVertex(mesh, {at(0), at(1), at(2)}, where);
             if (count == 6)
-                mesh.colors.emplace_back(at(3), at(4), at(5));
+                mesh.colors.push_back({at(3), at(4), at(5)});
         } else if (kind == "f") {
             const std::int64_t vertices = static_cast<std::int64_t>(mesh.positions.size());
             polygon.clear();

@@ -189,9 +189,9 @@ private:
             if (!property.isList) {
                 const double value = number(property.type, element, row);
                 if (isVertex && property.name.size() == 1 && property.name[0] >= 'x' && property.name[0] <= 'z')
-                    p[property.name[0] - 'x'] = static_cast<float>(value);
+                    component(p, property.name[0] - 'x') = static_cast<float>(value);
                 if (isVertex && property.channel >= 0) {
-                    color[property.channel] = static_cast<float>(value / largestOf(property.type));
+                    component(color, property.channel) = static_cast<float>(value / largestOf(property.type));
                     channels |= 1u << property.channel;
                 }
                 continue;

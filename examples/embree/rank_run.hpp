@@ -106,7 +106,7 @@ inline dfb::World worldOf(const RankScene& scene, const RenderSettings& settings
 {
     dfb::World world;
     const float ghosts = ghostReach(scene.info, settings);
-    const auto box = [](const Box& b) { return dfb::Box3{{b.lo.x, b.lo.y, b.lo.z}, {b.hi.x, b.hi.y, b.hi.z}}; };
+    const auto box = [](const Box& b) { return dfb::Box3{b.lo, b.hi}; };
     for (const std::uint32_t id : scene.brickIds)
         world.add({id, box(scene.bounds[id]), box(scene.bounds[id].padded(ghosts))});
     return world;

@@ -205,8 +205,8 @@ private:
             return 0;
         const FlushDenormals flush;
         const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
-        const Camera& view = camera.pose();
-        const Light light{normalize(view.forward * -0.75f + view.up * 0.55f + view.right * -0.40f)};
+        const Pose& view = camera.pose();
+        const Light light{unit(view.forward * -0.75f + view.up * 0.55f + view.right * -0.40f)};
         std::vector<Hit> hits, scratch;
         std::vector<VolumeRay> rays(volumes_.size());
         std::int64_t cost = 0;
@@ -234,9 +234,9 @@ private:
                     continue;
                 const Vec3 position = pointAt(origin, direction, sum.depth);
                 for (int i = 0; i < 3; ++i) {
-                    to.normal[3 * at + i] = sum.normal[i];
-                    to.albedo[3 * at + i] = sum.albedo[i];
-                    to.position[3 * at + i] = position[i];
+                    to.normal[3 * at + i] = component(sum.normal, i);
+                    to.albedo[3 * at + i] = component(sum.albedo, i);
+                    to.position[3 * at + i] = component(position, i);
                 }
                 to.primitiveId[at] = sum.primitive;
                 to.instanceId[at] = sum.instance;
@@ -276,8 +276,8 @@ private:
         const double u = unitReal(h), angle = 2 * 3.14159265358979323846 * unitReal(hash64(h)), r = std::sqrt(u);
         const Vec3d n(normal);
         const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d(0, 1, 0) : Vec3d(1, 0, 0);
-        const Vec3d a = normalize(cross(n, other)), b = cross(n, a);
-        return Vec3(normalize(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
+        const Vec3d a = unit(cross(n, other)), b = cross(n, a);
+        return rounded(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
     }
 
     // The part of the sky that a hit sees, as far as the rays look. Of everything that the brick has, in its cell or
@@ -316,13 +316,13 @@ private:
             ++cost;
             if (hits.empty()) {
                 const float sky = 0.9f + 0.5f * direction.y; // brighter above
-                return product(through, Vec3(sky, sky, 1.05f * sky));
+                return product(through, Vec3{sky, sky, 1.05f * sky});
             }
             hit = hits.front();
             point = pointAt(origin, direction, hit.t);
             through = product(through, hit.color);
         }
-        return Vec3(0, 0, 0);
+        return Vec3{0, 0, 0};
     }
 
     // The distances at which a ray enters and leaves a box; false if it misses.
@@ -331,7 +331,8 @@ private:
         enter = 0;
         leave = std::numeric_limits<float>::max();
         for (int i = 0; i < 3; ++i) {
-            const float a = (box.lo[i] - origin[i]) * inverse[i], b = (box.hi[i] - origin[i]) * inverse[i];
+            const float from = component(origin, i), steps = component(inverse, i);
+            const float a = (component(box.lo, i) - from) * steps, b = (component(box.hi, i) - from) * steps;
             if (std::isnan(a) || std::isnan(b))
                 continue; // 0 * infinity, of a ray within a face, limits nothing
             enter = std::max(enter, std::min(a, b));
@@ -344,7 +345,7 @@ private:
                       std::vector<Hit>& hits, std::vector<Hit>& scratch, std::vector<VolumeRay>& rays) const
     {
         Accumulator sum;
-        const Vec3 inverse(1 / direction.x, 1 / direction.y, 1 / direction.z);
+        const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
         float enter = 0, leave = 0;
         // Wider than the cell by more than rounding: it is the points that decide.
         const Box reach = cell_.padded(1e-5f * (scene_.bounds.largestExtent() + length(origin)));
@@ -431,7 +432,7 @@ private:
                     addHits(t);
                     if (isDone())
                         break;
-                    sum.albedo = sum.albedo + Vec3(entry.r, entry.g, entry.b) * static_cast<float>(sum.through);
+                    sum.albedo = sum.albedo + Vec3{entry.r, entry.g, entry.b} * static_cast<float>(sum.through);
                     sum.add(t, entry.r, entry.g, entry.b, entry.alpha);
                 }
             }

@@ -41,7 +41,7 @@ inline Placement fitToUnitCube(const Box& box, bool fit)
     const float extent = box.largestExtent(), scale = 1 / extent;
     if (fit && extent > 0 && isUsable(box.lo * scale) && isUsable(box.hi * scale)) {
         placement.scale = {scale, scale, scale};
-        placement.offset = Vec3(0.5f, 0.5f, 0.5f) - box.center() * scale;
+        placement.offset = Vec3{0.5f, 0.5f, 0.5f} - box.center() * scale;
     }
     return placement;
 }
@@ -259,12 +259,12 @@ inline void bisect(const Box& box, int count, std::vector<Box>& cells)
     const Vec3 extent = box.extent();
     const int axis = extent.x >= extent.y && extent.x >= extent.z ? 0 : extent.y >= extent.z ? 1 : 2;
     const int lower = count / 2;
-    const float plane = static_cast<float>(static_cast<double>(box.lo[axis])
-                                           + static_cast<double>(extent[axis]) * static_cast<double>(lower)
+    const float plane = static_cast<float>(static_cast<double>(component(box.lo, axis))
+                                           + static_cast<double>(component(extent, axis)) * static_cast<double>(lower)
                                                  / static_cast<double>(count));
     Box a = box, b = box;
-    a.hi[axis] = plane;
-    b.lo[axis] = plane;
+    component(a.hi, axis) = plane;
+    component(b.lo, axis) = plane;
     bisect(a, lower, cells);
     bisect(b, count - lower, cells);
 }
@@ -296,7 +296,7 @@ inline std::vector<Box> cutScene(const Scene& scene, int count)
     }
     auto plane = [&](int axis, int i) {
         const int n = grid[static_cast<std::size_t>(axis)];
-        const float lo = scene.bounds.lo[axis], hi = scene.bounds.hi[axis];
+        const float lo = component(scene.bounds.lo, axis), hi = component(scene.bounds.hi, axis);
         return i == n ? hi : lo + (hi - lo) * (static_cast<float>(i) / static_cast<float>(n));
     };
     for (int z = 0; z < grid[2]; ++z)
@@ -354,9 +354,10 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         return;
     Index3 lo, hi;
     for (int i = 0; i < 3; ++i) {
-        const float offset = object.placement.offset[i], scale = object.placement.scale[i];
+        const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
         const std::size_t axis = static_cast<std::size_t>(i);
-        const float first = scale > 0 ? part.lo[i] : part.hi[i], behind = scale > 0 ? part.hi[i] : part.lo[i];
+        const float low = component(part.lo, i), high = component(part.hi, i);
+        const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
         const int last = object.source.info.dims[axis] - 1;
         // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
         const auto voxel = [&](float world, float slack) {

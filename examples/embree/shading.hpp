@@ -79,7 +79,7 @@ struct Light {
     // Highlight for a unit normal and the unit direction of the view ray.
     float specular(const Vec3& normal, const Vec3& view) const
     {
-        const float c = std::fabs(dot(normal, normalize(direction - view)));
+        const float c = std::fabs(dot(normal, unit(direction - view)));
         const float c2 = c * c, c4 = c2 * c2, c8 = c4 * c4, c16 = c8 * c8;
         return 0.22f * c16 * c16;
     }
@@ -87,7 +87,7 @@ struct Light {
     Vec3 shade(const Vec3& color, const Vec3& normal, const Vec3& view) const
     {
         const float s = specular(normal, view);
-        return color * diffuse(normal) + Vec3(s, s, s);
+        return color * diffuse(normal) + Vec3{s, s, s};
     }
 };
 

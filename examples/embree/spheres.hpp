@@ -76,10 +76,10 @@ public:
                 if (column == symbolColumn_)
                     symbol = word;
                 else if (column >= placeColumn_ && column < placeColumn_ + 3)
-                    ok = ok && parseNumber(word, at[column - placeColumn_]);
+                    ok = ok && parseNumber(word, component(at, column - placeColumn_));
             }
             Sphere sphere;
-            sphere.center = Vec3(at);
+            sphere.center = rounded(at);
             if (!ok || !isUsable(sphere.center))
                 fail("expected 'element x y z' with finite numbers below 1e15");
             const int element = elementNumber(symbol);

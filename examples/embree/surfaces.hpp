@@ -265,8 +265,8 @@ private:
         const std::vector<Vec3>& colors = part.mesh.colors;
         if (colors.empty())
             return part.color;
-        return Vec3(Vec3d(colors[triangle[0]]) * (1 - u - v) + Vec3d(colors[triangle[1]]) * u
-                    + Vec3d(colors[triangle[2]]) * v);
+        return rounded(Vec3d(colors[triangle[0]]) * (1 - u - v) + Vec3d(colors[triangle[1]]) * u
+                       + Vec3d(colors[triangle[2]]) * v);
     }
 
     // Notes the hit and rejects it, so that Embree goes on to the next one.
@@ -287,7 +287,7 @@ private:
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];
-        hit.normal = Vec3(normalize(normal));
+        hit.normal = rounded(unit(normal));
         hit.color = colorAt(part, triangle, u, v);
         query.keep(distance, hit);
     }
@@ -358,7 +358,7 @@ private:
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[arguments->primID];
-        hit.normal = Vec3(normalize(d * t - toCenter));
+        hit.normal = rounded(unit(d * t - toCenter));
         hit.color = sphere.color;
         query.keep(t, hit);
         if (query.mayEnd && query.isFull()) { // with room for the rounding of Embree's boxes

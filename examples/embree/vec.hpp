@@ -1,5 +1,8 @@
-// Vec3: vectors, boxes, and the few pure functions on them that every rank must compute to the same bit.
+// Vec3: the library's vectors, boxes, and the few pure functions on them that every rank must compute to the same bit.
+// Vec3d: the same in double, where digits matter.
 #pragma once
+
+#include <dfb/render/world.hpp>
 
 #include <algorithm>
 #include <cmath>
@@ -8,59 +11,49 @@
 
 namespace example {
 
-template <class T>
-struct Vec3T {
-    T x = 0, y = 0, z = 0;
+using dfb::Vec3;
 
-    Vec3T() = default;
-    Vec3T(T xValue, T yValue, T zValue) : x(xValue), y(yValue), z(zValue) {}
-    template <class U>
-    explicit Vec3T(const Vec3T<U>& v) : x(static_cast<T>(v.x)), y(static_cast<T>(v.y)), z(static_cast<T>(v.z))
+inline float& component(Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+inline float component(const Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+inline float length(const Vec3& a) { return std::sqrt(dot(a, a)); }
+
+struct Vec3d {
+    double x = 0, y = 0, z = 0;
+
+    Vec3d() = default;
+    Vec3d(double xValue, double yValue, double zValue) : x(xValue), y(yValue), z(zValue) {}
+    explicit Vec3d(const Vec3& v)
+        : x(static_cast<double>(v.x)), y(static_cast<double>(v.y)), z(static_cast<double>(v.z))
     {
     }
-
-    T& operator[](int axis) { return axis == 0 ? x : axis == 1 ? y : z; }
-    T operator[](int axis) const { return axis == 0 ? x : axis == 1 ? y : z; }
 };
 
-using Vec3 = Vec3T<float>;
-using Vec3d = Vec3T<double>;
+inline Vec3 rounded(const Vec3d& v)
+{
+    return {static_cast<float>(v.x), static_cast<float>(v.y), static_cast<float>(v.z)};
+}
 
-template <class T>
-Vec3T<T> operator+(const Vec3T<T>& a, const Vec3T<T>& b)
-{
-    return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-template <class T>
-Vec3T<T> operator-(const Vec3T<T>& a, const Vec3T<T>& b)
-{
-    return {a.x - b.x, a.y - b.y, a.z - b.z};
-}
-template <class T>
-Vec3T<T> operator*(const Vec3T<T>& a, T s)
-{
-    return {a.x * s, a.y * s, a.z * s};
-}
-template <class T>
-T dot(const Vec3T<T>& a, const Vec3T<T>& b)
-{
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
-template <class T>
-Vec3T<T> cross(const Vec3T<T>& a, const Vec3T<T>& b)
+inline Vec3d operator+(const Vec3d& a, const Vec3d& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+inline Vec3d operator-(const Vec3d& a, const Vec3d& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+inline Vec3d operator*(const Vec3d& a, double s) { return {a.x * s, a.y * s, a.z * s}; }
+inline double dot(const Vec3d& a, const Vec3d& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+inline Vec3d cross(const Vec3d& a, const Vec3d& b)
 {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-template <class T>
-T length(const Vec3T<T>& a)
-{
-    return std::sqrt(dot(a, a));
-}
+inline double length(const Vec3d& a) { return std::sqrt(dot(a, a)); }
+
+inline double& component(Vec3d& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
+
 // The zero vector stays the zero vector.
-template <class T>
-Vec3T<T> normalize(const Vec3T<T>& a)
+inline Vec3d unit(const Vec3d& a)
 {
-    const T l = length(a);
+    const double l = length(a);
+    return l > 0 ? a * (1 / l) : a;
+}
+inline Vec3 unit(const Vec3& a)
+{
+    const float l = length(a);
     return l > 0 ? a * (1 / l) : a;
 }
 // Finite, and small enough for squares and sums of such.
@@ -100,8 +93,8 @@ struct Box {
     void grow(const Vec3& p, float radius = 0)
     {
         for (int i = 0; i < 3; ++i) {
-            lo[i] = std::min(lo[i], p[i] - radius);
-            hi[i] = std::max(hi[i], p[i] + radius);
+            component(lo, i) = std::min(component(lo, i), component(p, i) - radius);
+            component(hi, i) = std::max(component(hi, i), component(p, i) + radius);
         }
     }
     void grow(const Box& b)
@@ -122,7 +115,7 @@ struct Box {
     }
     Box padded(float amount) const
     {
-        const Vec3 pad(amount, amount, amount);
+        const Vec3 pad{amount, amount, amount};
         Box box;
         box.lo = lo - pad;
         box.hi = hi + pad;
@@ -140,8 +133,8 @@ inline Box intersection(const Box& a, const Box& b)
 {
     Box box;
     for (int i = 0; i < 3; ++i) {
-        box.lo[i] = std::max(a.lo[i], b.lo[i]);
-        box.hi[i] = std::min(a.hi[i], b.hi[i]);
+        component(box.lo, i) = std::max(component(a.lo, i), component(b.lo, i));
+        component(box.hi, i) = std::min(component(a.hi, i), component(b.hi, i));
     }
     return box;
 }

@@ -214,8 +214,7 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path, 
         const auto [begin, end] =
             loaders.shareOf(static_cast<std::uint64_t>(info.dims[0]) * static_cast<std::uint64_t>(info.dims[1])
                             * static_cast<std::uint64_t>(info.dims[2]));
-        return std::vector<VoxelRange>{
-            scanVoxels(stream, path, info.type, begin, end, *loaders.readCounter())};
+        return std::vector<VoxelRange>{scanVoxels(stream, path, info.type, begin, end, *loaders.readCounter())};
     }));
     const float lo = range.lo, hi = range.hi;
     info.notFinite = range.notFinite;
@@ -297,7 +296,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
                 }
             for (const int x : {first, last})
                 if (x >= 0)
-                    points.emplace_back(static_cast<float>(x), static_cast<float>(y), static_cast<float>(z));
+                    points.push_back({static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)});
         }
         return points;
     });

@@ -24,15 +24,15 @@ class VolumeSampler {
 public:
     // `step`: distance between samples in world space.
     VolumeSampler(BrickVolume volume, float step)
-        : volume_(std::move(volume)),
-          inverseScale_(1 / volume_.placement.scale.x, 1 / volume_.placement.scale.y, 1 / volume_.placement.scale.z),
-          shift_(-volume_.placement.offset.x * inverseScale_.x, -volume_.placement.offset.y * inverseScale_.y,
-                 -volume_.placement.offset.z * inverseScale_.z),
+        : volume_(std::move(volume)), inverseScale_{1 / volume_.placement.scale.x, 1 / volume_.placement.scale.y,
+                                                    1 / volume_.placement.scale.z},
+          shift_{-volume_.placement.offset.x * inverseScale_.x, -volume_.placement.offset.y * inverseScale_.y,
+                 -volume_.placement.offset.z * inverseScale_.z},
           transferFunction_(256 * step / volume_.placement.size() / static_cast<float>(largestIndex())),
           valueScale_(1 / (info().maximum - info().minimum))
     {
         for (int i = 0; i < 3; ++i)
-            slopeScale_[i] = std::copysign(0.5f * valueScale_, inverseScale_[i]);
+            component(slopeScale_, i) = std::copysign(0.5f * valueScale_, component(inverseScale_, i));
         dispatch([this](const auto* voxels) { buildSkipGrid(voxels); });
     }
 
@@ -74,8 +74,9 @@ public:
         float steps = 1e6f;
         const int cell[3] = {cx, cy, cz};
         for (int i = 0; i < 3; ++i) {
-            const int wall = (inverseStep[i] > 0 ? cell[i] + distance : cell[i] - distance + 1) * cellWidth;
-            const float s = (static_cast<float>(wall) - v[i]) * inverseStep[i];
+            const float inverse = component(inverseStep, i);
+            const int wall = (inverse > 0 ? cell[i] + distance : cell[i] - distance + 1) * cellWidth;
+            const float s = (static_cast<float>(wall) - component(v, i)) * inverse;
             steps = s < steps ? s : steps; // false for 0 * infinity, which is not a number
         }
         return static_cast<int>(std::max(0.0f, steps - 0.05f)) + 1; // 0.05 for rounding
@@ -120,9 +121,9 @@ private:
                         next = plane(p + along, a, b, fa, fb), behind = plane(p + 2 * along, a, b, fa, fb);
             return lerp(next - before, behind - here, f);
         };
-        const Vec3 rise(slope(dx, dy, dz, fx, fy, fz), slope(dy, dx, dz, fy, fx, fz),
-                        lerp(z1 - plane(p - dz, dx, dy, fx, fy), plane(p + 2 * dz, dx, dy, fx, fy) - z0, fz));
-        const Vec3 gradient(rise.x * slopeScale_.x, rise.y * slopeScale_.y, rise.z * slopeScale_.z);
+        const Vec3 rise{slope(dx, dy, dz, fx, fy, fz), slope(dy, dx, dz, fy, fx, fz),
+                        lerp(z1 - plane(p - dz, dx, dy, fx, fy), plane(p + 2 * dz, dx, dy, fx, fy) - z0, fz)};
+        const Vec3 gradient{rise.x * slopeScale_.x, rise.y * slopeScale_.y, rise.z * slopeScale_.z};
         const float steepness = length(gradient);
         if (steepness > 0) {
             // Where the value hardly changes its direction is noise: there the colour is left as it is.

@@ -24,6 +24,7 @@ namespace cut_cases {
 namespace {
 
 using example::Box;
+using example::component;
 using example::Index3;
 using example::Scene;
 using example::Vec3;
@@ -42,23 +43,24 @@ void checkTiling(const std::vector<Box>& cells, const Box& bounds)
     std::set<float> planes[3];
     for (int axis = 0; axis < 3; ++axis)
         for (const Box& c : cells) {
-            REQUIRE(c.lo[axis] < c.hi[axis]);
-            planes[axis].insert({c.lo[axis], c.hi[axis]});
+            const float lower = component(c.lo, axis), upper = component(c.hi, axis);
+            REQUIRE(lower < upper);
+            planes[axis].insert({lower, upper});
         }
     for (int axis = 0; axis < 3; ++axis) {
-        CHECK(*planes[axis].begin() == bounds.lo[axis]);
-        CHECK(*planes[axis].rbegin() == bounds.hi[axis]);
+        CHECK(*planes[axis].begin() == component(bounds.lo, axis));
+        CHECK(*planes[axis].rbegin() == component(bounds.hi, axis));
     }
     int wrong = 0;
     for (const float x : planes[0])
         for (const float y : planes[1])
             for (const float z : planes[2]) {
-                const Vec3 p(x, y, z);
+                const Vec3 p{x, y, z};
                 const bool inside = x < bounds.hi.x && y < bounds.hi.y && z < bounds.hi.z;
                 wrong += cellsWith(cells, p) != (inside ? 1 : 0);
                 // The last point before all three planes.
                 const float least = -std::numeric_limits<float>::infinity();
-                const Vec3 q(std::nextafter(x, least), std::nextafter(y, least), std::nextafter(z, least));
+                const Vec3 q{std::nextafter(x, least), std::nextafter(y, least), std::nextafter(z, least)};
                 wrong += cellsWith(cells, q) != (bounds.contains(q) ? 1 : 0);
             }
     CHECK(wrong == 0);
@@ -388,8 +390,10 @@ TEST_CASE("A brick holds its part of the volume, with ghosts, and no more", "[cu
         // Interpolation of values and gradients at any point in the cell reads from one voxel before to two behind.
         for (int axis = 0; axis < 3; ++axis) {
             const std::size_t a = static_cast<std::size_t>(axis);
-            const float scale = object.placement.scale[axis], offset = object.placement.offset[axis];
-            const float ends[2] = {(cells[id].lo[axis] - offset) / scale, (cells[id].hi[axis] - offset) / scale};
+            const float scale = component(object.placement.scale, axis),
+                        offset = component(object.placement.offset, axis);
+            const float ends[2] = {(component(cells[id].lo, axis) - offset) / scale,
+                                   (component(cells[id].hi, axis) - offset) / scale};
             const float first = std::max(0.0f, std::min(ends[0], ends[1])),
                         behind = std::min(127.0f, std::max(ends[0], ends[1]));
             CHECK(block.lo()[a] <= static_cast<int>(first) - 1);
@@ -474,10 +478,12 @@ TEST_CASE("Each hit of a ray belongs to one brick", "[cut]")
                 auto next = real;
                 Vec3 origin, target;
                 for (int axis = 0; axis < 3; ++axis) {
-                    origin[axis] = scene.bounds.center()[axis] + 4 * scene.bounds.largestExtent() * (next() - 0.5f);
-                    target[axis] = scene.bounds.lo[axis] + scene.bounds.extent()[axis] * next();
+                    component(origin, axis) =
+                        component(scene.bounds.center(), axis) + 4 * scene.bounds.largestExtent() * (next() - 0.5f);
+                    component(target, axis) =
+                        component(scene.bounds.lo, axis) + component(scene.bounds.extent(), axis) * next();
                 }
-                const Vec3 direction = normalize(target - origin);
+                const Vec3 direction = example::unit(target - origin);
                 std::vector<example::Hit> expected, got, all;
                 whole->intersect(origin, direction, expected);
                 for (const auto& part : parts) {

@@ -43,8 +43,8 @@ std::vector<Vec3> pointsOf(const Scene& scene)
         for (const example::Sphere& sphere : object.spheres)
             for (int i = 0; i < 27; ++i)
                 points.push_back(sphere.center
-                                 + normalize(Vec3(static_cast<float>(i % 3 - 1), static_cast<float>(i / 3 % 3 - 1),
-                                                  static_cast<float>(i / 9 - 1)))
+                                 + example::unit(Vec3{static_cast<float>(i % 3 - 1), static_cast<float>(i / 3 % 3 - 1),
+                                                      static_cast<float>(i / 9 - 1)})
                                        * sphere.radius);
     for (const auto& object : scene.volumes)
         for (const example::Sphere& corner : corners(object.bounds().lo, object.bounds().hi, 0))
@@ -53,7 +53,7 @@ std::vector<Vec3> pointsOf(const Scene& scene)
 }
 
 // How far out the farthest of the points is in the image: 1 is the border, infinity behind the camera.
-float farthestOf(const std::vector<Vec3>& points, const example::Camera& camera)
+float farthestOf(const std::vector<Vec3>& points, const example::Pose& camera)
 {
     float farthest = 0;
     for (const Vec3& p : points) {
@@ -188,7 +188,7 @@ TEST_CASE("A very narrow image has a camera at a distance that can be reckoned w
     settings.width = 1;
     settings.height = 65536;
     const example::SceneInfo info(scene);
-    const float distance = length(frameCamera(info, settings, 0).pose().origin - info.focus.box.center());
+    const float distance = example::length(frameCamera(info, settings, 0).pose().origin - info.focus.box.center());
     CHECK(distance > 100.0f);
     CHECK(distance < 1001.0f);
 }

@@ -18,6 +18,7 @@ namespace opaque_cases {
 namespace {
 
 using example::Box;
+using example::component;
 using example::Scene;
 using example::Vec3;
 
@@ -90,7 +91,7 @@ std::vector<example::Sphere> swarm(int count, float radius, const Vec3& lo, cons
     for (int i = 0; i < count; ++i) {
         example::Sphere sphere;
         for (int axis = 0; axis < 3; ++axis)
-            sphere.center[axis] = lo[axis] + (hi[axis] - lo[axis]) * next();
+            component(sphere.center, axis) = component(lo, axis) + (component(hi, axis) - component(lo, axis)) * next();
         sphere.radius = radius;
         sphere.color = {next(), next(), next()};
         spheres.push_back(sphere);
@@ -252,8 +253,8 @@ TEST_CASE("The first hits of a ray are those of all", "[opaque]")
         std::uint64_t key = 3;
         const auto next = [&key] { return static_cast<float>(example::unitReal(key = example::hash64(key))); };
         for (int i = 0; i < 1000; ++i) {
-            const Vec3 origin(4 * next() - 2, 4 * next() - 2, 4 * next() - 2), target(next(), next(), next());
-            const Vec3 direction = normalize(target - origin);
+            const Vec3 origin{4 * next() - 2, 4 * next() - 2, 4 * next() - 2}, target{next(), next(), next()};
+            const Vec3 direction = example::unit(target - origin);
             surfaces.intersect(origin, direction, all);
             seen += all.size();
             wrong += !std::is_sorted(all.begin(), all.end(),

@@ -620,7 +620,7 @@ TEST_CASE("OBJ: errors name the line, and the index as it is in the file", "[rea
 
 TEST_CASE("The colours of vertices are taken as sRGB", "[readers]")
 {
-    const Vec3 black(0, 0, 0), half(0.214f, 0.214f, 0.214f), red(1, 0, 0);
+    const Vec3 black{0, 0, 0}, half{0.214f, 0.214f, 0.214f}, red{1, 0, 0};
     const auto check = [&](const Mesh& mesh) {
         REQUIRE(mesh.positions.size() == 3);
         REQUIRE(mesh.colors.size() == 3);
@@ -675,14 +675,14 @@ TEST_CASE("A scene takes files by their ending and says which one is wrong", "[r
     CHECK(scene.spheres.size() == 1);
     // Each fills the unit cube, and the bounds are hardly larger.
     for (int axis = 0; axis < 3; ++axis) {
-        CHECK(scene.bounds.lo[axis] < 0.0f);
-        CHECK(scene.bounds.lo[axis] > -1e-3f);
-        CHECK(scene.bounds.hi[axis] > 1.0f);
-        CHECK(scene.bounds.hi[axis] < 1.001f);
+        CHECK(example::component(scene.bounds.lo, axis) < 0.0f);
+        CHECK(example::component(scene.bounds.lo, axis) > -1e-3f);
+        CHECK(example::component(scene.bounds.hi, axis) > 1.0f);
+        CHECK(example::component(scene.bounds.hi, axis) < 1.001f);
     }
     Scene unfitted;
     addFile(unfitted, folder / "m.xyz", false);
-    CHECK(length(unfitted.bounds.center() - Vec3(100, 200, 300)) < 1e-3f);
+    CHECK(length(unfitted.bounds.center() - Vec3{100, 200, 300}) < 1e-3f);
 
     for (const std::string name : {"x.ply", "x.obj", "x.xyz", "x_2x2x2_uint8.raw", "x.stl", "x", "m.PLY"}) {
         INFO(name); // of which none is there

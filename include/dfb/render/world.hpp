@@ -20,6 +20,7 @@ struct Vec3 {
 inline Vec3 operator+(const Vec3& a, const Vec3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
 inline Vec3 operator-(const Vec3& a, const Vec3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
 inline Vec3 operator*(float s, const Vec3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
+inline Vec3 operator*(const Vec3& a, float s) noexcept { return s * a; }
 inline float dot(const Vec3& a, const Vec3& b) noexcept { return a.x * b.x + a.y * b.y + a.z * b.z; }
 inline Vec3 cross(const Vec3& a, const Vec3& b) noexcept
 {
