@@ -70,7 +70,7 @@ void checkMesh(const Mesh& mesh)
                   "all vertices have a colour or none");
     for (const Vec3& c : mesh.colors)
         for (int i = 0; i < 3; ++i)
-            fuzz::require(c[i] >= 0 && c[i] <= 1, "a colour is one");
+            fuzz::require(component(c, i) >= 0 && component(c, i) <= 1, "a colour is one");
     const Mesh again = parsePly(plyOf(mesh), name);
     bool same = again.positions.size() == mesh.positions.size() && again.triangles == mesh.triangles;
     for (std::size_t i = 0; i < mesh.positions.size() && same; ++i)
@@ -95,7 +95,7 @@ void checkSpheres(const std::vector<Sphere>& spheres)
     for (const Sphere& s : spheres) {
         fuzz::require(isUsable(s.center) && s.radius > 0, "an atom is usable");
         for (int i = 0; i < 3; ++i)
-            fuzz::require(s.color[i] >= 0 && s.color[i] <= 1, "its colour is one");
+            fuzz::require(component(s.color, i) >= 0 && component(s.color, i) <= 1, "its colour is one");
         text += "C " + textOf(s.center.x) + ' ' + textOf(s.center.y) + ' ' + textOf(s.center.z) + '\n';
     }
     const auto again = parseXyz(text, name);
