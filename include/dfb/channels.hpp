@@ -37,7 +37,7 @@ inline constexpr ChannelMask instanceIdChannel = 64;  // the same
 // into the pixel. It is compared, never blended and no part of an image.
 inline constexpr ChannelMask farChannel = 128;
 
-// What an image can have beside colour and depth.
+// The channels that an image can have beside colour and depth.
 inline constexpr ChannelMask imageAuxChannels =
     normalChannel | albedoChannel | positionChannel | primitiveIdChannel | instanceIdChannel;
 inline constexpr ChannelMask allChannels = colorChannel | depthChannel | imageAuxChannels | farChannel;

@@ -26,7 +26,8 @@ inline std::string printed(const char* format, std::va_list values)
     return text;
 }
 
-// What printf() would write. It takes less of a compiler's time than sums of strings, and there are many of them.
+// The text that printf() would write. It takes less of a compiler's time than sums of strings, and there are many of
+// them.
 [[gnu::format(printf, 1, 2)]] inline std::string printed(const char* format, ...)
 {
     std::va_list values;
@@ -74,7 +75,7 @@ inline const char* toString(ErrorKind kind)
     return "unknown error";
 }
 
-// What went wrong, and where. A negative number means "does not apply".
+// An error and its place. A negative number means "does not apply".
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
     // Where it went wrong: the rank whose code threw, that cancelled or left, passed the wrong argument, or is lost. Of

@@ -1,4 +1,4 @@
-// What goes into a frame and what comes out of it: configuration, parameters, report.
+// The configuration of framebuffers, the parameters of frames, and the report of a frame.
 #pragma once
 
 #include <dfb/channels.hpp>
@@ -39,7 +39,7 @@ struct MessageConfig {
     std::size_t poolBytes = std::size_t{64} << 20;
 };
 
-// What a framebuffer is made with. How its messages travel is the NetworkConfig of its connection.
+// The configuration of a framebuffer. The NetworkConfig of its connection says how its messages travel.
 struct FrameBufferConfig {
     FrameBufferConfig() = default;
     FrameBufferConfig(int width, int height, OutputFormat format = OutputFormat::RGBA8, bool depth = false)

@@ -192,7 +192,7 @@ inline int toUnorm8Sse2(const double* values, int count, std::uint8_t* out, doub
     return i;
 }
 
-// The same, four at a time.
+// toUnorm8Sse2() four at a time.
 DFB_AVX2 inline int toUnorm8Avx2(const double* values, int count, std::uint8_t* out, double& farthest) noexcept
 {
 #if defined(DFB_HAS_AVX2_CLONES)

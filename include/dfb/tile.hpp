@@ -14,7 +14,7 @@
 
 namespace dfb {
 
-// Who an input of a tile is. (tile, pass, generation, source, part) is unique in a frame.
+// Identifies an input of a tile. (tile, pass, generation, source, part) is unique in a frame.
 struct TileHeader {
     std::int64_t frame = -1;  // set by Frame::start
     int tile = -1;            // index in the TileLayout

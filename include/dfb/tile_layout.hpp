@@ -113,7 +113,7 @@ struct WallLayout {
     int height() const noexcept { return rows * displayHeight + (rows - 1) * bezelY; }
     int displayCount() const noexcept { return columns * rows; }
 
-    // What a display shows of the framebuffer.
+    // The part of the framebuffer that a display shows.
     Region region(int display) const noexcept
     {
         const int x0 = display % columns * (displayWidth + bezelX), y0 = display / columns * (displayHeight + bezelY);

@@ -52,7 +52,7 @@
 
 namespace dfb {
 
-// What newFrame() is told of the tile and the frame.
+// The tile and the frame that newFrame() begins.
 struct TileInfo {
     int rank = 0; // that owns the tile
     std::int64_t frame = 0;
@@ -289,7 +289,7 @@ private:
     std::vector<double> color_;
 };
 
-// What a TileOp says of a tile that it has finished, if it has a member report().
+// Figures of a finished tile, which a TileOp sets in report() if it has that member.
 struct TileReport {
     double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
     std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right

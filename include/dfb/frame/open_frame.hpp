@@ -95,7 +95,7 @@ public:
         result.inTime = failNow(info);
         return result;
     }
-    // The same, by word of another rank, which has told all.
+    // Fails the frame because another rank says so; that one has told all.
     void failElsewhere(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);

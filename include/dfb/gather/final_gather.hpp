@@ -466,7 +466,7 @@ public:
         return isMissing(static_cast<std::size_t>(owner))
                && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
-    // The same: the tile of a frame that is over is not to be seen. Called in the order of tiles.
+    // On the display rank: hides a tile of a frame that is over. Called in the order of tiles.
     void setIncomplete(int tile)
     {
         if (tile < 0 || tile >= static_cast<int>(state_.size()))
@@ -474,7 +474,7 @@ public:
         state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
         incomplete_.push_back(tile);
     }
-    // The same: nothing has come for it in this frame.
+    // On the display rank: whether nothing has come for the tile in this frame.
     bool hasNothing(int tile) const
     {
         return isDisplay() && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;

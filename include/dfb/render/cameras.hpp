@@ -20,7 +20,7 @@ struct Ray {
     Vec3 origin, direction;
 };
 
-// What lens and shutter need besides a point of the image.
+// The point of the lens and the moment of the shutter of a ray.
 struct LensSample {
     double lensU = 0, lensV = 0, time = 0;
 };

@@ -71,7 +71,7 @@ public:
         return std::all_of(plan_.begin(), plan_.end(), [](const TileSamples& t) { return t.count == 0; });
     }
 
-    // What the next frame is to begin with; the rest is as in `params`.
+    // The parameters of the next frame; the others are those of `params`.
     FrameConfig next(FrameConfig params = {}) const
     {
         params.samples = std::make_shared<const std::vector<TileSamples>>(plan_);

@@ -326,7 +326,7 @@ inline void findInputs(const World& world, const std::vector<BrickInTile>& pairs
 
 } // namespace detail
 
-// What a rank declares that renders these pairs: the source is the brick's id.
+// Returns the inputs that a rank declares if it renders these pairs; the source is the brick's id.
 inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs)
 {
     std::vector<TileInput> inputs;

@@ -4,8 +4,6 @@
 #include "SortAndBlend.hpp"
 #include "context.hpp"
 
-#include <dfb/testing/adversarial.hpp>
-
 namespace {
 
 int failures = 0;

@@ -168,7 +168,7 @@ std::vector<Pixel> referenceOf(const TileInputs<Size>& in, const Rule& rule)
     return result;
 }
 
-// The same for AlphaBlend and ImageParallel.
+// The exact pixels of AlphaBlend and ImageParallel.
 template <int Size>
 std::vector<Pixel> referenceOf(const TileInputs<Size>& in)
 {
@@ -200,8 +200,8 @@ ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixe
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
 // Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
 // the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
-// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each the
-// generation and source that the operation expects; by default generation 1 and source `layer`. For operations that
+// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each
+// the generation and source that the operation expects; by default generation 1 and source `layer`. For operations that
 // keep no state.
 template <class Op, class Label>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
