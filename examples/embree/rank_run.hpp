@@ -433,8 +433,7 @@ private:
                 .start([&](auto& tile) { count(scene_->renderers.front().front().renderTile(tile, frame)); }, params,
                        tileData, pixelData);
         } else if constexpr (std::is_same_v<TileOp, Ordered>) {
-            const Vec3& eye = camera.pose().origin;
-            const std::vector<int> order = dfb::visibilityOrder(*shared_, {eye.x, eye.y, eye.z});
+            const std::vector<int> order = dfb::visibilityOrder(*shared_, camera.pinhole().eye());
             return once(orderedLoop_, *fb_, *shared_, inTurn_)
                 .start(camera, order, renderBrick, params, tileData, pixelData);
         } else if (!shared_) {

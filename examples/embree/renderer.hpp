@@ -205,16 +205,16 @@ private:
             return 0;
         const FlushDenormals flush;
         const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
-        const Pose& view = camera.pose();
-        const Light light{unit(view.forward * -0.75f + view.up * 0.55f + view.right * -0.40f)};
+        const dfb::PerspectiveCamera& view = camera.pinhole();
+        const Light light{unit(view.forward() * -0.75f + view.up() * 0.55f + view.right() * -0.40f)};
         std::vector<Hit> hits, scratch;
         std::vector<VolumeRay> rays(volumes_.size());
         std::int64_t cost = 0;
         for (int y = to.region.y0; y < to.region.y1; ++y)
             for (int x = to.region.x0; x < to.region.x1; ++x) {
                 const RaySample sample = sampleAt(x, y, to.sample, frameIndex);
-                Vec3 origin, direction;
-                if (!camera.ray(sample.x, sample.y, sample.lens, origin, direction))
+                const auto [origin, direction] = camera.ray(sample.x, sample.y, sample.lens);
+                if (!(dot(direction, direction) > 0))
                     continue;
                 const Accumulator sum = trace(origin, direction, light, sample.key, hits, scratch, rays);
                 cost += sum.cost;

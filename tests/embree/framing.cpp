@@ -53,16 +53,19 @@ std::vector<Vec3> pointsOf(const Scene& scene)
 }
 
 // How far out the farthest of the points is in the image: 1 is the border, infinity behind the camera.
-float farthestOf(const std::vector<Vec3>& points, const example::Pose& camera)
+float farthestOf(const std::vector<Vec3>& points, const dfb::PerspectiveCamera& camera,
+                 const example::RenderSettings& image)
 {
+    const float tanHalf = std::tan(image.view.fieldOfView * 3.14159265f / 360),
+                aspect = static_cast<float>(image.width) / static_cast<float>(image.height);
     float farthest = 0;
     for (const Vec3& p : points) {
-        const Vec3 to = p - camera.origin;
-        const float depth = dot(to, camera.forward);
+        const Vec3 to = p - camera.eye();
+        const float depth = dot(to, camera.forward());
         if (!(depth > 0))
             return std::numeric_limits<float>::infinity();
-        const float y = std::fabs(dot(to, camera.up)) / (depth * camera.tanHalfFov),
-                    x = std::fabs(dot(to, camera.right)) / (depth * camera.tanHalfFov * camera.aspect);
+        const float y = std::fabs(dot(to, camera.up())) / (depth * tanHalf),
+                    x = std::fabs(dot(to, camera.right())) / (depth * tanHalf * aspect);
         farthest = std::max({farthest, x, y});
     }
     return farthest;
@@ -129,7 +132,8 @@ TEST_CASE("Every point of a scene is in the default view", "[framing]")
                 for (const float elevation : {20.0f, 90.0f, -35.0f})
                     for (int frame = 0; frame < settings.frames; ++frame) {
                         settings.view.elevation = elevation;
-                        farthest = std::max(farthest, farthestOf(points, frameCamera(info, settings, frame).pose()));
+                        const example::FrameCamera camera = frameCamera(info, settings, frame);
+                        farthest = std::max(farthest, farthestOf(points, camera.pinhole(), settings));
                     }
                 CHECK(farthest < 1.0f);
                 if (name == "a sphere") // as large as it can be
@@ -160,8 +164,8 @@ TEST_CASE("No kind of camera cuts off a scene by default", "[framing]")
                 settings.view.domeAngle = 20;
                 const example::FrameCamera camera = frameCamera(info, settings, 0);
                 const auto meets = [&](double x, double y, const dfb::LensSample& lens) {
-                    Vec3 origin, direction;
-                    if (!camera.ray(x, y, lens, origin, direction))
+                    const auto [origin, direction] = camera.ray(x, y, lens);
+                    if (!(dot(direction, direction) > 0))
                         return false;
                     surfaces.intersect(origin, direction, hits, 1);
                     return !hits.empty();
@@ -188,7 +192,7 @@ TEST_CASE("A very narrow image has a camera at a distance that can be reckoned w
     settings.width = 1;
     settings.height = 65536;
     const example::SceneInfo info(scene);
-    const float distance = example::length(frameCamera(info, settings, 0).pose().origin - info.focus.box.center());
+    const float distance = example::length(frameCamera(info, settings, 0).pinhole().eye() - info.focus.box.center());
     CHECK(distance > 100.0f);
     CHECK(distance < 1001.0f);
 }

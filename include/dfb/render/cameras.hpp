@@ -15,50 +15,6 @@
 
 namespace dfb {
 
-// `direction` has length 1, or is 0 where the camera sees nothing.
-struct Ray {
-    Vec3 origin, direction;
-};
-
-// The point of the lens and the moment of the shutter of a ray.
-struct LensSample {
-    double lensU = 0, lensV = 0, time = 0;
-};
-
-namespace detail {
-
-inline constexpr double pi = 3.14159265358979323846;
-
-inline Point3 pointOf(const Vec3& v) { return {v.x, v.y, v.z}; }
-inline Vec3 vecOf(const Point3& p)
-{
-    return {static_cast<float>(p.x), static_cast<float>(p.y), static_cast<float>(p.z)};
-}
-inline Point3 normalized(const Point3& p) { return (1 / length(p)) * p; }
-
-// Throws InvalidArgument if the view or `up` are none.
-inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
-{
-    const Point3 v = pointOf(view), side = cross(v, pointOf(up));
-    if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
-        detail::failArgument("the camera's view or up vector is degenerate");
-    Pose pose;
-    pose.eye = pointOf(eye);
-    pose.forward = normalized(v);
-    pose.right = normalized(side);
-    pose.up = cross(pose.right, pose.forward);
-    return pose;
-}
-
-inline double tanHalf(float fovY)
-{
-    if (!(fovY > 0 && fovY < 180))
-        detail::failArgument("the camera's angle of view must be in (0, 180) degrees");
-    return std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
-}
-
-} // namespace detail
-
 // A camera as most toolkits have it, from a view matrix and a projection matrix: perspective, off-axis or orthographic.
 //
 // Matrices are 4x4, column by column, as OpenGL takes them: row r of column c is at [4 * c + r]. VTK's vtkMatrix4x4

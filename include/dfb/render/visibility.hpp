@@ -133,10 +133,40 @@ inline Point3 cornerOf(const Box3& b, int corner) noexcept
     return {pick(1, b.lower.x, b.upper.x), pick(2, b.lower.y, b.upper.y), pick(4, b.lower.z, b.upper.z)};
 }
 
+inline constexpr double pi = 3.14159265358979323846;
+
+inline Point3 pointOf(const Vec3& v) { return {v.x, v.y, v.z}; }
+inline Vec3 vecOf(const Point3& p)
+{
+    return {static_cast<float>(p.x), static_cast<float>(p.y), static_cast<float>(p.z)};
+}
+inline Point3 normalized(const Point3& p) { return (1 / length(p)) * p; }
+
 // Where the eye is and how it looks; the axes are orthonormal.
 struct Pose {
     Point3 eye, forward, right, up;
 };
+
+// Throws InvalidArgument if the view or `up` are none.
+inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
+{
+    const Point3 v = pointOf(view), side = cross(v, pointOf(up));
+    if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
+        failArgument("the camera's view or up vector is degenerate");
+    Pose pose;
+    pose.eye = pointOf(eye);
+    pose.forward = normalized(v);
+    pose.right = normalized(side);
+    pose.up = cross(pose.right, pose.forward);
+    return pose;
+}
+
+inline double tanHalf(float fovY)
+{
+    if (!(fovY > 0 && fovY < 180))
+        failArgument("the camera's angle of view must be in (0, 180) degrees");
+    return std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
+}
 
 // The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, and that has `pixelsPerUnit`
 // at distance 1. Of a box that reaches behind the eye: the whole image. `blur(depth)`: by how many pixels a point at
@@ -188,60 +218,62 @@ inline Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsP
 
 } // namespace detail
 
+// `direction` has length 1, or is 0 where the camera sees nothing.
+struct Ray {
+    Vec3 origin, direction;
+};
+
+// The point of the lens and the moment of the shutter of a ray.
+struct LensSample {
+    double lensU = 0, lensV = 0, time = 0;
+};
+
 // A pinhole at `eye`. Pixels are square; pixel coordinates grow to the right and down.
 class PerspectiveCamera {
 public:
     // Looks from `eye` to `target`; `fovY` is the vertical angle of view in degrees. Throws InvalidArgument if the two
     // coincide, `up` is along the view, or the angle is not in (0, 180).
     PerspectiveCamera(const Vec3& eye, const Vec3& target, const Vec3& up, float fovY)
-        : PerspectiveCamera(Along(target - eye), eye, up, fovY)
+        : PerspectiveCamera(detail::poseOf(eye, target - eye, up), fovY)
     {
     }
 
     // Looks along `view`, of any length: also where the eye is so far from the origin that no target near it is exact.
     static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
     {
-        return PerspectiveCamera(Along(view), eye, up, fovY);
+        return PerspectiveCamera(detail::poseOf(eye, view, up), fovY);
     }
 
-    const Vec3& eye() const noexcept { return eye_; }
+    Vec3 eye() const noexcept { return detail::vecOf(pose_.eye); }
+
+    // The axes of the camera: unit vectors at right angles to each other.
+    Vec3 forward() const noexcept { return detail::vecOf(pose_.forward); }
+    Vec3 right() const noexcept { return detail::vecOf(pose_.right); }
+    Vec3 up() const noexcept { return detail::vecOf(pose_.up); }
 
     // The unit direction from the eye through point (x, y) of the image, in pixels; pixel centres are at .5.
     Vec3 direction(double x, double y, int width, int height) const
     {
-        const double scale = 2.0 * static_cast<double>(tanHalfFov_) / height;
-        const auto u = static_cast<float>((x - 0.5 * width) * scale),
-                   v = static_cast<float>((0.5 * height - y) * scale);
-        return normalize(forward_ + u * right_ + v * up_);
+        const double scale = 2 * tan_ / height;
+        return detail::vecOf(detail::normalized(pose_.forward + (x - 0.5 * width) * scale * pose_.right
+                                                + (0.5 * height - y) * scale * pose_.up));
+    }
+    Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
+    {
+        return {eye(), direction(x, y, width, height)};
     }
 
     // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
     Footprint project(const Box3& bounds, int width, int height) const
     {
-        const auto of = [](const Vec3& v) { return detail::Point3{v.x, v.y, v.z}; };
-        return detail::projectBox(bounds, {of(eye_), of(forward_), of(right_), of(up_)},
-                                  0.5 * height / static_cast<double>(tanHalfFov_), width, height);
+        return detail::projectBox(bounds, pose_, 0.5 * height / tan_, width, height);
     }
 
 private:
-    struct Along { // tells the constructors apart, also where they are given braces
-        explicit Along(const Vec3& direction) : view(direction) {}
-        Vec3 view;
-    };
+    PerspectiveCamera(const detail::Pose& pose, float fovY) : pose_(pose), tan_(detail::tanHalf(fovY)) {}
 
-    PerspectiveCamera(const Along& along, const Vec3& eye, const Vec3& up, float fovY) : eye_(eye)
-    {
-        const Vec3 right = cross(along.view, up);
-        if (!(dot(along.view, along.view) > 0.0f) || !(dot(right, right) > 0.0f) || !(fovY > 0.0f && fovY < 180.0f))
-            detail::failArgument("the camera's view, up vector or angle is degenerate");
-        forward_ = normalize(along.view);
-        right_ = normalize(right);
-        up_ = cross(right_, forward_);
-        tanHalfFov_ = std::tan(fovY * 3.14159265358979f / 360.0f);
-    }
-
-    Vec3 eye_, forward_, right_, up_;
-    float tanHalfFov_ = 1.0f;
+    detail::Pose pose_;
+    double tan_;
 };
 
 // A brick of the world, by its place in World::bricks(), and a tile that it may project to.
