@@ -27,7 +27,7 @@ example::Ball shellOf(int number)
     return ball;
 }
 
-// What the way from `enter` to `leave` through glass looks like.
+// Returns the colour of glass between `enter` and `leave`.
 dfb::Segment segmentOf(const dfb::Vec3& color, float enter, float leave)
 {
     const float alpha = 1 - std::exp(-1.5f * (leave - enter));

@@ -18,7 +18,7 @@ namespace {
 
 constexpr int width = 640, height = 480;
 
-// What glReadPixels() would give of a ball of this number.
+// Returns the pixels that glReadPixels() would give of the ball of this number.
 void renderBall(int number, std::vector<std::uint8_t>& pixels, std::vector<float>& depths)
 {
     const float centerX = 190 + 85.0f * static_cast<float>(number % 4),

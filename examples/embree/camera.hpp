@@ -14,8 +14,7 @@ namespace example {
 
 enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
 
-// What the user chooses about the view; angles in degrees, lengths in units of the largest extent of what there is to
-// see.
+// The user's choice of view. Angles are in degrees, lengths in units of the largest extent of the visible scene.
 struct View {
     float azimuth = 30;            // around the y axis, from +z towards +x
     float elevation = 20;          // above the xz plane

@@ -60,7 +60,7 @@ int report(const ParsedOptions& parsed)
 }
 
 #if defined(DFB_HAS_MPI)
-// What a launcher (MPICH's or Open MPI's) has told this process, or `otherwise`.
+// Returns the number that a launcher (MPICH's or Open MPI's) has told this process, or `otherwise`.
 int fromLauncher(const char* mpich, const char* openMpi, int otherwise)
 {
     for (const char* name : {mpich, openMpi})

@@ -84,7 +84,7 @@ struct Options {
     }
 };
 
-// What the program exits with, beside 0.
+// Exit codes beside 0.
 inline constexpr int exitFailed = 1; // the run has failed
 inline constexpr int exitUsage = 2;  // the command line is wrong
 

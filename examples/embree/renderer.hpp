@@ -34,7 +34,7 @@ struct RenderSettings {
     View view;
 };
 
-// What a renderer needs to know of the whole scene.
+// Facts about the whole scene that every renderer needs.
 struct SceneInfo {
     Box bounds;
     Focus focus;    // where the camera looks
@@ -49,7 +49,7 @@ struct SceneInfo {
     }
 };
 
-// The same on all ranks, with or without a brick.
+// The camera of a frame, equal on all ranks, with or without a brick.
 inline FrameCamera frameCamera(const SceneInfo& scene, const RenderSettings& settings, int frameIndex)
 {
     return FrameCamera(scene.focus, settings.view, frameIndex, settings.frames, settings.width, settings.height);
@@ -97,7 +97,7 @@ public:
         return render(to, frameIndex);
     }
 
-    // The same into a tile with several segments per pixel: adds one to each where the brick has something.
+    // Renders into a tile with several segments per pixel: adds a segment to each pixel where the brick has something.
     std::int64_t renderDeep(dfb::DeepTile& deep, int frameIndex) const
     {
         Target to;
@@ -135,7 +135,7 @@ private:
         FlushDenormals& operator=(const FlushDenormals&) = delete;
     };
 
-    // What has been gathered along a ray so far.
+    // The colour gathered along a ray so far.
     struct Accumulator {
         double r = 0, g = 0, b = 0, alpha = 0, through = 1;
         float depth = std::numeric_limits<float>::infinity(), farDepth = -std::numeric_limits<float>::infinity();
@@ -171,7 +171,7 @@ private:
         }
     };
 
-    // What a ray is traced with: numbers that are a function of pixel, sample, frame and seed alone.
+    // The numbers of a ray: a function of pixel, sample, frame and seed alone.
     struct RaySample {
         std::uint64_t key = 0;
         dfb::LensSample lens;

@@ -148,7 +148,7 @@ struct Scene {
         spheres.push_back({nextGeometry_++, std::move(set)});
     }
 
-    // What there is to see, for the camera.
+    // The visible part of the scene, for the camera.
     Focus focus() const
     {
         Focus all{seen_, 0};
@@ -421,9 +421,9 @@ inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reac
 
 } // namespace detail
 
-// What a rank keeps of the scene for one cell. Volumes are read from their source here, and only as far as needed;
-// the scene itself can go when all bricks are loaded. `ghosts`: meshes and spheres are kept as far as that beyond the
-// cell, for secondary rays.
+// Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
+// the scene itself can go when all bricks are loaded. Meshes and spheres are kept up to `ghosts` beyond the cell, for
+// secondary rays.
 inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
 {
     Brick brick;

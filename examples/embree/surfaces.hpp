@@ -159,7 +159,8 @@ private:
 #else
     using Context = RTCIntersectContext;
 #endif
-    // What Embree hands to the callbacks; `context` is first, so that a pointer to it is one to all of this.
+    // The query that Embree hands to the callbacks. `context` is first, so that a pointer to it also points to the
+    // query.
     struct Query {
         Context context;
         Vec3 origin, direction;

@@ -139,7 +139,7 @@ inline Box intersection(const Box& a, const Box& b)
     return box;
 }
 
-// What a camera looks at.
+// The part of the world that a camera looks at.
 struct Focus {
     Box box;
     float radius = 0; // of the ball around the box's centre that holds all there is to see

@@ -116,7 +116,7 @@ public:
         throw Error(std::move(info));
     }
 
-    // What the first incomplete generation still waits for.
+    // The inputs that the first incomplete generation still waits for.
     struct Missing {
         int generation = 0;
         std::int64_t expected = 0, got = 0;

@@ -71,8 +71,8 @@ public:
     static constexpr std::uint32_t first = 114u << 7;  // the upper 16 bits of 2^-13, below the first threshold
     static constexpr std::size_t count = 13 * 128 + 1; // the last one is that of 1
 
-    // What a cell has, in one word for gathering: the level at its start, plus 1, times 2^17; and the lower 16 bits of
-    // the least float that has the next one. `none` where that begins in a later cell.
+    // A cell is one word, so that vector code can gather it: the level at its start, plus 1, times 2^17; and the lower
+    // 16 bits of the least float of the next level, or `none` where that level begins in a later cell.
     static constexpr std::uint32_t none = 0x18000;
 
     SrgbCells()

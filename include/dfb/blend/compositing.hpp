@@ -63,7 +63,7 @@ struct CompositeRow {
     std::vector<double> rgba;          // 4 * width, premultiplied
     std::vector<double> transmittance; // width
     std::vector<float> depth;          // width: of the nearest layer with alpha > 0, else +infinity
-    // What the first two have beyond a double; of the same sizes, or empty: not computed.
+    // The low words of the first two, for sums in double-double. Of the same sizes, or empty if not computed.
     std::vector<double> rgbaLow, transmittanceLow;
     AuxPixels aux;
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.

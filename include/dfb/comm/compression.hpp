@@ -20,7 +20,7 @@ class Codec {
 public:
     virtual ~Codec() = default;
 
-    // What stands in the messages; the same number must mean the same format on all ranks. Not 0.
+    // The codec's number in messages, not 0. A number must mean one format on all ranks.
     virtual std::uint8_t id() const noexcept = 0;
     // The most that compress() writes for `byteCount` bytes.
     virtual std::size_t bound(std::size_t byteCount) const = 0;
@@ -86,7 +86,7 @@ public:
     }
 
 private:
-    // What must be left over to give up, and what to come back.
+    // The compressed share of the bytes above which compression stops, and below which it starts again.
     static constexpr double worse = 0.95, better = 0.9;
     static constexpr int firstInterval = 16, longestInterval = 512;
 

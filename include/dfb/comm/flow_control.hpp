@@ -25,7 +25,7 @@ namespace dfb::detail {
 // All members may be called from any thread. The callbacks are called without a lock held.
 class FlowControl {
 public:
-    // What CreditRequest and Credit messages carry.
+    // The bodies of CreditRequest and Credit messages.
     struct Request {
         std::uint64_t first = 0; // the total that is needed for the first message that waits
         std::uint64_t all = 0;   // and for as many as should come at once

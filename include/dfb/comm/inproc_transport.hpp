@@ -24,7 +24,7 @@ namespace dfb {
 
 namespace detail {
 
-// What the ranks of one process share. Each transport that a rank makes opens the next channel.
+// Shared state of the ranks of one process. Each transport that a rank makes opens the next channel.
 class InprocHub {
 public:
     // One rank's end of a channel.

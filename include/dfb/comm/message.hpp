@@ -158,7 +158,8 @@ T loadAs(const std::byte* bytes)
     throw Error(std::move(info));
 }
 
-// What a message has after its header, if that is a Body and nothing else. Throws Error (MalformedMessage).
+// Returns the body of a message that has a header, one Body, and nothing else. Throws Error (MalformedMessage)
+// otherwise.
 template <class Body>
 Body bodyOf(const Buffer& message)
 {

@@ -10,8 +10,8 @@
 // own under the tag that the announcement names, so that it goes straight into the block that the handler gets.
 // Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
 //
-// What ranks built with any version of this do first: duplicate the communicator, and gather on it the 8 bytes of their
-// packetFormat. That must stay as it is.
+// Ranks of every version of this file first duplicate the communicator and gather the 8 bytes of their packetFormat on
+// it. No version may change that.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -273,8 +273,8 @@ private:
     // Why this rank can have no transport; empty if nothing is wrong. Takes no memory, of which there may be none.
     using Reason = std::array<char, 512>;
 
-    // What a rank does alone. If it fails the rank does nothing more of that kind, but still takes part in what all do
-    // together, as they wait for it there, until it can tell them.
+    // Runs a step that a rank does alone. A rank that fails does no more such steps. It still takes part in the steps
+    // of all ranks, as they wait for it there, until it can tell them.
     static void attempt(Reason& wrong, detail::FunctionRef<void()> step)
     {
         if (wrong[0] != 0)
@@ -348,7 +348,7 @@ private:
         throw TransportError(std::move(text), other);
     }
 
-    // What a rank tells all others then.
+    // A rank's message to all others in meetNode().
     struct Card {
         std::uint64_t host;
         Processors processors;
@@ -902,7 +902,7 @@ private:
         MPI_Comm_free(&comm_);
     }
 
-    // What tells the others why this rank goes should still leave, but not at any cost.
+    // Tries to send the messages that tell the others why this rank leaves, for a short time.
     void flush()
     {
         leaving_ = false;

@@ -35,7 +35,7 @@ public:
         std::uint64_t secret[2] = {}; // to know that it is this one
     };
 
-    // What one process has at most; only what is used takes memory.
+    // The most that one process has. Only used pages take memory.
     static constexpr std::size_t capacity = std::size_t{1} << 30;
     static constexpr std::size_t alignment = 64;
 
@@ -148,7 +148,7 @@ public:
         return Buffer(shared_from_this(), block, static_cast<std::size_t>(byteCount), 0);
     }
 
-    // What is there; null if there can be no block of that size.
+    // Returns the block at `place`, or null if no block of that size fits there.
     std::byte* at(std::int32_t place, std::uint64_t byteCount) const noexcept
     {
         if (place < 2 || static_cast<std::size_t>(place) >= capacity / alignment)

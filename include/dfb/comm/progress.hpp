@@ -90,7 +90,7 @@ private:
         const auto between = [&](int shortest, int longest) {
             return std::clamp<Clock::duration>(idle / 8, microseconds(shortest), microseconds(longest));
         };
-        // What the network library has taken may need it for a moment more.
+        // The network library may need more calls to finish messages that it has taken.
         if (!expecting_ && quiet && idle > std::chrono::milliseconds(10))
             return longestNap_;
         if (link_.wakesOnArrival())

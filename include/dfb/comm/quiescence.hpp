@@ -24,7 +24,7 @@ struct MessageCounts {
 // One per rank. newFrame() apart, members may be called from any thread; each round is entered and then ended.
 class Quiescence {
 public:
-    // What a rank says, or several together: added up.
+    // The counts of one rank, or the sums of several.
     struct Report {
         MessageCounts messages;
         std::uint64_t unfinished = 0; // ranks that wait for more than the others' word that all are done

@@ -119,8 +119,8 @@ public:
         return find(key) != nullptr;
     }
 
-    // What this rank waits for: parts that have not come, each from a child, and of the ranks from that one to `last`;
-    // if it has all of them, the result, from its parent, which has a lower rank.
+    // The message that this rank waits for: a part from a child, which stands for the ranks from the child to `last`;
+    // or, if all parts are here, the result from the parent, which has a lower rank.
     struct Missing {
         int rank, last;
     };

@@ -1,10 +1,11 @@
 // Declarations: every rank tells the owners which inputs it will send, and all learn when all owners
 // know. Counts come from the senders only, so owner and contributor cannot disagree about visibility.
 //
-// What a rank has declared holds until it declares something else. In each frame a rank sends a manifest to those
-// owners alone for which its inputs are not those of the last frame; the owner acknowledges it and forgets the rank's
-// older one. A rank whose manifests are all acknowledged, or that had none to send, enters a reduction. When that is
-// done, every manifest has arrived everywhere, and owners know that those who sent none send the same as before.
+// A rank's declaration holds until the rank declares something else. In each frame a rank sends a manifest to those
+// owners alone for which its inputs are not those of the last frame. The owner acknowledges a manifest and drops the
+// rank's older one. A rank enters a reduction when all of its manifests are acknowledged, or at once if it had none to
+// send. When the reduction is done, every manifest has arrived, and owners know that ranks without a new manifest send
+// the same inputs as before.
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>

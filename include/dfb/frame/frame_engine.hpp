@@ -402,7 +402,7 @@ private:
                && (config_.messages.compression == CompressionMode::Always || compressionTrial_.compresses());
     }
 
-    // What messages with pixels to that rank are compressed with in this frame, or null.
+    // Returns the codec for messages with pixels to that rank in this frame, or null for none.
     const Codec* codecFor(int other) const
     {
         if (other == rank() || !compresses())
@@ -661,7 +661,7 @@ private:
         return info;
     }
 
-    // What this rank has counted in the frame.
+    // Adds this rank's counts of the frame to the verdict.
     void addFigures(Verdict& v)
     {
         const std::int64_t repeated = mailbox_->connection().duplicates();

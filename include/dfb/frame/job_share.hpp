@@ -20,7 +20,7 @@
 
 namespace dfb::detail {
 
-// What a rank asks for: it says how many there are, as the one that it asks may not have come to that yet.
+// A rank's request for jobs. It also carries the number of jobs, as the rank that gets it may not know that yet.
 struct JobRequest {
     std::int64_t count = 0;
     std::int32_t workers = 1;

@@ -13,7 +13,7 @@
 
 namespace dfb::detail {
 
-// What the types of two operations say; see tile_op.hpp and pixel_op.hpp.
+// The traits of a tile operation and a pixel operation; see tile_op.hpp and pixel_op.hpp.
 struct OperationTraits {
     int tileSize = 64;
     ChannelMask channels = 0, neededChannels = 0;
@@ -89,7 +89,7 @@ public:
     {
     }
 
-    // What the next newFrame() takes a copy of: both must live until then.
+    // Offers the frame data that the next newFrame() copies. Both objects must live until then.
     void offer(const TileFrameData& tileData, const PixelFrameData& pixelData)
     {
         offeredTileData_ = &tileData;

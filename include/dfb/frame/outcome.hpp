@@ -366,9 +366,9 @@ private:
         mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout : untilAsked));
     }
 
-    // What travels in a round of quiescence_. Ranks that were given different parameters may wait for each other for
-    // ever: therefore it carries what they were given, and shows the difference on its way up the tree, as soon as two
-    // of them are in end(); see receiveReduction().
+    // The message of one round of quiescence_. Ranks that were given different parameters could wait for each other for
+    // ever. A round therefore carries the parameters. It shows a difference on its way up the tree as soon as two such
+    // ranks are in end(); see receiveReduction().
     struct Round {
         FrameTerms terms;
         Quiescence::Report report;
@@ -415,7 +415,7 @@ private:
 
     // ---- what is missing
 
-    // What this rank waits for; `kind`: how that is known to be missing.
+    // Returns an error of this kind that names what this rank waits for.
     ErrorInfo missing(ErrorKind kind)
     {
         ErrorInfo info;

@@ -45,13 +45,13 @@ public:
     {
     }
 
-    // What the image has beside the colour.
+    // Returns the image's channels beside colour.
     static ChannelMask imageChannels(const FrameBufferConfig& config)
     {
         return static_cast<ChannelMask>(config.image.aux | (config.image.depth ? depthChannel : 0));
     }
-    // What of a tile is read at all: by the operation, for the image, or to tell in which of several passes what gives
-    // position and ids is the nearest.
+    // Returns the channels of a tile that somebody reads: the operation, the image, or the search for the nearest of
+    // several passes, which gives position and ids.
     static ChannelMask travelling(const OperationTraits& traits, const FrameBufferConfig& config,
                                   bool comparesPasses = true)
     {
@@ -214,7 +214,7 @@ public:
     }
     WireFormat wireColor() const noexcept { return wireColor_; }
 
-    // What the pixel operation makes of the background; throws what it throws.
+    // Runs the pixel operation on the background. Throws what it throws.
     void finishBackground()
     {
         if (!traits().pixelOpIsPointwise)
@@ -254,7 +254,7 @@ public:
     std::int64_t nonFinitePixels() const noexcept { return nonFinite_; }
     std::int64_t alphaOutsidePixels() const noexcept { return alphaOutside_; } // of the others
 
-    // What the operation has said of this rank's tiles, up to now.
+    // The operation's reports on this rank's tiles, up to now.
     struct Reports {
         std::vector<TileError> errors;
         std::int64_t orderUndefinedPixels = 0;

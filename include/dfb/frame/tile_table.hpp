@@ -115,7 +115,7 @@ public:
     // How many tiles needed no more although more was to come.
     std::int64_t endedEarlyCount() const noexcept { return endedEarly_; }
 
-    // What a tile gets in this frame.
+    // Returns the samples that a tile gets in this frame.
     TileSamples samples(int tile) const
     {
         return plan_ ? (*plan_)[static_cast<std::size_t>(tile)] : TileSamples{info_.firstSample, info_.passes};
@@ -159,10 +159,11 @@ public:
         }
     }
 
-    // What will come for each tile, in each pass; nothing for a tile that is not named. Calls `ready(tile)` for those
-    // whose inputs are already all there, and before that `counted(tile)` for each tile that is waited for. `all`: also
-    // for the tiles that nothing will come for. `expected` must live as long as the frame. Throws what the tracker and
-    // the op throw, when all tiles have been counted; `where` then names the first one that is spoilt by it.
+    // Takes the number of inputs that each tile will get in each pass; a tile that is not named gets none. First calls
+    // `counted(tile)` for each tile that waits for inputs, then `ready(tile)` for each tile whose inputs are all there.
+    // With `all`, also calls them for tiles without inputs. `expected` must live as long as the frame. If the tracker
+    // or the operation throws, this goes on with the other tiles and throws at the end; `where` then names the first
+    // tile that failed.
     template <class Counted, class Ready>
     void declare(const ExpectedInputs& expected, bool all, ErrorInfo& where, const Counted& counted, const Ready& ready)
     {
@@ -241,11 +242,11 @@ public:
         return tiles;
     }
 
-    // What the operation says of a tile that is finished.
+    // Returns the operation's report on a finished tile.
     TileReport report(int tile) { return slotFor(tile).op->report(); }
 
-    // What the tiles that are not complete wait for: the first of them, and all in words. `declared`: tiles that nobody
-    // named wait for nothing.
+    // Returns what the incomplete tiles wait for: the first tile in numbers, all of them in words. With `declared`, a
+    // tile that nobody named waits for nothing.
     std::optional<ErrorInfo> missing(bool declared)
     {
         constexpr int mostTiles = 8; // in the text
@@ -317,7 +318,7 @@ private:
         BackgroundPixels background;
     };
 
-    // What a tile gets over several frames.
+    // The samples of a tile over several frames.
     struct Series {
         std::int64_t begin = 0; // the frame with sample 0
         int next = 0;           // sample

@@ -27,7 +27,7 @@
 
 namespace dfb::detail {
 
-// What the messages to the display rank need to know.
+// Settings of the messages to the display rank.
 struct GatherSettings {
     OutputFormat format = OutputFormat::None;
     ChannelMask channels = 0;   // beside the colour
@@ -492,7 +492,7 @@ public:
     }
 
 private:
-    // What a rank has sent to the display rank: tiles, those that it has put into the image included, and messages.
+    // Counts of a rank's tiles and messages to the display rank. Tiles that it has put into the image itself count too.
     struct SentCount {
         std::int32_t tiles = 0, batches = 0;
     };

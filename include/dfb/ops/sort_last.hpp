@@ -188,7 +188,7 @@ private:
     std::int64_t undefinedPixels_ = 0;
 };
 
-// What the sort-last operations have in common.
+// The base of the sort-last operations.
 template <BlendRule Rule, int TileSize, ChannelMask Channels>
 class SortLast {
 public:

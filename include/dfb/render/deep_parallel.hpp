@@ -23,7 +23,7 @@
 
 namespace dfb {
 
-// What is between two depths of a ray, composited.
+// The composited colour between two depths of a ray.
 struct Segment {
     std::array<float, 4> rgba{}; // premultiplied
     float depth = 0, farDepth = 0;

@@ -14,8 +14,8 @@
 #include <utility>
 #include <vector>
 
-// What the rendering loops have in common: tiles to render into, a job per tile and pass on all workers, and a
-// frame in which a renderer may throw. inPlace(): for renderers that have their pixels already.
+// Common parts of the rendering loops: tiles to render into, a job per tile and pass on all workers, and a frame in
+// which a renderer may throw. inPlace() is for renderers that have their pixels already.
 
 namespace dfb {
 
@@ -41,7 +41,7 @@ InPlace<Find> inPlace(Find find)
 
 namespace detail {
 
-// What a loop hands to a renderer.
+// The tile that a loop hands to a renderer.
 template <class FrameBuffer, class Render>
 struct TileOf {
     using Type = typename FrameBuffer::Tile;
@@ -205,7 +205,7 @@ private:
 
 namespace detail {
 
-// What there is to do for a rank that renders its own bricks, and what it declares.
+// The jobs of a rank that renders its own bricks, and its declaration.
 class OwnBricks {
 public:
     // Calls job(brick, tile) for each brick, tile and pass, with a tile that has been started for them.

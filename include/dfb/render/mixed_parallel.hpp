@@ -55,7 +55,7 @@ public:
             costs_[figure.key] = figure.value;
     }
 
-    // What FrameReport::figures has the cost of a brick in a tile under.
+    // Returns the key under which FrameReport::figures has the cost of a brick in a tile.
     static std::uint64_t keyOf(std::uint32_t brickId, int tile) noexcept
     {
         return std::uint64_t{brickId} << 32 | static_cast<std::uint32_t>(tile);
@@ -173,7 +173,7 @@ struct MixedJob {
     int pass = 0;
 };
 
-// What there is to do in a mixed-parallel frame.
+// The jobs of a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs;
     std::vector<int> passes;    // of each pair

@@ -128,8 +128,8 @@ private:
             plan_[t] = {taken_[t], 0};
         for (std::size_t t = 0; t < taken_.size(); ++t)
             plan_[t].count = std::min(wanted(t), config_.maxSamples) - taken_[t];
-        // What is rare may not have been seen yet: a tile beside one that needs many samples gets a quarter of what
-        // that one has, so that an edge that only just reaches into it is not lost.
+        // Few samples may have missed something small. A tile therefore gets at least a quarter of its neighbour's
+        // samples, so that an edge that only just reaches into it is not lost.
         for (int row = 0; row < layout_.tilesY(); ++row)
             for (int column = 0; column < layout_.tilesX(); ++column) {
                 const auto tile = static_cast<std::size_t>(layout_.tileAt(column, row));

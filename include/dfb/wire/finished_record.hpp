@@ -24,7 +24,7 @@ struct FinishedPlanes {
     std::size_t stride = 0;
 };
 
-// What it makes and reads records of: the format and the channels of an image.
+// Makes and reads the records of finished tiles for one format and one set of channels.
 class FinishedRecord {
 public:
     struct Header {
@@ -45,7 +45,7 @@ public:
     // Of a record with so many pixels, the most.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
-    // What is to be written of a tile, found by one pass over it; kept from tile to tile, as it has memory.
+    // The parts of a tile to be written, found by one pass over it. Kept from tile to tile for its memory.
     class Plan {
     public:
         std::size_t bytes() const noexcept { return bytes_; }

@@ -51,7 +51,7 @@ inline std::size_t largestFragment(int width, int height, ChannelMask channels)
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * perPixel;
 }
 
-// What is wrong with the pixels of an input.
+// Faults in the pixels of an input.
 struct InputFaults {
     std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
     std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]

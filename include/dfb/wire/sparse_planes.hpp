@@ -57,10 +57,10 @@ struct SparseShape {
 };
 static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
 
-// What makes a plane of pixels easier to compress. Neighbouring pixels are alike in the upper bits of each
-// word and rarely in the lower ones: so each word becomes its difference to that of the pixel before, small ones of
-// either sign with zeros at the top, and the planes of equal bytes are stored one after the other. (The bytes of floats
-// as they stand hide from a codec that looks for repetitions what they have in common.)
+// Makes a plane of pixels easier to compress. Neighbouring pixels are alike in the upper bits of each word and rarely
+// in the lower ones. Each word becomes its difference to the word of the pixel before, coded so that small differences
+// of either sign have zeros at the top. Then all first bytes are stored, then all second bytes, and so on. A codec that
+// looks for repetitions finds few in the plain bytes of floats.
 class PlaneFilter {
 public:
     // `byteCount` bytes of pixels that have `words` words of `wordBytes` (1, 2 or 4) each; a rest that is no whole
@@ -296,7 +296,7 @@ void encodeSparse(const PlaneFormat& format, const SparseShape& shape, const Act
     std::copy(active.rowCounts.begin(), active.rowCounts.end(), reinterpret_cast<std::uint16_t*>(counts));
 }
 
-// What is in a body.
+// The contents of a body.
 struct SparseBody {
     ConstPlanes planes;
     const Span* spans = nullptr;              // Sparse

@@ -75,7 +75,7 @@ struct UnormCode {
 using Unorm16Code = UnormCode<std::uint16_t>;
 using Unorm8Code = UnormCode<std::uint8_t>;
 
-// What the channels of a pixel are multiplied by, and the least alpha that comes out of decoding.
+// The factors for the channels of a pixel, and the least alpha that decoding returns.
 struct WireScales {
     float color, alpha, leastAlpha = 0;
 };
@@ -311,7 +311,7 @@ inline std::size_t bytesOf(WireFormat format) noexcept
     return 1;
 }
 
-// What all fragments of a framebuffer have in common: which pixels they have, and how their colours are converted.
+// Encodes and decodes the colours of a framebuffer's fragments.
 class WireCoder {
 public:
     WireCoder() = default;

@@ -23,7 +23,7 @@
 
 namespace dfb::testing {
 
-// What has been done to messages so far, by all transports that share it. Read it at any time.
+// Counts of the faults so far, of all transports that share it. Read it at any time.
 struct FaultCounts {
     std::atomic<std::int64_t> sent{0}; // calls of send()
     std::atomic<std::int64_t> reordered{0}, delayed{0}, duplicated{0}, dropped{0}, corrupted{0};
@@ -43,7 +43,7 @@ struct FaultOptions {
     std::shared_ptr<FaultCounts> counts;
 };
 
-// What happens to one message.
+// The faults of one message.
 struct FaultDecision {
     bool reorder = false, delay = false, duplicate = false, drop = false, corrupt = false;
     std::chrono::nanoseconds delayBy{0}, copyDelayBy{0};
@@ -188,7 +188,8 @@ public:
         base_.stop(orderly);
     }
 
-    // What Base need not have; neither has this then. What goes through shared memory without a message goes unharmed.
+    // Optional members of Base: this has them if Base has. Data that goes through shared memory without a message stays
+    // unharmed.
     template <class B = Base>
     auto abort(const std::string& text) -> decltype(std::declval<B&>().abort(text))
     {

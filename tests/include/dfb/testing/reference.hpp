@@ -24,7 +24,7 @@ using Exact = long double;
 
 inline constexpr std::uint32_t noIdOfPixel = 0xffffffffu;
 
-// What an input may have in a pixel beside colour and depth.
+// Channels of an input's pixel beside colour and depth.
 struct AuxSample {
     std::array<float, 3> normal{}, albedo{}; // premultiplied
     std::array<float, 3> position{};
@@ -40,7 +40,7 @@ struct Sample {
     AuxSample aux{};
 };
 
-// What is taken of one input, and the depth of that.
+// The value taken from one input, and its depth.
 template <class Value>
 struct Taken {
     Value value{};

@@ -90,8 +90,8 @@ struct TileOutput {
     }
 };
 
-// What the framebuffer does with a tile in a frame, with the inputs arriving in this order. `written`: how many pixels
-// the operation has set.
+// Treats a tile in a frame as the framebuffer does, with the inputs arriving in this order. Sets `written` to the
+// number of pixels that the operation has set.
 template <class Op>
 TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order,
                      OutputFormat format, bool withDepth = true, const TileWire& wire = {}, bool dither = false,

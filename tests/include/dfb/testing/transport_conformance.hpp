@@ -61,7 +61,7 @@ inline std::string describeFailures(const std::vector<ConformanceResult>& result
 
 namespace detail {
 
-// What the calling thread sees of a suite that runs in another.
+// The state of a suite that runs in another thread.
 class Report {
 public:
     // A case, or another step that must end within `limit`.
@@ -185,8 +185,8 @@ private:
         std::unique_ptr<Poller<Transport>> poller;
     };
 
-    // What a rank tells the others: that it has come to a step, and in the last step of a case how that went. The words
-    // follow.
+    // A rank's message to the others: it has come to a step, and after the last step of a case, how the case went. The
+    // words follow.
     struct Announcement {
         std::uint64_t magic = controlMagic, checksum = 0;
         std::uint32_t step = 0;
@@ -493,7 +493,7 @@ private:
                 problems_.add("the handler was called after stop(), " + std::to_string(calls) + " times");
     }
 
-    // What is missing in one transport may have come to another.
+    // A message that is missing in one transport may have come to another.
     void lookForStrays()
     {
         for (const auto& end : ends_)

@@ -1,5 +1,5 @@
-// What the conformance suite of transports is made of: messages that can be checked, where they arrive, what is expected,
-// and a thread that polls. Not for users.
+// Parts of the conformance suite of transports: messages that can be checked, their arrival, expectations, and a thread
+// that polls. Not for users.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -37,8 +37,8 @@ inline std::string inSeconds(Clock::duration time)
     return ms % 1000 ? std::to_string(ms) + " ms" : std::to_string(ms / 1000) + " s";
 }
 
-// What the messages of a case say of themselves, if they are long enough to say anything; their content follows from
-// it, so that the receiver can check every byte.
+// The label at the start of a case's messages, if they are long enough. The rest of a message follows from its label,
+// so that the receiver can check every byte.
 struct Label {
     std::uint64_t magic = 0;
     std::uint32_t channel = 0, series = 0; // the transport; the case, and the round in it
@@ -87,7 +87,7 @@ inline Buffer makeMessage(MemoryPool& pool, const Label& label, std::uint64_t se
     return message;
 }
 
-// What keeps a case from passing; the first few in words.
+// Counts the problems that keep a case from passing, and keeps the first few in words.
 class Problems {
 public:
     void add(const std::string& text)
