@@ -325,7 +325,9 @@ public:
             // tree.
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
-                if (!executor_->help() && !connection_->poll() && !over())
+                // Before a task, as other ranks may wait for what this one has queued.
+                const bool moved = connection_->poll();
+                if (!executor_->help() && !moved && !over())
                     connection_->nap(std::chrono::microseconds(50));
                 handler_.polled();
                 lock.lock();

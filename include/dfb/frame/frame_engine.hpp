@@ -258,8 +258,10 @@ public:
     {
         bool did = mailbox_->connection().poll();
         Executor& executor = mailbox_->executor();
-        while (!executor.hasWorkers() && executor.help())
+        while (!executor.hasWorkers() && executor.help()) {
             did = true;
+            mailbox_->connection().poll(); // other ranks may wait for what this one has queued
+        }
         return did;
     }
 
