@@ -37,6 +37,7 @@
 #include <functional>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <thread>
 #include <utility>
@@ -157,6 +158,7 @@ public:
     // this rank does not see it. It does as long as this lives.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
+        static_assert(detail::NodeMemory::alignment == bytesOfPlace);
         return memory_ && memory_->holds(block) ? memory_->placeOf(block) : -1;
     }
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
@@ -171,15 +173,22 @@ public:
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
     bool wakesOnArrival() const noexcept { return false; }
-    // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are.
+    // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are. Where
+    // all that a rank waits for comes from this node, its bell ends the nap.
     void nap(std::chrono::nanoseconds limit)
     {
         napLimit_ = limit;
+        const bool isAwaiting = limit < std::chrono::milliseconds(1);
         if (Clock::now() - lastWake_.load() < 2 * wakePause) // then send() may not end it
             limit = std::min(limit, wakePause);
-        signal_.nap(limit < std::chrono::milliseconds(10) ? limit * crowding_ / 4 : limit);
+        if (limit < std::chrono::milliseconds(10))
+            limit = limit * crowding_ / 4;
+        if (listener_)
+            listener_->nap(isAwaiting && isRungForAll_ ? std::max(limit, rungNap) : limit, isAwaiting);
+        else
+            signal_.nap(limit);
     }
-    void interrupt() { signal_.interrupt(); }
+    void interrupt() { listener_ ? memory_->bell().interrupt() : signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
 
@@ -192,7 +201,7 @@ public:
             outbox_.push_back({destination, std::move(message)});
         }
         if (first && mayWake())
-            signal_.interrupt();
+            interrupt();
     }
 
     bool quiet() const
@@ -394,10 +403,13 @@ private:
         attempt(wrong, [&] {
             for (std::size_t i = 0; i < all.size(); ++i)
                 peers_[i].seesMine = seen[i] != 0;
-            if (std::count(seen.begin(), seen.end(), 1) > 0) {
+            const auto seers = std::count(seen.begin(), seen.end(), 1);
+            if (seers > 0) {
                 memory_ = memory;
+                listener_.emplace(memory->bell());
                 pool_->share(memory);
             }
+            areAllHere_ = seers == size_ - 1;
         });
     }
 
@@ -433,6 +445,7 @@ private:
 
     using Clock = std::chrono::steady_clock;
     static constexpr std::chrono::nanoseconds wakePause{300000};
+    static constexpr std::chrono::nanoseconds rungNap{2000000};
 
     using Record = detail::PacketRecord;
 
@@ -558,11 +571,21 @@ private:
 
     bool move()
     {
+        if (listener_)
+            listener_->look();
         const bool started = !leaving_ && startSends();
         const bool arrived = receivePackets();
         const bool delivered = receiveBodies();
         const bool completed = finishSends();
+        isRungForAll_ = areAllHere_ && sends_.requests.empty() && receives_.requests.empty() && waitingPeers_.empty();
         return started || arrived || delivered || completed;
+    }
+
+    // Wakes a rank of this node that naps: MPI has something for it.
+    void ring(int other)
+    {
+        if (const auto& memory = peers_[static_cast<std::size_t>(other)].itsMemory)
+            memory->bell().ring();
     }
 
     // --- sending
@@ -657,6 +680,7 @@ private:
         check(MPI_Isend(transfer.data.data() + transfer.offset, transfer.count(), MPI_BYTE, transfer.peer, transfer.tag,
                         comm_, &request),
               "MPI_Isend", transfer.peer);
+        ring(transfer.peer);
         return request;
     }
 
@@ -666,6 +690,7 @@ private:
                 sent.offset += static_cast<std::size_t>(sent.count());
                 if (sent.offset < sent.data.size())
                     return startSend(sent);
+                ring(sent.peer); // it may have left only now
                 --peers_[static_cast<std::size_t>(sent.peer)].inFlight;
                 return MPI_REQUEST_NULL;
             }))
@@ -940,6 +965,9 @@ private:
     int sharingRanks_ = 1;
     std::thread::id onlyThread_; // that may call MPI; none if all may
 
+    std::optional<detail::Bell::Listener> listener_; // of memory_; none: signal_ in its place
+    bool areAllHere_ = false;                        // all other ranks can ring
+    std::atomic<bool> isRungForAll_{false};          // nothing can come that is not announced by the bell
     NapSignal signal_;
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> outbox_;                                  // under mutex_

@@ -1,5 +1,5 @@
 // NodeMemory: memory that the processes of one node all see, so that messages between them are not copied: the sender
-// tells where a block lies, and the receiver reads it there and gives it back.
+// tells where a block lies, and the receiver reads it there and gives it back. It also has a bell for each process.
 //
 // It has no name in the file system that could be left behind: others reach it through the process that made it, and it
 // is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at another, there
@@ -9,23 +9,98 @@
 #include <dfb/buffer.hpp>
 
 #include <atomic>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
 #include <memory>
 #include <mutex>
+#include <new>
 #include <string>
 #include <utility>
 
 #if defined(__linux__)
 #include <fcntl.h>
+#include <linux/futex.h>
 #include <sys/mman.h>
 #include <sys/random.h>
 #include <sys/stat.h>
+#include <sys/syscall.h>
 #include <unistd.h>
 #endif
 
 namespace dfb::detail {
+
+// Bell: a word in memory that the processes of a node share, with which they wake a rank that naps.
+class Bell {
+public:
+    // One that naps. From several threads at once.
+    class Listener {
+    public:
+        explicit Listener(Bell& bell) : bell_(bell), heard_(bell.word_.load()), seen_(bell.word_.load()) {}
+
+        // Before it looks for messages: what was rung up to now needs no nap to end.
+        void look() noexcept { heard_ = bell_.word_.load(); }
+
+        // Naps for `limit`, or until it is interrupted, or with `isAwaiting` until a rank rings. Ends at once if either
+        // has happened since the last nap, or look().
+        void nap(std::chrono::nanoseconds limit, bool isAwaiting) noexcept
+        {
+            const std::uint32_t word = bell_.word_.load();
+            if (ringsOf(word) == ringsOf(heard_) && interruptsOf(word) == interruptsOf(seen_)) {
+                auto& nappers = isAwaiting ? bell_.awaiting_ : bell_.napping_;
+                nappers.fetch_add(1);
+                bell_.wait(word, limit); // returns at once if the word is another one by now
+                nappers.fetch_sub(1);
+            }
+            heard_ = seen_ = bell_.word_.load();
+        }
+
+    private:
+        static std::uint32_t ringsOf(std::uint32_t word) { return word & 0xffff; }
+        static std::uint32_t interruptsOf(std::uint32_t word) { return word >> 16; }
+
+        Bell& bell_;
+        std::atomic<std::uint32_t> heard_, seen_;
+    };
+
+    // Of the rank itself: ends its nap, or else the next one.
+    void interrupt() noexcept
+    {
+        word_.fetch_add(0x10000);
+        if (awaiting_.load() + napping_.load() > 0)
+            wake();
+    }
+    // Of another rank, that has sent something.
+    void ring() noexcept
+    {
+        word_.fetch_add(1);
+        if (awaiting_.load() > 0)
+            wake();
+    }
+
+private:
+#if defined(__linux__)
+    void wait(std::uint32_t word, std::chrono::nanoseconds limit) noexcept
+    {
+        const timespec time{static_cast<time_t>(limit.count() / 1000000000),
+                            static_cast<long>(limit.count() % 1000000000)};
+        syscall(SYS_futex, &word_, FUTEX_WAIT, word, &time, nullptr, 0);
+    }
+    void wake() noexcept
+    {
+        syscall(SYS_futex, &word_, FUTEX_WAKE, std::numeric_limits<int>::max(), nullptr, nullptr, 0);
+    }
+#else
+    void wait(std::uint32_t, std::chrono::nanoseconds) noexcept {} // there is no such memory
+    void wake() noexcept {}
+#endif
+
+    std::atomic<std::uint32_t> word_{0}; // rings in the lower half, interrupts in the upper one
+    std::atomic<std::uint32_t> awaiting_{0}, napping_{0};
+};
+static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(Bell) == 3 * sizeof(std::uint32_t));
 
 class NodeMemory final : public SharedMemory, public BlockOwner, public std::enable_shared_from_this<NodeMemory> {
 public:
@@ -60,6 +135,7 @@ public:
         memory->address_.process = getpid();
         memory->address_.file = file;
         std::memcpy(base, memory->address_.secret, sizeof memory->address_.secret);
+        new (&memory->bell()) Bell;
         return memory;
 #else
         return nullptr;
@@ -103,6 +179,8 @@ public:
     }
 
     const Address& address() const noexcept { return address_; }
+    // The bell of the process whose memory it is.
+    Bell& bell() const noexcept { return *reinterpret_cast<Bell*>(base_ + alignment); }
 
     std::byte* take(std::size_t byteCount) noexcept override
     {
@@ -202,7 +280,7 @@ private:
     const int file_; // -1: of another process
     Address address_;
     std::mutex mutex_;
-    std::size_t used_ = alignment, allocated_; // the first bytes are the secret; under mutex_
+    std::size_t used_ = 2 * alignment, allocated_; // the first bytes are the secret and the bell; under mutex_
 };
 
 } // namespace dfb::detail

@@ -30,9 +30,14 @@
 //                                               orderly: it waits for nobody; other ranks may get fail(), and messages
 //                                               under way may be lost
 //
-// Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp):
-//   bool lendsTo(int other) const;              std::int32_t placeOf(const std::byte* block) const;
+// Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp). Places in that memory are counted in
+// units of bytesOfPlace, at which the memory is aligned:
+//   bool lendsTo(int other) const;              whether that rank sees this one's
+//   std::int32_t placeOf(const std::byte* p) const;
+//                                               the place that holds *p, or -1 if others do not see it
 //   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
+//                                               so many bytes from a place of another rank's memory on, or null. They
+//                                               can be read as long as the transport lives
 //
 // Optional, if a thread of the library's own may not always poll:
 //   static bool mayHaveThread(const Communicator&);
@@ -244,6 +249,8 @@ constexpr bool checkTransport()
 }
 
 } // namespace detail
+
+inline constexpr std::int64_t bytesOfPlace = 64;
 
 // Link: a transport of any type behind an abstract class, so that its users are no templates. Its members are those of
 // the contract above.

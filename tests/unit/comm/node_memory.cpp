@@ -4,11 +4,13 @@
 
 #include <dfb/comm/node_memory.hpp>
 
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <memory>
 #include <set>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -30,6 +32,43 @@ struct SharedPool {
 };
 
 } // namespace
+
+TEST_CASE("A bell ends a nap, or the next one, and wakes only who wants to be woken", "[memory]")
+{
+    using namespace std::chrono;
+    SharedPool s;
+    dfb::detail::Bell &mine = s.memory->bell(), &others = s.seen->bell(); // the same, as another process has it
+    dfb::detail::Bell::Listener listener(mine);
+    // The time is the assertion: a nap that nobody ends takes a minute.
+    const auto isShort = [&](bool isAwaiting, const auto& before, const auto& meanwhile) {
+        before();
+        const auto start = steady_clock::now();
+        std::thread napper([&] { listener.nap(minutes(1), isAwaiting); });
+        meanwhile();
+        napper.join();
+        return steady_clock::now() - start < seconds(30);
+    };
+    const auto nothing = [] {};
+    const auto ring = [&] { others.ring(); };
+    const auto interrupt = [&] { mine.interrupt(); };
+    for (const bool isAwaiting : {true, false}) {
+        CHECK(isShort(isAwaiting, ring, nothing));
+        CHECK(isShort(isAwaiting, interrupt, nothing));
+        CHECK(isShort(isAwaiting, nothing, interrupt));
+    }
+    CHECK(isShort(true, nothing, ring));
+    // An interrupt ends one nap, also if it has looked since; a ring that it has looked after ends none.
+    mine.interrupt();
+    others.ring();
+    listener.look();
+    const auto timeOf = [&](milliseconds limit) {
+        const auto start = steady_clock::now();
+        listener.nap(limit, true);
+        return steady_clock::now() - start;
+    };
+    CHECK(timeOf(minutes(1)) < seconds(30));
+    CHECK(timeOf(milliseconds(20)) >= milliseconds(20));
+}
 
 TEST_CASE("What one process writes another reads in the same place, and gives back", "[memory]")
 {
