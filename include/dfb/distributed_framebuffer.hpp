@@ -78,8 +78,9 @@ public:
         // pass that the frame does not have, and for a negative generation or number of children. An input that does
         // not fit the others makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
-        // Sends pixels that lie in your own memory; they are not read any more when it returns. Threads, waiting and
-        // exceptions as above. Throws InvalidArgument also if a channel that has to travel is null.
+        // Sends pixels that lie in your own memory; they are not read any more when it returns, unless you promise
+        // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Throws InvalidArgument also if a channel
+        // that has to travel is null.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
         // Whether an input of that tile and generation cannot be seen and need not be rendered: this rank knows of an
@@ -339,6 +340,11 @@ public:
         config.image.height = height;
         makeEngines(config);
     }
+
+    // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
+    // and aligned to 64 bytes. If there is no shared memory, or no more of it (1 GiB a rank), it is memory of this rank
+    // alone, and pixels in it are sent. Any thread. Waits for nothing. Throws OutOfMemory.
+    Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
     using Reduce = dfb::Reduce;
 

@@ -1,23 +1,19 @@
-// Fragment: a sparse owning handle of one input of a tile: who it is, and per channel the active row spans,
-// read in place out of the message that brought it.
+// Fragment: one input of a tile: who it is, and per channel the active row spans. It owns the message that brought it
+// and is read there, or it is a view of pixels that lie in the memory of a renderer (TileView::staysUntilEnd).
 #pragma once
 
 #include <dfb/tile.hpp>
+#include <dfb/wire/active_pixels.hpp>
 #include <dfb/wire/wire_format.hpp>
 
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <memory>
 #include <type_traits>
 #include <utility>
 
 namespace dfb {
-
-// A run of active pixels in a row, counted from the region's left border.
-struct Span {
-    std::uint16_t x = 0;
-    std::uint16_t count = 0;
-};
 
 // The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its
 // colour at color + 4 * k and its depth at depth + k. What did not travel is null.
@@ -38,10 +34,11 @@ struct FragmentRow {
 
 // How the pixels of a fragment are stored.
 enum class FragmentEncoding : std::uint8_t {
-    Empty,   // no active pixel: "nothing here"
-    Sparse,  // row spans
-    Dense,   // every pixel of the region, no spans
-    Constant // every pixel of the region alike: one pixel is stored
+    Empty,    // no active pixel: "nothing here"
+    Sparse,   // row spans
+    Dense,    // every pixel of the region, no spans
+    Constant, // every pixel of the region alike: one pixel is stored
+    InPlace   // read in the memory of its renderer; which pixels are active shows row by row
 };
 
 class Fragment {
@@ -57,8 +54,10 @@ public:
         WireFormat colorFormat = WireFormat::Float32; // that it came in
         const float* color = nullptr;
         const float* depth = nullptr;
-        detail::ConstPlanes aux; // all but colour and depth
-        Span fullRow;            // Dense and Constant
+        detail::ConstPlanes aux;               // all but colour and depth
+        Span fullRow;                          // Dense and Constant
+        detail::PixelsInPlace inPlace;         // InPlace
+        detail::FaultCounts* faults = nullptr; // InPlace: of all inputs of the rank
     };
 
     Fragment() = default;
@@ -71,14 +70,14 @@ public:
 
     const TileHeader& header() const noexcept { return header_; }
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
-    std::uint32_t activePixels() const noexcept { return parts_.activePixels; }
-    bool hasDepth() const noexcept { return parts_.depth != nullptr; }
+    std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: not known, 0
+    bool hasDepth() const noexcept { return parts_.depth != nullptr || parts_.inPlace.depth != nullptr; }
     ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
     WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // that it came in
 
     // Colour of the pixels that are stored: all that are active, or with FragmentEncoding::Constant a row of equal
-    // ones.
+    // ones. Null, and none, with FragmentEncoding::InPlace.
     const float* color() const noexcept { return parts_.color; }
     std::size_t storedPixels() const noexcept
     {
@@ -89,6 +88,8 @@ public:
     // must.
     bool isOpaque() const noexcept
     {
+        if (parts_.encoding == FragmentEncoding::InPlace)
+            return parts_.inPlace.isOpaque(header_.region.width(), header_.region.height());
         if (parts_.encoding != FragmentEncoding::Dense && parts_.encoding != FragmentEncoding::Constant)
             return false;
         const std::size_t count = storedPixels();
@@ -114,14 +115,22 @@ private:
 // Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
 class FragmentCursor {
 public:
-    explicit FragmentCursor(const Fragment& fragment)
+    // `row` is memory for a row of a fragment that is read in place; null: the cursor has its own. `countsFaults`:
+    // whether pixels that are not as they should be are added to the frame's counts; only one walk may.
+    explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
           depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
-          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0)
+          hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0), countsFaults_(countsFaults),
+          rowPixels_(row)
     {
+        if (!row && isInPlace()) {
+            ownRow_ = std::make_unique<detail::RowPixels>();
+            rowPixels_ = ownRow_.get();
+        }
     }
 
-    // The active pixels of the next row of the region, starting with row 0; a row may have none.
+    // The active pixels of the next row of the region, starting with row 0; a row may have none. Of a fragment that is
+    // read in place they hold until the next call.
     FragmentRow next()
     {
         FragmentRow row;
@@ -137,6 +146,8 @@ public:
     {
         const int row = row_++;
         result.spanCount = 0;
+        if (isInPlace())
+            return readRow(row, result);
         if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
             return false;
         const bool isSparse = parts_->encoding == FragmentEncoding::Sparse;
@@ -150,7 +161,7 @@ public:
 
     void advance(const FragmentRow& row)
     {
-        if (parts_->encoding == FragmentEncoding::Constant)
+        if (parts_->encoding == FragmentEncoding::Constant || isInPlace())
             return;
         std::size_t pixels = 0;
         for (int i = 0; i < row.spanCount; ++i)
@@ -160,7 +171,32 @@ public:
         advance(pixels);
     }
 
+    // Leaves out rows.
+    void skip(int count)
+    {
+        if (isInPlace())
+            row_ += count;
+        else
+            for (int i = 0; i < count; ++i)
+                next();
+    }
+
 private:
+    bool isInPlace() const noexcept { return parts_->encoding == FragmentEncoding::InPlace; }
+
+    bool readRow(int y, FragmentRow& result)
+    {
+        detail::InputFaults faults;
+        parts_->inPlace.readRow(y, *rowPixels_, faults);
+        if (countsFaults_ && parts_->faults)
+            parts_->faults->add(faults);
+        result.spans = rowPixels_->active.spans.data();
+        result.spanCount = static_cast<int>(rowPixels_->active.spans.size());
+        result.color = rowPixels_->color.data();
+        result.depth = parts_->inPlace.depth ? rowPixels_->depth.data() : nullptr;
+        return result.spanCount > 0;
+    }
+
     void advance(std::size_t pixels)
     {
         color_ += 4 * pixels;
@@ -175,8 +211,10 @@ private:
     const float* color_;
     const float* depth_;
     detail::ConstPlanes aux_;
-    bool hasAux_;
+    bool hasAux_, countsFaults_;
     int row_ = 0;
+    detail::RowPixels* rowPixels_; // of the row that next() gave; InPlace
+    std::unique_ptr<detail::RowPixels> ownRow_;
 };
 
 template <class F>

@@ -170,7 +170,7 @@ struct FrameReport {
     std::int64_t messagesSent = 0;         // all
     std::int64_t tilesTotal = 0;           // in the image
     std::int64_t tilesTouched = 0;         // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (see wire/fragment_message.hpp)
+    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (wire/active_pixels.hpp)
     std::int64_t alphaOutsidePixels = 0;   // all: finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in

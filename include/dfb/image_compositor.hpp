@@ -36,7 +36,7 @@ enum class ImageBlend : std::uint8_t {
     InOrder  // images blended front to back in an order of the ranks; no depth is needed
 };
 
-// The image that a rank has rendered, in the program's own memory. ImageCompositor::start() reads it.
+// The image that a rank has rendered, in memory of the program. ImageCompositor::start() reads it.
 struct InputImage {
     // This rank has nothing to show.
     InputImage() = default;
@@ -58,6 +58,10 @@ struct InputImage {
     Region region{0, 0, 0, 0};
     // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
+    // A promise: the memory stays as it is until end() has returned. Then pixels need not be copied if their colours
+    // are premultiplied RGBA: a rank reads its own where they lie, and those of other ranks of its node if they lie in
+    // memory of sharedMemory(). composite() takes it as promised.
+    bool staysUntilEnd = false;
 };
 
 // One object per rank. Construction, destruction and resize() are collective. One thread at a time may call members;
@@ -97,7 +101,9 @@ public:
     // rank's place in the order, 0 in front, a different one on each rank. Collective. Waits and throws as end().
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {})
     {
-        start(image, place, frame);
+        InputImage staying = image;
+        staying.staysUntilEnd = true;
+        start(staying, place, frame);
         return end();
     }
     // Does so for the other ways to blend, which need no place.
@@ -106,7 +112,8 @@ public:
         return composite(image, -1, frame);
     }
 
-    // Reads this rank's image and sends it. Its memory may be used again when this returns. Waits for another rank only
+    // Reads this rank's image and sends it. Its memory may be used again when this returns, unless you have promised
+    // InputImage::staysUntilEnd. Waits for another rank only
     // if this one has too much under way (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open. If
     // the image is wrong, end() throws on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
@@ -131,6 +138,12 @@ public:
     // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Waits
     // for all ranks. Throws OutOfMemory, TransportError.
     Image imageOnAllRanks() { return engine_->imageOnAllRanks(); }
+
+    // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
+    // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (1 GiB a rank), it is memory of
+    // this rank alone, which is as good for all but speed. After a TransportError do not write to it until the
+    // compositor is gone. Any thread. Waits for nothing. Throws OutOfMemory.
+    Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
     // Changes the size of the picture; image() is empty then. Collective. Waits for all ranks. Throws InvalidArgument
     // if a picture is open, or on all ranks if the size cannot be.
@@ -178,10 +191,12 @@ class InputTile {
 public:
     using View = TileView<colorChannel | depthChannel, 64>;
 
-    // `isFlipped`: the image's first row is the last of the picture.
-    InputTile(const InputImage& image, const Region& region, const TileLayout& layout, bool isFlipped)
+    // `isFlipped`: the image's first row is the last of the picture. `usesDepth`: whether depths are sent.
+    InputTile(const InputImage& image, const Region& region, const TileLayout& layout, bool isFlipped, bool usesDepth)
         : image_(image), held_(region), height_(layout.height()), isFlipped_(isFlipped)
     {
+        const bool hasFarDepth = image.depth && image.farDepth < std::numeric_limits<float>::infinity();
+        isConverted_ = image.hasStraightAlpha || image.isBgra || (hasFarDepth && !usesDepth);
         valid_ = intersection(intersection(held_, image.valid), {0, 0, layout.width(), layout.height()});
         if (isFlipped)
             valid_ = {valid_.x0, height_ - valid_.y1, valid_.x1, height_ - valid_.y0};
@@ -189,9 +204,9 @@ public:
 
     const Region& valid() const noexcept { return valid_; } // in the picture
 
-    // Fills in where the pixels of view.region are. What has to be converted is in memory of this thread, until its
-    // next call.
-    void find(View& view) const
+    // Returns where the pixels of a tile are; `view` is used for them. What has to be converted is in memory of this
+    // thread, until its next call.
+    InputPixels find(View& view) const
     {
         const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();
         const int row = (isFlipped_ ? height_ - 1 - view.region.y0 : view.region.y0) - held_.y0;
@@ -201,13 +216,17 @@ public:
         view.color8 = image_.rgba8 ? image_.rgba8 + 4 * first : nullptr;
         view.color = image_.rgba32f ? image_.rgba32f + 4 * first : nullptr;
         view.depth = image_.depth ? image_.depth + first : nullptr;
-        const bool hasFarDepth = image_.depth && image_.farDepth < std::numeric_limits<float>::infinity();
-        if (!image_.hasStraightAlpha && !image_.isBgra && !hasFarDepth)
-            return;
-        static thread_local std::unique_ptr<Converted> converted;
-        if (!converted)
-            converted.reset(new Converted);
-        convert(view, *converted);
+        if (isConverted_) {
+            static thread_local std::unique_ptr<Converted> converted;
+            if (!converted)
+                converted.reset(new Converted);
+            convert(view, *converted);
+            return InputPixels(view);
+        }
+        view.staysUntilEnd = image_.staysUntilEnd;
+        InputPixels pixels(view);
+        pixels.depthLimit = image_.farDepth;
+        return pixels;
     }
 
 private:
@@ -254,7 +273,7 @@ private:
     const InputImage& image_;
     Region held_, valid_;
     int height_;
-    bool isFlipped_;
+    bool isFlipped_, isConverted_;
 };
 
 } // namespace detail
@@ -349,7 +368,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         detail::failArgument("an image of 8 bits and of floats");
     if (blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
         detail::failArgument("place %d in an order of %d ranks", place, size());
-    const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_);
+    const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);
     const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
     inputs_.clear();
     const Region tiles = isThere ? layout.tilesIn(part.valid()) : Region();
@@ -364,8 +383,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         static_cast<TileHeader&>(view) = engine_->headerOf(inputs_[i].tile, 0);
         view.generation = 1;
         view.source = source;
-        part.find(view);
-        engine_->setTile(view);
+        engine_->setTile(part.find(view));
     });
 }
 

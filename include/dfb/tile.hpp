@@ -234,6 +234,11 @@ struct TileView : TileHeader {
     Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
                  std::numeric_limits<int>::max()};
     Region validRegion() const noexcept { return intersection(region, valid); }
+    // A promise: the pixels stay as they are until the frame's end() has returned. Then they need not be copied: where
+    // the tile belongs to this rank they are read where they lie, and where it belongs to another rank of the node, if
+    // they lie in memory of sharedMemory(). After a TransportError such memory must not be written to until the
+    // framebuffer is gone. NetworkConfig::checksums finds promises that are not kept.
+    bool staysUntilEnd = false;
 
     detail::ConstPlanes planes() const noexcept
     {
@@ -267,7 +272,7 @@ struct InputPixels : TileHeader {
     template <ChannelMask Channels, int Size>
     InputPixels(const TileView<Channels, Size>& from)
         : TileHeader(from), channels(Channels), at(from.planes()), stride(from.stride), valid(from.validRegion()),
-          hasBytes(!from.color && from.color8)
+          hasBytes(!from.color && from.color8), staysUntilEnd(from.staysUntilEnd)
     {
     }
 
@@ -288,6 +293,8 @@ struct InputPixels : TileHeader {
     std::ptrdiff_t stride; // from a row to the next, in pixels
     Region valid;          // of the region; pixels outside of it have nothing, and are not read
     bool hasBytes = false; // the colour has 8 bits a channel
+    bool staysUntilEnd = false;
+    float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
 };
 
 } // namespace detail

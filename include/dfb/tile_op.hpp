@@ -26,6 +26,9 @@
 //                                                depth. Only what is there travels and comes to add()
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
+//   static constexpr bool readsInPlace = true;   inputs may come as views of a renderer's memory
+//                                                (FragmentEncoding::InPlace): they are read with forEachPixel() or a
+//                                                FragmentCursor, in finish(), and not through Fragment::color()
 //   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
 //                                                isComplete() does not wait for them: nobody need render them
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
@@ -375,6 +378,13 @@ struct EmptyIsBackground : std::false_type {
 };
 template <class T>
 struct EmptyIsBackground<T, std::void_t<decltype(T::emptyIsBackground)>> : std::bool_constant<T::emptyIsBackground> {
+};
+
+template <class T, class = void>
+struct ReadsInPlace : std::false_type {
+};
+template <class T>
+struct ReadsInPlace<T, std::void_t<decltype(T::readsInPlace)>> : std::bool_constant<T::readsInPlace> {
 };
 
 template <class T, class = void>

@@ -10,6 +10,7 @@
 #include <cstring>
 #include <limits>
 #include <tuple>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -112,6 +113,25 @@ struct OwnImage {
         image.region = form.isPart ? valid : dfb::Region{0, 0, 0, 0};
         image.valid = valid;
     }
+
+    // Brings the image to memory that other ranks see, as long as the result lives.
+    dfb::Buffer moveTo(const dfb::ImageCompositor& compositor)
+    {
+        dfb::Buffer memory = compositor.sharedMemory(bytes.size() + 4 * floats.size() + 4 * depths.size() + 1);
+        std::byte* end = memory.data();
+        const auto move = [&](auto& values, auto*& pointer) {
+            if (!pointer)
+                return;
+            std::memcpy(end, values.data(), values.size() * sizeof values[0]);
+            pointer = reinterpret_cast<std::decay_t<decltype(pointer)>>(end);
+            end += values.size() * sizeof values[0];
+            values.assign(values.size(), 77); // nobody reads it there
+        };
+        move(bytes, image.rgba8);
+        move(floats, image.rgba32f);
+        move(depths, image.depth);
+        return memory;
+    }
 };
 
 constexpr std::array<float, 4> background{0.25f, 0.5f, 0.125f, 0.75f};
@@ -187,15 +207,22 @@ struct Images {
                         compositor.setBottomUp(toBottomUp);
                         dfb::FrameConfig frame;
                         frame.background = background;
+                        const int place = blend == dfb::ImageBlend::InOrder ? placeOf(compositor.rank()) : -1;
                         {
                             const OwnImage own(compositor.rank(), form, hasDepth);
-                            compositor.start(
-                                own.image, blend == dfb::ImageBlend::InOrder ? placeOf(compositor.rank()) : -1, frame);
+                            compositor.start(own.image, place, frame);
                         } // it is not needed any more
                         compositor.end();
-                        if (!compositor.isDisplayRank())
-                            continue;
-                        check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                        if (compositor.isDisplayRank())
+                            check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                        // Memory that stays: of this rank alone, and seen by others.
+                        OwnImage own(compositor.rank(), form, hasDepth);
+                        for (const bool isShared : {false, true}) {
+                            const dfb::Buffer memory = isShared ? own.moveTo(compositor) : dfb::Buffer();
+                            compositor.composite(own.image, place, frame);
+                            if (compositor.isDisplayRank())
+                                check(result, compositor.image(), form, blend, toBottomUp, hasDepth, ranks, placeOf);
+                        }
                     }
             }
         return result;

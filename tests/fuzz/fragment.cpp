@@ -1,5 +1,5 @@
 // decodeFragment: what it takes can be read to its last pixel, lies within its tile, and comes back the same when it is
-// encoded and decoded once more.
+// encoded and decoded once more. An input that is read in place lies within the memory that its sender shares.
 //
 // An input: flags, then a FragmentHeader and the payload.
 #include "fuzz.hpp"
@@ -13,6 +13,7 @@
 #include <cmath>
 #include <limits>
 #include <memory>
+#include <vector>
 
 namespace {
 
@@ -46,11 +47,30 @@ const dfb::TileLayout& layout()
     return whole;
 }
 
+// The memory that the sender shares; a byte beyond it is not ours.
+const std::vector<float>& sharedFloats()
+{
+    static const std::vector<float> floats = [] {
+        std::vector<float> all(1000);
+        for (std::size_t i = 0; i < all.size(); ++i)
+            all[i] = i % 7 == 3 ? 0.0f : static_cast<float>(i % 29) / 32;
+        all[500] = std::numeric_limits<float>::quiet_NaN();
+        return all;
+    }();
+    return floats;
+}
+const auto sharedBytes = [](std::int64_t offset, std::int64_t byteCount) {
+    const auto size = static_cast<std::int64_t>(sharedFloats().size() * sizeof(float));
+    const bool isThere = offset >= 0 && byteCount >= 0 && offset <= size && byteCount <= size - offset;
+    return isThere ? reinterpret_cast<const std::byte*>(sharedFloats().data()) + offset : nullptr;
+};
+
 dfb::Fragment decode(dfb::MemoryPool& pool, dfb::Buffer&& message, const dfb::Codec* with, const d::WireCoder& coder)
 {
     d::readMessageHeader(message);
     return d::decodeFragment(
-        pool, std::move(message), layout(), [](int tile) { return tile == 2 ? 0 : passes; }, with, coder);
+        pool, std::move(message), layout(), [](int tile) { return tile == 2 ? 0 : passes; }, with, coder, sharedBytes,
+        nullptr);
 }
 
 // The fragment as a tile; checks what may be relied on of spans and counts.
@@ -89,7 +109,8 @@ std::unique_ptr<Tile> tileOf(const dfb::Fragment& fragment)
                     fuzz::require(!std::isnan(row.depth[i]), "no depth is NaN");
         }
     }
-    fuzz::require(pixels == fragment.activePixels(), "the count of active pixels is right");
+    fuzz::require(pixels == fragment.activePixels() || fragment.encoding() == dfb::FragmentEncoding::InPlace,
+                  "the count of active pixels is right");
     return tile;
 }
 
@@ -188,6 +209,9 @@ bool take(fuzz::Input in)
     fuzz::require(fragment.hasDepth() == ((fragment.channels() & dfb::depthChannel) != 0) || fragment.empty(),
                   "depth is there if the mask says so");
     const auto tile = tileOf(fragment);
+    fuzz::require(!fragment.isOpaque() || tile->isOpaque(), "what is opaque is so in all pixels");
+    if (fragment.encoding() == dfb::FragmentEncoding::InPlace)
+        return true; // of shared floats, which may be out of range
     if (coder.activeByDepth() && !(fragment.channels() & dfb::depthChannel))
         return true; // is refused for its channels
 
@@ -268,6 +292,24 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("bytes_constant", *constant, colorAndDepth, Format::Bytes, 0);
     add("bytes_by_depth", *black, colorAndDepth, Format::Bytes, ByDepth);
     add("bytes_compressed", *runs, dfb::allChannels, Format::Bytes, HasCodec);
+    const auto addInPlace = [&](const std::string& name, std::ptrdiff_t first, std::ptrdiff_t stride, bool hasBytes) {
+        d::InputPixels tile(*dense);
+        const auto* begin = reinterpret_cast<const std::byte*>(sharedFloats().data());
+        tile.at.at[d::Color] = begin + (hasBytes ? 4 : 16) * first;
+        tile.at.at[d::Depth] = begin + 4 * first;
+        tile.stride = stride;
+        tile.hasBytes = hasBytes;
+        const dfb::Buffer message =
+            d::encodeInPlace(*pool, tile, d::pixelsInPlace(tile, colorAndDepth, false), colorAndDepth, 0,
+                             [&](const std::byte* p) { return static_cast<std::int64_t>(p - begin); });
+        const std::size_t prefix = sizeof(d::MessageHeader);
+        const std::string body = fuzz::textOf(message.data() + prefix, message.size() - prefix);
+        all.emplace_back(name, fuzz::Output().put(std::uint8_t{0}).text(body).bytes());
+        fuzz::require(take(fuzz::Input(all.back().second)), "what is good is taken");
+    };
+    addInPlace("in_place", 16, 10, false);
+    addInPlace("in_place_bytes", 200, 20, true);
+    addInPlace("in_place_bottom_up", 100, -13, false);
     add("compressed_dense", *dense, colorAndDepth, Format::Float32, HasCodec | Compress);
     return all;
 }

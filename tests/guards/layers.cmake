@@ -11,8 +11,8 @@ set(level_2 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kerne
             comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
             gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
 set(level_3 blend/compositing.hpp comm/flow_control.hpp comm/progress.hpp comm/reduction.hpp frame/open_frame.hpp
-            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp wire/active_pixels.hpp)
-set(level_4 comm/connection.hpp testing/transport_conformance.hpp tile.hpp)
+            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp)
+set(level_4 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
 set(level_5 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
             tile_layout.hpp)
 set(level_6 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp

@@ -2,7 +2,8 @@
 //   mpirun -n 4 mpi_dead <how> <where> <reaction> <victim> <folder>
 //     how:      kill (SIGKILL), exit (without MPI_Finalize), stop (SIGSTOP), resume (SIGSTOP, and SIGCONT later)
 //     where:    constructor, frame (while rendering), pixels (the same, with tiles on their way to and from everybody),
-//               reduction (between frames), end (destruction)
+//               shared (the same, with pixels that others read in the memory of the rank), reduction (between frames),
+//               end (destruction)
 //     reaction: abort (the default: MPI_Abort), handler (the other ranks go on, as far as they can)
 // Launchers end a job when a rank dies, in most cases, or do not let it live on. Therefore each process forks first:
 // what the launcher sees goes on until all ranks have been told, whatever has become of the rank itself. So this is the
@@ -11,6 +12,7 @@
 // <folder> must be empty.
 #include <dfb/dfb.hpp>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <csignal>
@@ -92,9 +94,11 @@ void emptyFrame(
     frame.end();
 }
 
-// Each rank sends all tiles; after one half of them calls `halfway`.
-void fullFrame(FrameBuffer& fb, const std::function<void()>& halfway)
+// Each rank sends all tiles; after one half of them calls `halfway`. `shared`: memory for the pixels, or empty.
+void fullFrame(FrameBuffer& fb, dfb::Buffer& shared, const std::function<void()>& halfway)
 {
+    auto* pixels = reinterpret_cast<float*>(shared.data());
+    std::fill_n(pixels, shared.size() / sizeof(float), 0.5f);
     auto frame = fb.begin({});
     const auto tile = std::make_unique<FrameBuffer::Tile>();
     for (const int index : fb.ownedTiles()) {
@@ -105,6 +109,18 @@ void fullFrame(FrameBuffer& fb, const std::function<void()>& halfway)
     for (int index = 0; index < fb.layout().tileCount(); ++index) {
         if (index == fb.layout().tileCount() / 2)
             halfway();
+        if (!shared.empty()) {
+            FrameBuffer::TileView view;
+            frame.start(view, index);
+            view.generation = 1;
+            view.stride = fb.layout().width();
+            const auto first = static_cast<std::size_t>(view.region.y0 * fb.layout().width() + view.region.x0);
+            view.color = pixels + 4 * first;
+            view.depth = pixels + 4 * static_cast<std::size_t>(fb.layout().width() * fb.layout().height()) + first;
+            view.staysUntilEnd = true;
+            frame.setTile(view);
+            continue;
+        }
         frame.start(*tile, index);
         tile->generation = 1;
         tile->fill({0.5f, 0.25f, 0, 0.5f});
@@ -139,7 +155,7 @@ void runRank(const Run& run, int& argc, char**& argv)
         try {
             const auto make = [&] {
                 dfb::FrameBufferConfig config{256, 256};
-                if (run.where == "pixels") {
+                if (run.where == "pixels" || run.where == "shared") {
                     config.image.width = config.image.height = 2048;
                     config.messages.poolBytes = 0; // as small as can be: who sends waits for who takes
                 }
@@ -152,8 +168,11 @@ void runRank(const Run& run, int& argc, char**& argv)
                 fb = make();
                 emptyFrame(*fb);
             }
+            dfb::Buffer pixels; // of floats, 5 a pixel
+            if (run.where == "shared")
+                pixels = fb->sharedMemory(std::size_t{2048} * 2048 * 20);
             start = Clock::now();
-            if (isVictim && run.where != "frame" && run.where != "pixels")
+            if (isVictim && run.where != "frame" && run.where != "pixels" && run.where != "shared")
                 die(run);
             if (run.where == "constructor")
                 fb = make();
@@ -163,8 +182,8 @@ void runRank(const Run& run, int& argc, char**& argv)
                     if (isVictim)
                         die(run);
                 });
-            else if (run.where == "pixels")
-                fullFrame(*fb, [&] {
+            else if (run.where == "pixels" || run.where == "shared")
+                fullFrame(*fb, pixels, [&] {
                     if (isVictim)
                         die(run);
                 });

@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <memory>
 #include <vector>
 
 namespace dfb {
@@ -25,22 +26,25 @@ class FragmentCompositor {
 public:
     explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
 
-    // `begin` to `end` are iterators of pointers to fragments, which must outlive this.
+    // `begin` to `end` are iterators of pointers to fragments, which must outlive this. `isFirst`: nobody else has
+    // walked them, so faults of pixels are counted.
     template <class Iterator>
-    void start(Iterator begin, Iterator end)
+    void start(Iterator begin, Iterator end, bool isFirst = true)
     {
         cursors_.clear();
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
+        std::size_t inPlace = 0;
         for (; begin != end; ++begin)
-            if (!(*begin)->empty())
+            if ((*begin)->encoding() == FragmentEncoding::InPlace)
+                cursors_.push_back(FragmentCursor(**begin, rowPixels(inPlace++), isFirst));
+            else if (!(*begin)->empty())
                 cursors_.push_back(FragmentCursor(**begin));
     }
 
     void skipRows(int count)
     {
         for (FragmentCursor& cursor : cursors_)
-            for (int i = 0; i < count; ++i)
-                cursor.next();
+            cursor.skip(count);
     }
 
     // Composites the next row of all fragments into `row`, which has been sized for the region's width. With
@@ -81,6 +85,13 @@ public:
 private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
+
+    detail::RowPixels* rowPixels(std::size_t cursor)
+    {
+        while (rowPixels_.size() <= cursor)
+            rowPixels_.push_back(std::make_unique<detail::RowPixels>());
+        return rowPixels_[cursor].get();
+    }
 
     static void clearGap(CompositeRow& row, int begin, int end, bool isBetweenRuns = false)
     {
@@ -203,6 +214,7 @@ private:
 
     BlendRule rule_;
     std::vector<FragmentCursor> cursors_;
+    std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that are read in place
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
     std::vector<std::uint64_t> isEdge_;    // bit by bit

@@ -17,6 +17,7 @@
 #include <cstring>
 #include <exception>
 #include <functional>
+#include <limits>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -199,6 +200,25 @@ public:
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const
     {
         return link_->blockAt(other, place, byteCount);
+    }
+
+    // Any byte of such a block: its offset in the memory of this rank that others see, or -1; and bytes at an offset in
+    // that of another rank, or null.
+    std::int64_t offsetOf(const std::byte* address) const
+    {
+        const std::int64_t place = placeOf(address);
+        return place < 0 ? -1
+                         : bytesOfPlace * place
+                               + static_cast<std::int64_t>(reinterpret_cast<std::uintptr_t>(address) % bytesOfPlace);
+    }
+    const std::byte* bytesAt(int other, std::int64_t offset, std::int64_t byteCount) const
+    {
+        const std::int64_t place = offset / bytesOfPlace, before = offset % bytesOfPlace;
+        if (offset < 0 || byteCount < 0 || place > std::numeric_limits<std::int32_t>::max())
+            return nullptr;
+        const std::byte* block =
+            blockAt(other, static_cast<std::int32_t>(place), static_cast<std::size_t>(before + byteCount));
+        return block ? block + before : nullptr;
     }
 
     // Notes that all ranks have the same configuration, `checksums` included. Before that, messages may come with or

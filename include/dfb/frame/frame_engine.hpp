@@ -180,16 +180,19 @@ public:
         if (outcome_->failed() || isHidden(tile.tile, tile.generation))
             return;
         const int owner = tileOwner(tile.tile);
-        const Codec* codec = codecFor(owner);
-        Buffer message = pipeline_->encode(tile, codec);
-        if (codec)
-            gains_->add(owner, rawFragmentBytes(message), message.size());
+        const bool isInPlace = pipeline_->mayReadInPlace(tile);
+        if (isInPlace && mailbox_->connection().config().checksums)
+            pipeline_->notePromise(tile);
         ++inputsSent_;
         if (owner != rank()) {
-            mailbox_->sendWithCredit(owner, std::move(message));
+            Buffer message = isInPlace ? encodePlace(tile, owner) : Buffer();
+            mailbox_->sendWithCredit(owner, message.empty() ? encode(tile, owner) : std::move(message));
             waitForRoom();
         } else if (open_.enter(tile.frame)) {
-            arrive(std::move(message), -1);
+            if (isInPlace)
+                arrive([&](auto& where, auto& arrival) { pipeline_->arrive(tile, rank(), where, arrival); }, true);
+            else
+                arrive(encode(tile, owner), rank());
             open_.leave();
         }
         pollNowAndThen();
@@ -576,20 +579,60 @@ private:
 
     // ---- tiles
 
-    // `where` says what is known of the place.
-    // `source`: -1 if it is this rank's own.
+    Buffer encode(const InputPixels& tile, int owner)
+    {
+        const Codec* codec = codecFor(owner);
+        Buffer message = pipeline_->encode(tile, codec);
+        if (codec)
+            gains_->add(owner, rawFragmentBytes(message), message.size());
+        return message;
+    }
+
+    // The message that tells the owner where the pixels lie. Empty if it does not see them.
+    Buffer encodePlace(const InputPixels& tile, int owner)
+    {
+        const Connection& connection = mailbox_->connection();
+        if (!connection.isSeenBy(owner))
+            return Buffer();
+        return pipeline_->encodePlace(tile, [&](const std::byte* address) { return connection.offsetOf(address); });
+    }
+
+    // The message with an input of rank `source`.
     void arrive(Buffer&& message, int source)
     {
+        const auto sharedBytes = [this, source](std::int64_t offset, std::int64_t byteCount) {
+            return mailbox_->connection().bytesAt(source, offset, byteCount);
+        };
+        arrive(
+            [&](ErrorInfo& where, TileTable::Arrival& arrival) {
+                pipeline_->arrive(std::move(message), source, sharedBytes, where, arrival);
+            },
+            saysInPlace(message), source == rank() ? -1 : source);
+    }
+
+    // Takes an input by `take(where, arrival)`; `where` says what is known of the place. `source`: the rank whose
+    // message it is, or -1.
+    template <class Take>
+    void arrive(const Take& take, bool isInPlace, int source = -1)
+    {
+        if (!open_.beginReading(isInPlace))
+            return;
         ErrorInfo where;
         TileTable::Arrival arrival;
-        outcome_->guarded([&] { pipeline_->arrive(std::move(message), source >= 0 ? source : rank(), where, arrival); },
-                          where, source);
+        outcome_->guarded([&] { take(where, arrival); }, where, source);
         if (arrival.spoilt) {
             pipeline_->table().saidWhy();
             outcome_->tryVote();
         }
         if (arrival.ready)
             outcome_->guarded([&] { submitFinish(static_cast<int>(where.tile)); }, where);
+        endReading();
+    }
+
+    void endReading()
+    {
+        if (open_.endReading())
+            outcome_->tryVote();
     }
 
     void submitFinish(int tile)
@@ -603,10 +646,11 @@ private:
     {
         ErrorInfo where;
         where.tile = tile;
-        if (!outcome_->failed()) {
+        if (open_.beginReading()) {
             const bool finished = outcome_->guarded([&] { pipeline_->finish(tile); }, where);
             if ((finished || params_.allowPartial) && open_.tileFinished())
                 outcome_->guarded([&] { allFinished(); }, where);
+            endReading();
         }
         open_.leave();
     }
@@ -663,19 +707,28 @@ private:
         return info;
     }
 
-    // Adds this rank's counts of the frame to the verdict.
+    // Adds this rank's counts of the frame to the verdict, and a promise of its renderer that was not kept.
     void addFigures(Verdict& v)
     {
+        if (const int tile = pipeline_->brokenPromise(); tile >= 0 && !v.error) {
+            v.error = ErrorInfo();
+            v.error->kind = ErrorKind::InvalidArgument;
+            v.error->rank = rank();
+            v.error->frame = open_.number();
+            v.error->tile = tile;
+            v.error->message = "its pixels were to stay until the end of the frame (TileView::staysUntilEnd), and have "
+                               "changed";
+        }
         const std::int64_t repeated = mailbox_->connection().duplicates();
         const auto reports = pipeline_->reports();
         v.sums[Verdict::BytesSent] = mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes();
         v.sums[Verdict::MessagesSent] = mailbox_->messagesSent() - messagesBefore_;
         v.sums[Verdict::TilesTouched] = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
-        v.sums[Verdict::NonFinitePixels] = pipeline_->nonFinitePixels();
+        v.sums[Verdict::NonFinitePixels] = pipeline_->faults().nonFinite;
         v.sums[Verdict::LateMessages] = open_.takeLateCount();
         v.sums[Verdict::RepeatedMessages] = repeated - repeatedBefore_;
         v.sums[Verdict::OrderUndefinedPixels] = reports.orderUndefinedPixels;
-        v.sums[Verdict::AlphaOutsidePixels] = pipeline_->alphaOutsidePixels();
+        v.sums[Verdict::AlphaOutsidePixels] = pipeline_->faults().alphaOutside;
         v.sums[Verdict::CompressedLinks] = gains_->links();
         v.sums[Verdict::InputsLeft] = inputsSent_ - pipeline_->table().arrivedCount();
         v.sums[Verdict::TilesEndedEarly] = pipeline_->table().endedEarlyCount();

@@ -69,6 +69,7 @@ public:
         failed_ = damaged_ = isTold_ = false;
         tilesLeft_ = 0;
         areTilesKnown_ = areTilesFinished_ = false;
+        hasInPlace_ = false;
         opened_.clear();
         opened_.swap(early_);
         return opened_;
@@ -111,13 +112,14 @@ public:
         return isBeforeVote();
     }
 
-    // Makes this rank vote, once: when it has called end() and `isDone()`, or the frame has failed, and `may()`. True
-    // if it is to vote now.
+    // Makes this rank vote, once: when it has called end() and `isDone()`, or the frame has failed and nobody reads
+    // inputs in place any more, and `may()`. True if it is to vote now.
     template <class IsDone, class May>
     bool vote(const IsDone& isDone, const May& may)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        const bool isReady = state_ == FrameState::Failed || (state_ == FrameState::Finishing && isDone());
+        const bool isReading = hasInPlace_ && readers_ > 0;
+        const bool isReady = state_ == FrameState::Failed ? !isReading : state_ == FrameState::Finishing && isDone();
         if (!isReady || !may())
             return false;
         state_ = FrameState::Voted;
@@ -248,6 +250,23 @@ public:
             empty_.notify_all();
     }
 
+    // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So this rank
+    // does not vote while a task reads inputs, once the frame has one that `isInPlace`. False if the frame has failed:
+    // then inputs must not be read. Else endReading() must follow.
+    bool beginReading(bool isInPlace = false)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        hasInPlace_ = hasInPlace_ || isInPlace;
+        readers_ += !failed_;
+        return !failed_;
+    }
+    // Returns whether vote() has to be tried, as the frame has failed meanwhile.
+    bool endReading()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        return --readers_ == 0 && failed_;
+    }
+
     void countLate() noexcept { ++late_; }
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
@@ -282,7 +301,8 @@ private:
     std::optional<ErrorInfo> error_;
     bool isTold_ = false; // to all ranks, by this one or another: the frame has failed
     std::int64_t tilesLeft_ = 0;
-    int inside_ = 0;
+    int inside_ = 0, readers_ = 0;
+    bool hasInPlace_ = false;
     std::vector<Message> early_, opened_; // for the next frame; for the one that is open
 };
 

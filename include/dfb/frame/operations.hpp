@@ -18,7 +18,7 @@ struct OperationTraits {
     int tileSize = 64;
     ChannelMask channels = 0, neededChannels = 0;
     bool activeByDepth = false, emptyIsBackground = false, keepsState = false, endsEarly = false;
-    bool opaqueHides = false, reports = false;
+    bool opaqueHides = false, reports = false, readsInPlace = false;
     bool hasPixelOp = false, pixelOpIsPointwise = true;
     std::string tileOp, pixelOp; // names of the types, as the compiler has them
 
@@ -34,6 +34,7 @@ struct OperationTraits {
         t.keepsState = KeepsState<TileOp>::value;
         t.endsEarly = HasIsComplete<TileOp>::value;
         t.opaqueHides = OpaqueHides<TileOp>::value;
+        t.readsInPlace = ReadsInPlace<TileOp>::value;
         t.reports = HasReport<TileOp>::value;
         t.hasPixelOp = !std::is_same_v<PixelOp, NoPixelOp>;
         t.pixelOpIsPointwise = IsPointwise<PixelOp>::value;

@@ -133,10 +133,10 @@ public:
             return;
         Verdict mine;
         mine.terms = terms_.terms;
+        mine.error = frame_.reason();
         addFigures_(mine);
         if (terms_.allowPartial)
             mine.incomplete = tiles_.table().unfinished(terms_.declared);
-        mine.error = frame_.reason();
         mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
             verdict_ = Verdict::from(result);
             frame_.decide();

@@ -79,7 +79,8 @@ public:
     // data.
     void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses)
     {
-        nonFinite_ = alphaOutside_ = 0;
+        faults_.reset();
+        promises_.clear();
         reports_ = {};
         const bool hasPasses =
             plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
@@ -142,20 +143,66 @@ public:
         const FloatEnvironment floatEnvironment;
         InputFaults faults;
         Buffer message = encodeFragment(*pool_, tile, sent_, address_, codec, coder_, wireColor_, faults);
-        if (faults.nonFinite)
-            nonFinite_ += static_cast<std::int64_t>(faults.nonFinite);
-        if (faults.alphaOutside)
-            alphaOutside_ += static_cast<std::int64_t>(faults.alphaOutside);
+        faults_.add(faults);
         return message;
+    }
+
+    // Whether the owner of a tile may read its pixels where they lie, if it sees them.
+    bool mayReadInPlace(const InputPixels& tile) const
+    {
+        return tile.staysUntilEnd && traits().readsInPlace && !traits().keepsState && !isLossy()
+               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.planes().at[Color] && !tile.valid.empty();
+    }
+
+    // The message for such a tile of another owner. `offsetOf(address)`: from the start of the memory that the owner
+    // sees, or -1. Empty if the pixels do not lie in it.
+    template <class OffsetOf>
+    Buffer encodePlace(const InputPixels& tile, const OffsetOf& offsetOf)
+    {
+        return encodeInPlace(*pool_, tile, inPlace(tile), sent_ | colorChannel, address_, offsetOf);
+    }
+
+    // Takes such an input of this rank's own. As the next arrive().
+    void arrive(const InputPixels& tile, int rank, ErrorInfo& where, TileTable::Arrival& arrival)
+    {
+        Fragment::Parts parts;
+        parts.encoding = FragmentEncoding::InPlace;
+        parts.channels = static_cast<ChannelMask>(sent_ | colorChannel);
+        parts.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
+        parts.inPlace = inPlace(tile);
+        parts.faults = &faults_;
+        arrive(Fragment(tile, Buffer(), parts), rank, where, arrival);
+    }
+
+    // Remembers the pixels of a tile that are to stay as they are. From several threads.
+    void notePromise(const InputPixels& tile)
+    {
+        const std::uint32_t sum = checksumOf(tile);
+        const std::lock_guard<std::mutex> lock(reportsMutex_);
+        promises_.push_back({tile, sum});
+    }
+    // Returns a tile whose pixels have not stayed as they were, or -1.
+    int brokenPromise()
+    {
+        const std::lock_guard<std::mutex> lock(reportsMutex_);
+        for (const Promise& promise : promises_)
+            if (checksumOf(promise.tile) != promise.checksum)
+                return promise.tile.tile;
+        return -1;
     }
 
     // Takes an input of rank `from`. `where` gets what is known of the place: the tile. See TileTable::arrive() for the
     // rest.
-    void arrive(Buffer&& message, int from, ErrorInfo& where, TileTable::Arrival& arrival)
+    void arrive(Buffer&& message, int from, const SharedBytes& sharedBytes, ErrorInfo& where,
+                TileTable::Arrival& arrival)
     {
-        Fragment fragment = decodeFragment(
-            *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
-            config_.messages.codec.get(), coder_);
+        arrive(decodeFragment(
+                   *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
+                   config_.messages.codec.get(), coder_, sharedBytes, &faults_),
+               from, where, arrival);
+    }
+    void arrive(Fragment&& fragment, int from, ErrorInfo& where, TileTable::Arrival& arrival)
+    {
         const TileHeader& h = fragment.header();
         const int tile = h.tile;
         where.tile = tile;
@@ -250,9 +297,8 @@ public:
             gather_.setIncomplete(tile);
     }
 
-    // Input pixels of this frame, set on this rank, that had an infinity or NaN.
-    std::int64_t nonFinitePixels() const noexcept { return nonFinite_; }
-    std::int64_t alphaOutsidePixels() const noexcept { return alphaOutside_; } // of the others
+    // Of the inputs of this frame that this rank has copied or read in place.
+    const FaultCounts& faults() const noexcept { return faults_; }
 
     // The operation's reports on this rank's tiles, up to now.
     struct Reports {
@@ -345,6 +391,8 @@ private:
         return senders;
     }
 
+    PixelsInPlace inPlace(const InputPixels& tile) const { return pixelsInPlace(tile, sent_, traits().activeByDepth); }
+
     bool isLossy() const noexcept
     {
         return config_.precision.color != WireFormat::Float32 || config_.precision.budget > 0
@@ -381,9 +429,14 @@ private:
     const WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;
-    std::atomic<std::int64_t> nonFinite_{0}, alphaOutside_{0};
+    FaultCounts faults_;
+    struct Promise {
+        InputPixels tile;
+        std::uint32_t checksum;
+    };
     std::mutex reportsMutex_;
-    Reports reports_; // under reportsMutex_
+    Reports reports_;               // under reportsMutex_, as the next one
+    std::vector<Promise> promises_; // of TileView::staysUntilEnd, if they are checked
 };
 
 } // namespace dfb::detail

@@ -197,6 +197,7 @@ public:
     static constexpr BlendRule rule = Rule;
     static constexpr bool emptyIsBackground = true;
     static constexpr bool activeByDepth = Rule == BlendRule::Nearest;
+    static constexpr bool readsInPlace = true;
 
     void newFrame(const TileInfo& info) { store_.newFrame(info, Channels); }
     void add(Fragment&& fragment) { store_.add(std::move(fragment)); }
@@ -453,7 +454,7 @@ DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y
         const auto first = next;
         while (next != pointers.end() && (*next)->header().pass == pass)
             ++next;
-        compositor.start(first, next);
+        compositor.start(first, next, false);
         compositor.skipRows(y);
         row.resize(width, 0, true);
         compositor.nextRow(row);

@@ -1,17 +1,30 @@
-// Active pixels: which of a row travel, those with any colour channel that is not 0 or those with a depth; and copying
-// them, with a check.
+// Active pixels: which of a row travel, those with any colour channel that is not 0 or those with a depth; copying
+// them, with a check; and reading an input where it lies, row by row.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
 #include <dfb/channels.hpp>
+#include <dfb/image.hpp>
 #include <dfb/wire/wire_format.hpp>
 
+#include <algorithm>
+#include <atomic>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <vector>
 
-namespace dfb::detail {
+namespace dfb {
+
+// A run of active pixels in a row, counted from the region's left border.
+struct Span {
+    std::uint16_t x = 0;
+    std::uint16_t count = 0;
+};
+
+namespace detail {
 
 // Of up to 64 pixels, bit by bit: those with a colour channel that is not 0.
 DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
@@ -95,47 +108,68 @@ inline std::uint64_t activeByteBits(const std::byte* rgba, int count)
 
 // Of up to 64 pixels, bit by bit.
 struct DepthBits {
-    std::uint64_t active = 0; // below +infinity
+    std::uint64_t active = 0; // below the limit
     std::uint64_t nan = 0;
 };
 
-DFB_INLINE DepthBits findDepths(const float* depth, int count)
+DFB_INLINE DepthBits findDepths(const float* depth, int count, float limit)
 {
     DepthBits bits;
     for (int i = 0; i < count; ++i) {
-        bits.active |= std::uint64_t{depth[i] < std::numeric_limits<float>::infinity()} << i;
+        bits.active |= std::uint64_t{depth[i] < limit} << i;
         bits.nan |= std::uint64_t{depth[i] != depth[i]} << i;
     }
     return bits;
 }
 
 #if defined(DFB_HAS_AVX2_CLONES)
-DFB_AVX2 inline DepthBits findDepthsAvx2(const float* depth, int count)
+DFB_AVX2 inline DepthBits findDepthsAvx2(const float* depth, int count, float limit)
 {
-    const __m256 infinity = _mm256_set1_ps(std::numeric_limits<float>::infinity());
+    const __m256 most = _mm256_set1_ps(limit);
     const auto bitsOf8 = [](int mask) { return static_cast<std::uint64_t>(mask & 255); };
     DepthBits bits;
     int i = 0;
     for (; i + 8 <= count; i += 8) {
         const __m256 d = _mm256_loadu_ps(depth + i);
-        bits.active |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, infinity, _CMP_LT_OQ))) << i;
+        bits.active |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, most, _CMP_LT_OQ))) << i;
         bits.nan |= bitsOf8(_mm256_movemask_ps(_mm256_cmp_ps(d, d, _CMP_UNORD_Q))) << i;
     }
     if (i == count)
         return bits;
-    const DepthBits rest = findDepths(depth + i, count - i);
+    const DepthBits rest = findDepths(depth + i, count - i, limit);
     return {bits.active | rest.active << i, bits.nan | rest.nan << i};
 }
 #endif
 
-inline DepthBits depthBits(const float* depth, int count)
+inline DepthBits depthBits(const float* depth, int count, float limit)
 {
 #if defined(DFB_HAS_AVX2_CLONES)
     if (cpuHasAvx2())
-        return findDepthsAvx2(depth, count);
+        return findDepthsAvx2(depth, count, limit);
 #endif
-    return findDepths(depth, count);
+    return findDepths(depth, count, limit);
 }
+
+// Which pixels of a row are active.
+struct Activity {
+    bool byDepth = false; // those with a depth; else those with a colour
+    bool hasBytes = false;
+    float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
+
+    // Up to 64 pixels, bit by bit. `depth` may be null unless byDepth. Counts NaNs that keep a pixel from being active.
+    std::uint64_t bits(const std::byte* color, const float* depth, int count, std::uint64_t& nanDepths) const
+    {
+        const bool hasLimit = depth && depthLimit < std::numeric_limits<float>::infinity();
+        const DepthBits depths = byDepth || hasLimit ? depthBits(depth, count, depthLimit) : DepthBits();
+        if (byDepth) {
+            for (std::uint64_t nan = depths.nan; nan != 0; nan &= nan - 1)
+                ++nanDepths;
+            return depths.active;
+        }
+        const std::uint64_t colors = hasBytes ? activeByteBits(color, count) : activePixelBits(floatsOf(color), count);
+        return hasLimit ? colors & (depths.active | depths.nan) : colors;
+    }
+};
 
 // Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
 inline bool copyAndCheckColors(const float* rgba, int count, float* out)
@@ -218,4 +252,191 @@ inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t c
     return true;
 }
 
-} // namespace dfb::detail
+// Loads a row of an image into the cache. No processor knows by itself where the next row begins.
+inline void prefetchRow(const std::byte* row, std::size_t bytes)
+{
+#if defined(__GNUC__)
+    for (std::size_t i = 0; i < bytes; i += 64)
+        __builtin_prefetch(row + i);
+#else
+    (void)row, (void)bytes;
+#endif
+}
+// How many rows of this width to load ahead: 6 KiB were best where it was measured.
+inline int rowsAhead(int width) { return width < 64 ? 1 : std::max(1, 384 / width); }
+
+// Faults in the pixels of an input.
+struct InputFaults {
+    std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
+    std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
+};
+
+// The faults of all inputs of a rank in a frame. From any thread.
+struct FaultCounts {
+    std::atomic<std::int64_t> nonFinite{0}, alphaOutside{0};
+
+    void add(const InputFaults& faults)
+    {
+        if (faults.nonFinite)
+            nonFinite += static_cast<std::int64_t>(faults.nonFinite);
+        if (faults.alphaOutside)
+            alphaOutside += static_cast<std::int64_t>(faults.alphaOutside);
+    }
+    void reset() { nonFinite = alphaOutside = 0; }
+};
+
+// Either may be null.
+inline void countFaults(const float* rgba, const float* depth, int count, InputFaults& faults)
+{
+    for (int i = 0; i < count; ++i) {
+        bool isFinite = !(depth && depth[i] != depth[i]);
+        for (int c = 0; rgba && c < 4; ++c)
+            isFinite = isFinite && std::isfinite(rgba[4 * i + c]);
+        faults.nonFinite += isFinite ? 0 : 1;
+        faults.alphaOutside += isFinite && rgba && !(rgba[4 * i + 3] >= 0.0f && rgba[4 * i + 3] <= 1.0f) ? 1 : 0;
+    }
+}
+
+// Where the active pixels of a region are. Kept from tile to tile, as it has memory.
+struct ActiveSpans {
+    std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
+    std::vector<Span> spans;
+    int rowBegin = 0, rowEnd = 0;
+    std::uint32_t pixels = 0;
+
+    void clear()
+    {
+        rowCounts.clear();
+        spans.clear();
+        rowBegin = rowEnd = 0;
+        pixels = 0;
+    }
+
+    // Of pixels [begin, end) of row y; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active. Calls
+    // f(span) for each that it has found. Rows come from top to bottom, then endRows().
+    template <class BitsOfSome, class F>
+    void findRow(int y, int begin, int end, const BitsOfSome& bitsOfSome, const F& f)
+    {
+        const std::size_t before = spans.size();
+        for (int x0 = begin; x0 < end; x0 += 64) {
+            const int count = std::min(64, end - x0);
+            forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
+                const int x = x0 + at;
+                if (spans.size() > before && spans.back().x + spans.back().count == x)
+                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
+                else
+                    spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
+            });
+        }
+        for (std::size_t i = before; i < spans.size(); ++i) {
+            f(spans[i]);
+            pixels += spans[i].count;
+        }
+        const auto count = static_cast<std::uint16_t>(spans.size() - before);
+        if (count > 0 && rowEnd == 0)
+            rowBegin = y;
+        if (count > 0)
+            rowEnd = y + 1;
+        if (rowEnd > 0)
+            rowCounts.push_back(count);
+    }
+    void endRows() { rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin)); }
+
+    void setAll(const Region& region)
+    {
+        rowBegin = 0;
+        rowEnd = region.height();
+        rowCounts.assign(static_cast<std::size_t>(rowEnd), 1);
+        spans.assign(rowCounts.size(), {0, static_cast<std::uint16_t>(region.width())});
+        pixels = static_cast<std::uint32_t>(region.width() * region.height());
+    }
+
+    // Calls f(first, count) for each span, with its first pixel's place in planes of this stride.
+    template <class F>
+    void forEachSpan(std::ptrdiff_t stride, const F& f) const
+    {
+        const Span* span = spans.data();
+        for (std::size_t row = 0; row < rowCounts.size(); ++row) {
+            const std::ptrdiff_t begin = (rowBegin + static_cast<std::ptrdiff_t>(row)) * stride;
+            for (int i = 0; i < rowCounts[row]; ++i, ++span)
+                f(begin + span->x, static_cast<int>(span->count));
+        }
+    }
+};
+
+// The active pixels of a row, as they would travel: those of all spans, left to right.
+struct RowPixels {
+    ActiveSpans active;
+    std::vector<float> color, depth; // 4 and 1 a pixel
+};
+
+// The pixels of an input that are read where they lie. Another process may write to them at any time: each value is
+// checked as it is copied, so that a program that breaks its promise spoils its own picture and nothing else.
+struct PixelsInPlace {
+    const std::byte* color = nullptr; // of the first pixel of the tile's region
+    const float* depth = nullptr;     // null: not wanted
+    std::ptrdiff_t stride = 0;        // from a row to the next, in pixels
+    Region valid{0, 0, 0, 0};         // counted from the region's first pixel
+    Activity activity;
+
+    // Reads row y. Adds to `faults`.
+    void readRow(int y, RowPixels& row, InputFaults& faults) const;
+
+    // Whether alpha is 1 in all pixels of a region of this size.
+    bool isOpaque(int width, int height) const noexcept
+    {
+        if (valid != Region{0, 0, width, height} || activity.depthLimit < std::numeric_limits<float>::infinity())
+            return false;
+        for (int y = 0; y < height; ++y)
+            for (int x = 0; x < width; ++x) {
+                const std::ptrdiff_t at = 4 * (y * stride + x) + 3;
+                if (activity.hasBytes ? color[at] != std::byte{255} : floatsOf(color)[at] != 1.0f)
+                    return false;
+            }
+        return true;
+    }
+};
+
+inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) const
+{
+    row.active.clear();
+    if (y < valid.y0 || y >= valid.y1)
+        return;
+    const bool hasBytes = activity.hasBytes;
+    const std::ptrdiff_t bytes = hasBytes ? 4 : 4 * sizeof(float), begin = y * stride;
+    const int width = valid.width(), ahead = y + rowsAhead(width);
+    if (ahead < valid.y1)
+        prefetchRow(color + bytes * (ahead * stride + valid.x0), static_cast<std::size_t>(bytes * width));
+    if (depth && ahead < valid.y1)
+        prefetchRow(reinterpret_cast<const std::byte*>(depth + ahead * stride + valid.x0),
+                    sizeof(float) * static_cast<std::size_t>(width));
+    const auto most = static_cast<std::size_t>(width);
+    row.color.resize(std::max(row.color.size(), 4 * most));
+    row.depth.resize(std::max(row.depth.size(), depth ? most : 0));
+    ConstPlanes planes;
+    planes.at[Color] = color;
+    planes.at[Depth] = reinterpret_cast<const std::byte*>(depth);
+    const auto bitsOf = [&](int x, int count) {
+        return activity.bits(color + bytes * (begin + x), depth ? depth + begin + x : nullptr, count, faults.nonFinite);
+    };
+    std::size_t at = 0;
+    row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
+        const std::ptrdiff_t first = begin + span.x;
+        float *toColor = row.color.data() + 4 * at, *toDepth = depth ? row.depth.data() + at : nullptr;
+        bool isClean = true;
+        if (hasBytes)
+            cpuHasAvx2() ? decodeBytesAvx2(color + 4 * first, span.count, toColor)
+                         : decodeBytes(color + 4 * first, span.count, toColor);
+        else
+            isClean = copyAndCheck(planes, false, Color, first, span.count, reinterpret_cast<std::byte*>(toColor));
+        if (depth)
+            isClean &= copyAndCheck(planes, false, Depth, first, span.count, reinterpret_cast<std::byte*>(toDepth));
+        if (!isClean)
+            countFaults(toColor, depth ? depth + first : nullptr, span.count, faults);
+        at += span.count;
+    });
+}
+
+} // namespace detail
+
+} // namespace dfb

@@ -77,11 +77,11 @@ public:
         }
         active.endRows();
         SparseShape& shape = plan.header_.shape;
-        shape = active.shapeIn(region);
+        shape = shapeOf(active, region);
         if (const std::size_t dense = mostBytes(static_cast<std::size_t>(region.width() * region.height()));
             shape.encoding != FragmentEncoding::Dense && bytesOf(shape) >= dense) {
             active.setAll(region);
-            shape = active.shapeIn(region);
+            shape = shapeOf(active, region);
         }
         shape.isSplit = splits;
         plan.header_.tile = tile;

@@ -1,8 +1,10 @@
 // Wire: an input of a tile to the bytes of a message, and back to a fragment that is read in place.
 //
 // After the MessageHeader come a FragmentHeader and a body as in sparse_planes.hpp, which is split if it is compressed.
+// An input that the owner reads in the memory of its renderer has a PlaceInMemory as its body.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/fragment.hpp>
@@ -14,6 +16,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <cstring>
 #include <type_traits>
 #include <utility>
@@ -51,23 +54,6 @@ inline std::size_t largestFragment(int width, int height, ChannelMask channels)
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * perPixel;
 }
 
-// Faults in the pixels of an input.
-struct InputFaults {
-    std::uint64_t nonFinite = 0;    // pixels with an infinity or a NaN in the colour, or a NaN for a depth
-    std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
-};
-
-// `depth` may be null.
-inline void countFaults(const float* rgba, const float* depth, int count, InputFaults& faults)
-{
-    for (int i = 0; i < count; ++i, rgba += 4) {
-        const bool finite = std::isfinite(rgba[0]) && std::isfinite(rgba[1]) && std::isfinite(rgba[2])
-                            && std::isfinite(rgba[3]) && !(depth && depth[i] != depth[i]);
-        faults.nonFinite += finite ? 0 : 1;
-        faults.alphaOutside += finite && !(rgba[3] >= 0.0f && rgba[3] <= 1.0f) ? 1 : 0;
-    }
-}
-
 // Copies what is premultiplied by alpha, 3 floats a pixel, and makes it so by the alpha that the owner gets: else what
 // is divided by that in the end would not be a mean. `encoded`: the colours `rgba`, as they travel.
 inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const float* rgba, const std::byte* encoded,
@@ -97,12 +83,12 @@ inline bool areConstant(const InputPixels& tile, const ConstPlanes& planes, std:
 inline void countFaults(const ActivePixels& active, const InputPixels& tile, ChannelMask channels, InputFaults& faults)
 {
     faults.nonFinite += active.nanDepths();
-    if (!active.mayBeFaulty() || tile.hasBytes)
+    if (!active.mayBeFaulty())
         return;
-    const float* rgba = floatsOf(tile.planes().at[Color]);
+    const float* rgba = tile.hasBytes ? nullptr : floatsOf(tile.planes().at[Color]);
     const float* depth = hasChannel(channels, Depth) ? floatsOf(tile.planes().at[Depth]) : nullptr;
     active.forEachSpan(tile.stride, [&](std::ptrdiff_t first, int count) {
-        countFaults(rgba + 4 * first, depth ? depth + first : nullptr, count, faults);
+        countFaults(rgba ? rgba + 4 * first : nullptr, depth ? depth + first : nullptr, count, faults);
     });
 }
 
@@ -156,7 +142,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     countFaults(active, tile, channels, faults);
 
     FragmentHeader h = fragmentHeader(tile, channels);
-    h.shape = active.shapeIn(tile.region);
+    h.shape = shapeOf(active, tile.region);
     if (h.shape.encoding == FragmentEncoding::Dense && areConstant(tile, planes, pixelCount))
         h.shape.encoding = FragmentEncoding::Constant;
     const std::size_t stored = h.shape.stored();
@@ -195,6 +181,104 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     std::memcpy(message.data(), &m, sizeof m);
     std::memcpy(message.data() + sizeof m, &h, sizeof h);
     return message;
+}
+
+// The checksum of the valid pixels of a tile, of colour and depth.
+inline std::uint32_t checksumOf(const InputPixels& tile)
+{
+    std::uint32_t sum = 0;
+    const Region valid = tile.valid;
+    for (const std::size_t c : {std::size_t{Color}, std::size_t{Depth}}) {
+        const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(c));
+        for (int y = valid.y0 - tile.region.y0; tile.planes().at[c] && y < valid.y1 - tile.region.y0; ++y)
+            sum = crc32c(tile.planes().at[c] + bytes * (y * tile.stride + valid.x0 - tile.region.x0),
+                         static_cast<std::size_t>(bytes * valid.width()), sum);
+    }
+    return sum;
+}
+
+// Where the owner finds the pixels of an input, as bytes from the start of the memory that the sender shares with it.
+struct PlaceInMemory {
+    std::int64_t color = 0, depth = -1;           // of the region's first pixel; -1: none
+    std::int64_t stride = 0;                      // from a row to the next, in pixels
+    std::uint16_t x0 = 0, y0 = 0, x1 = 0, y1 = 0; // the valid pixels, counted from the region's first one
+    float depthLimit = 0;                         // at this depth or beyond a pixel is empty
+    std::uint32_t unused = 0;
+};
+static_assert(sizeof(PlaceInMemory) == 40 && std::is_trivially_copyable_v<PlaceInMemory>);
+
+// The pixels of a tile that are to be read where they lie. `channels`: that travel, of colour and depth.
+inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels, bool byDepth)
+{
+    PixelsInPlace p;
+    p.color = tile.planes().at[Color];
+    p.depth = hasChannel(channels, Depth) ? floatsOf(tile.planes().at[Depth]) : nullptr;
+    p.stride = tile.stride;
+    const int x0 = tile.region.x0, y0 = tile.region.y0;
+    p.valid = {tile.valid.x0 - x0, tile.valid.y0 - y0, tile.valid.x1 - x0, tile.valid.y1 - y0};
+    p.activity = {byDepth, tile.hasBytes, tile.depthLimit};
+    return p;
+}
+
+// The bytes from the first to the last valid pixel of a plane whose region begins at `first`.
+struct ByteRange {
+    std::int64_t begin = 0, end = 0;
+};
+inline ByteRange bytesOfPlane(std::int64_t first, std::int64_t stride, const Region& valid, std::int64_t pixelBytes)
+{
+    const std::int64_t upper = first + (valid.y0 * stride + valid.x0) * pixelBytes,
+                       lower = first + ((valid.y1 - 1) * stride + valid.x0) * pixelBytes;
+    return {std::min(upper, lower), std::max(upper, lower) + valid.width() * pixelBytes};
+}
+
+// Makes the message for a tile whose pixels the owner reads where they lie. `offsetOf(address)`: from the start of the
+// shared memory, or -1. Empty if they do not lie in it.
+template <class OffsetOf>
+Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPlace& pixels, ChannelMask channels,
+                     std::uint32_t receiver, const OffsetOf& offsetOf)
+{
+    const std::int64_t colorBytes = pixels.activity.hasBytes ? 4 : 16;
+    // Offset of a plane's first pixel, if all of its valid ones are in the memory.
+    const auto placeOf = [&](const std::byte* plane, std::int64_t pixelBytes) -> std::int64_t {
+        const ByteRange bytes = bytesOfPlane(0, pixels.stride, pixels.valid, pixelBytes);
+        const std::int64_t begin = offsetOf(plane + bytes.begin), end = offsetOf(plane + bytes.end - 1);
+        return begin < 0 || end != begin + (bytes.end - bytes.begin) - 1 ? -1 : begin - bytes.begin;
+    };
+    PlaceInMemory place;
+    place.color = placeOf(pixels.color, colorBytes);
+    place.depth = pixels.depth ? placeOf(reinterpret_cast<const std::byte*>(pixels.depth), 4) : -1;
+    if (place.color < 0 || (pixels.depth && place.depth < 0))
+        return Buffer();
+    place.stride = pixels.stride;
+    place.x0 = static_cast<std::uint16_t>(pixels.valid.x0);
+    place.y0 = static_cast<std::uint16_t>(pixels.valid.y0);
+    place.x1 = static_cast<std::uint16_t>(pixels.valid.x1);
+    place.y1 = static_cast<std::uint16_t>(pixels.valid.y1);
+    place.depthLimit = pixels.activity.depthLimit;
+    FragmentHeader h = fragmentHeader(tile, channels);
+    h.shape.encoding = FragmentEncoding::InPlace;
+    h.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
+    h.rawPayloadBytes = sizeof place;
+    MessageHeader m;
+    m.kind = MessageKind::Fragment;
+    m.receiver = receiver;
+    m.number = tile.frame;
+    Buffer message = pool.acquire(fragmentPrefix + sizeof place);
+    std::memcpy(message.data(), &m, sizeof m);
+    std::memcpy(message.data() + sizeof m, &h, sizeof h);
+    std::memcpy(message.data() + fragmentPrefix, &place, sizeof place);
+    return message;
+}
+
+// Looks up bytes of the memory that the sender shares with this rank; null if there are none. By offset and count.
+using SharedBytes = FunctionRef<const std::byte*(std::int64_t offset, std::int64_t byteCount)>;
+
+// Whether a fragment message, of which nothing has been checked, says that it is read in place.
+inline bool saysInPlace(const Buffer& message)
+{
+    return message.size() >= fragmentPrefix
+           && loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader)).shape.encoding
+                  == FragmentEncoding::InPlace;
 }
 
 // Of a fragment message that encodeFragment() has made, what it had without a codec.
@@ -254,15 +338,65 @@ inline Buffer rowOf(MemoryPool& pool, const PlaneFormat& format, const ConstPlan
     return row;
 }
 
+// Reads where the pixels of an input lie, and checks it completely. Throws Error (MalformedMessage).
+inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader& h, const Region& region, bool byDepth,
+                                     const SharedBytes& sharedBytes, FaultCounts* faults)
+{
+    if (message.size() != fragmentPrefix + sizeof(PlaceInMemory) || h.rawPayloadBytes != sizeof(PlaceInMemory)
+        || h.codec != 0)
+        failMalformed("wrong size of a place in memory", sizeof(PlaceInMemory), h.rawPayloadBytes);
+    if ((h.channels & ~(colorChannel | depthChannel)) != 0
+        || (h.colorFormat != WireFormat::Float32 && h.colorFormat != WireFormat::Bytes))
+        failMalformed("channels or a format that are not read in place", colorChannel | depthChannel, h.channels);
+    const auto place = loadAs<PlaceInMemory>(message.data() + fragmentPrefix);
+    Fragment::Parts parts;
+    PixelsInPlace& p = parts.inPlace;
+    p.valid = {place.x0, place.y0, place.x1, place.y1};
+    const std::int64_t largest = std::int64_t{1} << 40; // of an offset or a row, so that sums cannot overflow
+    if (p.valid.x0 >= p.valid.x1 || p.valid.y0 >= p.valid.y1 || p.valid.x1 > region.width()
+        || p.valid.y1 > region.height())
+        failMalformed("valid pixels outside the tile", region.width(), p.valid.x1);
+    if (std::abs(place.stride) < region.width() || std::abs(place.stride) > largest || std::abs(place.color) > largest
+        || std::abs(place.depth) > largest || place.color % 4 != 0)
+        failMalformed("rows that cannot be", region.width(), place.stride);
+    // The address of the region's first pixel, which need not lie in the memory itself.
+    const auto planeAt = [&](std::int64_t first, std::int64_t pixelBytes) {
+        const ByteRange bytes = bytesOfPlane(first, place.stride, p.valid, pixelBytes);
+        const std::byte* begin = bytes.begin < 0 ? nullptr : sharedBytes(bytes.begin, bytes.end - bytes.begin);
+        if (!begin)
+            failMalformed("a place outside of the memory that the sender shares", -1, bytes.begin);
+        return begin - (bytes.begin - first);
+    };
+    p.activity = {byDepth, h.colorFormat == WireFormat::Bytes, place.depthLimit};
+    p.stride = static_cast<std::ptrdiff_t>(place.stride);
+    p.color = planeAt(place.color, p.activity.hasBytes ? 4 : 16);
+    if (hasChannel(h.channels, Depth)) {
+        if (place.depth % 4 != 0)
+            failMalformed("a depth between two words", 0, place.depth % 4);
+        p.depth = floatsOf(planeAt(place.depth, 4));
+    } else if (byDepth) {
+        failMalformed("an input without the depth that tells which pixels it has");
+    }
+    parts.encoding = FragmentEncoding::InPlace;
+    parts.channels = h.channels;
+    parts.colorFormat = h.colorFormat;
+    parts.faults = faults;
+    return parts;
+}
+
 // The rest of decodeFragment(), of a tile and a pass that there are.
 inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const FragmentHeader& h, const TileHeader& header,
-                              const Codec* codec, const WireCoder& coder)
+                              const Codec* codec, const WireCoder& coder, const SharedBytes& sharedBytes,
+                              FaultCounts* faults)
 {
     if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
     if (h.colorFormat > WireFormat::Bytes)
         failMalformed("unknown format of colour", static_cast<std::int64_t>(WireFormat::Bytes),
                       static_cast<std::int64_t>(h.colorFormat));
+    if (h.shape.encoding == FragmentEncoding::InPlace)
+        return Fragment(header, Buffer(),
+                        decodeInPlace(message, h, header.region, coder.activeByDepth(), sharedBytes, faults));
     h.shape.check(header.region);
     const std::byte* in = unpack(pool, message, h, codec, coder);
     const int width = header.region.width();
@@ -299,10 +433,11 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
 }
 
 // Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
-// decompressed form). `passesOf(tile)`: how many passes the tile has. Throws Error (MalformedMessage).
+// decompressed form). `passesOf(tile)`: how many passes the tile has. `faults` gets those that show while the fragment
+// is read, if it is read in place. Throws Error (MalformedMessage).
 template <class PassesOf>
 Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
-                        const Codec* codec, const WireCoder& coder)
+                        const Codec* codec, const WireCoder& coder, const SharedBytes& sharedBytes, FaultCounts* faults)
 {
     if (message.size() < fragmentPrefix)
         failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
@@ -320,7 +455,17 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
     header.children = h.children;
     header.source = h.source;
     header.part = h.part;
-    return decodeChecked(pool, std::move(message), h, header, codec, coder);
+    return decodeChecked(pool, std::move(message), h, header, codec, coder, sharedBytes, faults);
+}
+
+// Does so where no sender shares memory.
+template <class PassesOf>
+Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
+                        const Codec* codec, const WireCoder& coder)
+{
+    return decodeFragment(
+        pool, std::move(message), layout, passesOf, codec, coder,
+        [](std::int64_t, std::int64_t) -> const std::byte* { return nullptr; }, nullptr);
 }
 
 } // namespace dfb::detail

@@ -199,87 +199,21 @@ private:
     std::size_t pixelBytes_ = 0;
 };
 
-// Where the active pixels of a region are. Kept from tile to tile, as it has memory.
-struct ActiveSpans {
-    std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
-    std::vector<Span> spans;
-    int rowBegin = 0, rowEnd = 0;
-    std::uint32_t pixels = 0;
-
-    void clear()
-    {
-        rowCounts.clear();
-        spans.clear();
-        rowBegin = rowEnd = 0;
-        pixels = 0;
+// Returns the shape of the body of a region with these active pixels.
+inline SparseShape shapeOf(const ActiveSpans& active, const Region& region)
+{
+    SparseShape shape;
+    shape.pixels = active.pixels;
+    if (active.pixels == static_cast<std::uint32_t>(region.width() * region.height())) {
+        shape.encoding = FragmentEncoding::Dense;
+    } else if (active.pixels > 0) {
+        shape.encoding = FragmentEncoding::Sparse;
+        shape.spans = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
+        shape.rowBegin = static_cast<std::uint16_t>(active.rowBegin);
+        shape.rowEnd = static_cast<std::uint16_t>(active.rowEnd);
     }
-
-    // Of pixels [begin, end) of row y; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active. Calls
-    // f(span) for each that it has found. Rows come from top to bottom, then endRows().
-    template <class BitsOfSome, class F>
-    void findRow(int y, int begin, int end, const BitsOfSome& bitsOfSome, const F& f)
-    {
-        const std::size_t before = spans.size();
-        for (int x0 = begin; x0 < end; x0 += 64) {
-            const int count = std::min(64, end - x0);
-            forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
-                const int x = x0 + at;
-                if (spans.size() > before && spans.back().x + spans.back().count == x)
-                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
-                else
-                    spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
-            });
-        }
-        for (std::size_t i = before; i < spans.size(); ++i) {
-            f(spans[i]);
-            pixels += spans[i].count;
-        }
-        const auto count = static_cast<std::uint16_t>(spans.size() - before);
-        if (count > 0 && rowEnd == 0)
-            rowBegin = y;
-        if (count > 0)
-            rowEnd = y + 1;
-        if (rowEnd > 0)
-            rowCounts.push_back(count);
-    }
-    void endRows() { rowCounts.resize(static_cast<std::size_t>(rowEnd - rowBegin)); }
-
-    void setAll(const Region& region)
-    {
-        rowBegin = 0;
-        rowEnd = region.height();
-        rowCounts.assign(static_cast<std::size_t>(rowEnd), 1);
-        spans.assign(rowCounts.size(), {0, static_cast<std::uint16_t>(region.width())});
-        pixels = static_cast<std::uint32_t>(region.width() * region.height());
-    }
-
-    SparseShape shapeIn(const Region& region) const
-    {
-        SparseShape shape;
-        shape.pixels = pixels;
-        if (pixels == static_cast<std::uint32_t>(region.width() * region.height())) {
-            shape.encoding = FragmentEncoding::Dense;
-        } else if (pixels > 0) {
-            shape.encoding = FragmentEncoding::Sparse;
-            shape.spans = static_cast<std::uint16_t>(spans.size()); // at most 128 a row, 256 rows
-            shape.rowBegin = static_cast<std::uint16_t>(rowBegin);
-            shape.rowEnd = static_cast<std::uint16_t>(rowEnd);
-        }
-        return shape;
-    }
-
-    // Calls f(first, count) for each span, with its first pixel's place in planes of this stride.
-    template <class F>
-    void forEachSpan(std::ptrdiff_t stride, const F& f) const
-    {
-        const Span* span = spans.data();
-        for (std::size_t row = 0; row < rowCounts.size(); ++row) {
-            const std::ptrdiff_t begin = (rowBegin + static_cast<std::ptrdiff_t>(row)) * stride;
-            for (int i = 0; i < rowCounts[row]; ++i, ++span)
-                f(begin + span->x, static_cast<int>(span->count));
-        }
-    }
-};
+    return shape;
+}
 
 // Writes a body, not split: `write(channel, out, bytes)` writes a plane.
 template <class Write>
@@ -384,47 +318,23 @@ private:
         clear();
         nanDepths_ = 0;
         const ConstPlanes& planes = tile.planes();
-        const float* depths = byDepth ? floatsOf(planes.at[Depth]) : nullptr;
+        const float* depths = floatsOf(planes.at[Depth]);
+        const Activity activity{byDepth, tile.hasBytes, tile.depthLimit};
         const Region valid = tile.valid;
         const int x0 = valid.x0 - tile.region.x0, width = planes.at[Color] ? valid.width() : 0;
-        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
-        const int ahead = width < 64 ? 1 : std::max(1, 384 / width); // rows: 6 KiB were best where it was measured
+        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0, ahead = rowsAhead(width);
         for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
             const std::ptrdiff_t begin = y * tile.stride;
-            const auto found = [&](Span span) { f(begin + span.x, static_cast<int>(span.count)); };
             if (y + ahead < yEnd)
-                prefetch(tile.colorAt(x0, y + ahead), static_cast<std::size_t>(width) * tile.pixelBytes(Color));
-            if (depths)
-                findRow(
-                    y, x0, x0 + width,
-                    [&](int x, int count) {
-                        const DepthBits bits = depthBits(depths + begin + x, count);
-                        for (std::uint64_t nan = bits.nan; nan != 0; nan &= nan - 1)
-                            ++nanDepths_;
-                        return bits.active;
-                    },
-                    found);
-            else
-                findRow(
-                    y, x0, x0 + width,
-                    [&](int x, int count) {
-                        return tile.hasBytes ? activeByteBits(tile.colorAt(x, y), count)
-                                             : activePixelBits(floatsOf(tile.colorAt(x, y)), count);
-                    },
-                    found);
+                prefetchRow(tile.colorAt(x0, y + ahead), static_cast<std::size_t>(width) * tile.pixelBytes(Color));
+            findRow(
+                y, x0, x0 + width,
+                [&](int x, int count) {
+                    return activity.bits(tile.colorAt(x, y), depths ? depths + begin + x : nullptr, count, nanDepths_);
+                },
+                [&](Span span) { f(begin + span.x, static_cast<int>(span.count)); });
         }
         endRows();
-    }
-
-    // No processor knows by itself where the next row of an image begins.
-    static void prefetch(const std::byte* row, std::size_t bytes)
-    {
-#if defined(__GNUC__)
-        for (std::size_t i = 0; i < bytes; i += 64)
-            __builtin_prefetch(row + i);
-#else
-        (void)row, (void)bytes;
-#endif
     }
 
     std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such

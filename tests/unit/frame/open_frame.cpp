@@ -145,6 +145,36 @@ TEST_CASE("What a failure says depends on whether this rank has voted, and who w
     frame.close(noHelp);
 }
 
+TEST_CASE("A rank does not vote on a frame that has failed while it reads inputs in place", "[open_frame]")
+{
+    OpenFrame frame;
+    frame.open();
+    CHECK(frame.beginReading());
+    CHECK(frame.beginReading(true)); // two threads
+    frame.fail(errorOf(dfb::ErrorKind::UserCode));
+    CHECK_FALSE(frame.vote(yes, yes));
+    CHECK_FALSE(frame.beginReading()); // nobody begins any more
+    CHECK_FALSE(frame.endReading());
+    CHECK_FALSE(frame.vote(yes, yes));
+    CHECK(frame.endReading()); // the last one is to try again
+    CHECK(frame.vote(yes, yes));
+    frame.close(noHelp);
+
+    frame.open(); // inputs that were copied may be read for long
+    CHECK(frame.beginReading());
+    frame.fail(errorOf(dfb::ErrorKind::TimedOut));
+    CHECK(frame.vote(yes, yes));
+    CHECK(frame.endReading());
+    frame.close(noHelp);
+
+    frame.open(); // a good frame waits for its tiles, which is more
+    CHECK(frame.beginReading(true));
+    frame.finish();
+    CHECK_FALSE(frame.endReading());
+    CHECK(frame.vote(yes, yes));
+    frame.close(noHelp);
+}
+
 TEST_CASE("The tiles of a rank are finished when all are known and none is left", "[open_frame]")
 {
     OpenFrame frame;

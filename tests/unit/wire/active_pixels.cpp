@@ -56,12 +56,14 @@ TEST_CASE("By depth a pixel is active if that is below infinity, and NaN is noti
             for (float& value : row)
                 value = values[random() % 10];
             const float* depth = row.data() + random() % 2; // not aligned either
+            const float limit = round % 3 == 0 ? 0.0f : infinity;
             std::uint64_t active = 0, nan = 0;
             for (int i = 0; i < count; ++i) {
-                active |= std::uint64_t{depth[i] < infinity} << i;
+                active |= std::uint64_t{depth[i] < limit} << i;
                 nan |= std::uint64_t{std::isnan(depth[i])} << i;
             }
-            for (const auto& bits : {dfb::detail::depthBits(depth, count), dfb::detail::findDepths(depth, count)}) {
+            for (const auto& bits :
+                 {dfb::detail::depthBits(depth, count, limit), dfb::detail::findDepths(depth, count, limit)}) {
                 CHECK(bits.active == active);
                 CHECK(bits.nan == nan);
             }

@@ -150,7 +150,7 @@ TEST_CASE("Active pixels come back at their places, in each format of planes, sp
                         isActive[i] = static_cast<int>(random() % 5) < round % 6;
                     const auto count = std::count(isActive.begin(), isActive.end(), true);
                     const d::ActiveSpans active = spansOf(region, isActive);
-                    d::SparseShape shape = active.shapeIn(region);
+                    d::SparseShape shape = d::shapeOf(active, region);
                     CHECK(shape.encoding
                           == (count == 0                               ? FragmentEncoding::Empty
                               : static_cast<std::size_t>(count) == all ? FragmentEncoding::Dense
@@ -245,7 +245,7 @@ TEST_CASE("Spans that are out of order or their row, or do not add up, are refus
     const d::ActiveSpans active = spansOf(region, isActive);
     const d::PlaneFormat format(dfb::colorChannel, 1);
     const auto refusalOf = [&](const std::function<void(d::SparseShape&, dfb::Span*, std::uint16_t*)>& change) {
-        d::SparseShape shape = active.shapeIn(region);
+        d::SparseShape shape = d::shapeOf(active, region);
         std::vector<std::uint32_t> body((format.bodyBytes(shape) + 3) / 4 + 2);
         auto* bytes = reinterpret_cast<std::byte*>(body.data());
         encodeSparse(format, shape, active, bytes, [](std::size_t, std::byte*, std::size_t) {});
