@@ -50,6 +50,17 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     };
     addDfb<BasicOrderedBlend<64>>(systems, connection, inputs, "in order, float32, tiles of 64", {});
     addOrdered("float32", {});
+    bench::DfbSettings inPlace;
+    inPlace.memory = bench::InputMemory::Own;
+    addOrdered("float32, own in place", inPlace);
+    inPlace.memory = bench::InputMemory::Shared;
+    addOrdered("float32, all in place", inPlace);
+    addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, all in place, tiles of 64", inPlace);
+    inPlace.hasBytes = true;
+    addOrdered("bytes, all in place", inPlace);
+    bench::DfbSettings bytes;
+    bytes.hasBytes = true;
+    addOrdered("bytes", bytes);
     bench::DfbSettings threads;
     threads.hasThreads = true;
     addDfb<BasicOrderedBlend<128>>(systems, bench::makeConnection(inputs.comm, true), inputs,

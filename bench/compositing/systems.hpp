@@ -129,6 +129,10 @@ struct ViewportCamera {
 template <class TileOp>
 inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
+// Where dfb finds the images: it copies them, or reads them where they lie (TileView::staysUntilEnd), a rank those in
+// its own memory or all ranks those in memory that the node shares.
+enum class InputMemory { Copied, Own, Shared };
+
 struct DfbSettings {
     dfb::Precision wire{};
     std::shared_ptr<const dfb::Codec> codec{};
@@ -137,6 +141,44 @@ struct DfbSettings {
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
     bool hasThreads = false;        // a worker; else the executor has none
     bool hasDefaultThreads = false; // those that a framebuffer makes by itself
+    InputMemory memory = InputMemory::Copied;
+    bool hasBytes = false; // images of 8 bits a channel, which are ready
+};
+
+// The pixels of one view as a framebuffer gets them.
+struct DfbImage {
+    template <class FrameBuffer>
+    DfbImage(const FrameBuffer& fb, const PartialImage& image, const DfbSettings& settings)
+        : color(image.rgba.data()), depth(image.depth.data()), staysUntilEnd(settings.memory != InputMemory::Copied)
+    {
+        const std::size_t pixels = image.depth.size(), colorBytes = (settings.hasBytes ? 4 : 16) * pixels;
+        if (settings.memory != InputMemory::Shared && !settings.hasBytes)
+            return;
+        std::byte* at = nullptr;
+        if (settings.memory == InputMemory::Shared) {
+            shared = fb.sharedMemory(colorBytes + 4 * pixels);
+            at = shared.data();
+        } else {
+            own.resize(colorBytes + 4 * pixels);
+            at = own.data();
+        }
+        std::memcpy(at + colorBytes, depth, 4 * pixels);
+        depth = reinterpret_cast<const float*>(at + colorBytes);
+        if (settings.hasBytes) {
+            dfb::convertPixels(color, static_cast<int>(pixels), dfb::OutputFormat::RGBA8, at);
+            color8 = reinterpret_cast<const std::uint8_t*>(at);
+            color = nullptr;
+        } else {
+            std::memcpy(at, color, colorBytes);
+            color = reinterpret_cast<const float*>(at);
+        }
+    }
+
+    dfb::Buffer shared;
+    std::vector<std::byte> own;
+    const float *color, *depth;
+    const std::uint8_t* color8 = nullptr;
+    bool staysUntilEnd;
 };
 
 // Without `hasThreads` what each rank does is done by one thread, as with the other systems.
@@ -165,9 +207,12 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         dfb::RoundRobinBricks owner;
         dfb::DataParallelLoop<FrameBuffer> loop;
         dfb::OrderedLoop<FrameBuffer, dfb::RoundRobinBricks> orderedLoop;
+        std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
     for (const bool toBytes : {false, true}) {
+        if (settings.hasBytes && !toBytes)
+            continue;
         dfb::FrameBufferConfig c;
         c.image.width = inputs.image().width;
         c.image.height = inputs.image().height;
@@ -188,15 +233,20 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
             else if (!settings.hasDefaultThreads)
                 ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
             const auto r = std::make_shared<Renderer>(connection, ownConfig);
+            for (const View& view : inputs.views)
+                r->images.emplace_back(r->fb, view.image, settings);
             Compositor compositor;
             compositor.frame = [r, &inputs] {
                 const PartialImage& image = inputs.image();
-                const auto renderBrick = dfb::inPlace([&image](const dfb::Brick&, auto& view) {
+                const DfbImage& pixels = r->images[inputs.frame % r->images.size()];
+                const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
                     view.stride = static_cast<std::size_t>(image.width);
                     const std::size_t first = static_cast<std::size_t>(view.region.y0) * view.stride
                                               + static_cast<std::size_t>(view.region.x0);
-                    view.color = &image.rgba[4 * first];
-                    view.depth = &image.depth[first];
+                    view.color = pixels.color ? pixels.color + 4 * first : nullptr;
+                    view.color8 = pixels.color8 ? pixels.color8 + 4 * first : nullptr;
+                    view.depth = pixels.depth + first;
+                    view.staysUntilEnd = pixels.staysUntilEnd;
                     const auto [left, top, columns, rows] = image.viewport; // as IceT has it
                     view.valid = {left, top, left + columns, top + rows};
                 });
