@@ -71,6 +71,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
                             defaults);
     addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, tiles of 64", {});
     addDfb<BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
+    addOrdered("within half a level", {dfb::HalfLevel{}});
     addOrdered("unorm16", {WireFormat::Unorm16});
     addOrdered("unorm8", {WireFormat::Unorm8});
 #if defined(DFB_HAS_SNAPPY)

@@ -46,6 +46,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
         name << "budget " << budget;
         add(name.str(), {dfb::ErrorBudget{budget}});
     }
+    addOrdered("in order, within half a level", {dfb::HalfLevel{}});
     add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
     addDfb<dfb::BasicAlphaBlend<32>>(systems, connection, inputs, "float32, tiles of 32", {});
     addDfb<dfb::BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});

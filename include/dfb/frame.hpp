@@ -52,8 +52,8 @@ struct FrameBufferConfig {
 
     ImageConfig image;
     MessageConfig messages;
-    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, or a Precision. The default is exact.
-    // Other channels always travel exactly, and finished tiles in image.format. All ranks must give the same.
+    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, HalfLevel, or a Precision. The default is
+    // exact. Other channels always travel exactly, and finished tiles in image.format. All ranks must give the same.
     Precision precision{};
     // For AlphaBlend, OrderedBlend and DeepBlend. If the layers of a pixel let through less than this part of the
     // light, the layers behind them are left out. The pixel changes by no more than this times the largest colour.

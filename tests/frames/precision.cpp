@@ -5,9 +5,12 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <memory>
 #include <string>
+#include <utility>
 #include <vector>
 
 namespace frame_cases {
@@ -94,6 +97,64 @@ struct Precision {
             worst =
                 std::max(worst, std::abs(static_cast<double>(lossy.first[i]) - static_cast<double>(emission.first[i])));
         result.expect(worst <= lossy.second.wireErrorBound + 0x1p-23, "emission");
+        return result;
+    }
+};
+
+// HalfLevel: images of floats, and what stays within a node, are exact; no 8-bit level is off by more than one.
+struct WithinHalfALevel {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        for (const bool sharesMemory : {true, false}) {
+            dfb::NetworkConfig network;
+            network.sharedMemory = sharesMemory;
+            const auto connection = dfb::connect<Transport>(communicator, network);
+            bool hasFarRanks = false;
+            for (int other = 0; other < connection->size(); ++other)
+                hasFarRanks = hasFarRanks || (other != connection->rank() && !connection->sharesMemoryWith(other));
+            for (const auto format :
+                 {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8, dfb::OutputFormat::RGBA32F}) {
+                const auto frame = [&](const dfb::Precision& precision) {
+                    auto config = configOf(s, 1);
+                    config.image.format = format;
+                    config.precision = precision;
+                    dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(connection,
+                                                                                                        config);
+                    auto params = paramsOf(s);
+                    params.maxLayers = 5;
+                    const auto report =
+                        dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                            .render(
+                                scene::FlatCamera(),
+                                [&](const dfb::Brick& b, auto& tile) { renderInRange(s, b, tile); }, params);
+                    std::vector<std::byte> bytes;
+                    fb.image().forEachPlane([&](const std::byte* plane, std::size_t count) {
+                        bytes.insert(bytes.end(), plane, plane + count);
+                    });
+                    return std::make_pair(bytes, report);
+                };
+                const auto exact = frame({}), half = frame(dfb::HalfLevel{});
+                const bool isFloat = format == dfb::OutputFormat::RGBA32F, isLossy = hasFarRanks && !isFloat;
+                const std::string name =
+                    std::string(dfb::nameOf(format)) + (sharesMemory ? ", shared memory" : ", through MPI");
+                const double budget = format == dfb::OutputFormat::SRGBA8 ? 0.5 / 255 / 12.92 : 0.5 / 255;
+                result.expect(half.second.wireColor == (isLossy ? dfb::WireFormat::Unorm16 : dfb::WireFormat::Float32),
+                              name + ": travels as " + dfb::nameOf(half.second.wireColor));
+                result.expect(half.second.wireErrorBound <= (isLossy ? budget : 0),
+                              name + ": a bound of " + std::to_string(half.second.wireErrorBound));
+                result.expect(isLossy ? half.second.bytesSent < exact.second.bytesSent : half.first == exact.first,
+                              name + (isLossy ? ": no fewer bytes" : ": another image"));
+                const std::size_t colors = half.first.empty() ? 0 : 4 * static_cast<std::size_t>(s.width * s.height);
+                int worst = 0;
+                for (std::size_t i = 0; i < colors && !isFloat; ++i)
+                    worst =
+                        std::max(worst, std::abs(static_cast<int>(half.first[i]) - static_cast<int>(exact.first[i])));
+                result.expect(worst <= 1, name + ": off by " + std::to_string(worst) + " levels");
+            }
+        }
         return result;
     }
 };
@@ -197,6 +258,11 @@ struct NoPrecision {
 };
 
 } // namespace frame_cases
+
+TEST_CASE("Within half a level: exact on a node and for floats, else no level is off by more than one", "[precision]")
+{
+    everywhere<frame_cases::WithinHalfALevel>();
+}
 
 TEST_CASE("Lossy formats keep their bounds and budgets, the same on any ranks", "[precision]")
 {

@@ -202,6 +202,9 @@ public:
         return link_->blockAt(other, place, byteCount);
     }
 
+    // Whether each sees memory of the other.
+    bool sharesMemoryWith(int other) const { return isSeenBy(other) && blockAt(other, 2, 0); }
+
     // Any byte of such a block: its offset in the memory of this rank that others see, or -1; and bytes at an offset in
     // that of another rank, or null.
     std::int64_t offsetOf(const std::byte* address) const

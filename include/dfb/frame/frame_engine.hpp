@@ -63,7 +63,11 @@ public:
             if (const long long ms = config_.quiet.count(); ms < 1)
                 failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
             checkWire();
-            pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), mailbox_->address(),
+            bool hasFarRanks = false;
+            for (int other = 0; other < size(); ++other)
+                hasFarRanks = hasFarRanks || isFar(other);
+            pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
+                                                       mailbox_->address(),
                                                        [this](Buffer&& message) { sendToDisplay(std::move(message)); });
             outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                       [this](Verdict& verdict) { addFigures(verdict); });
@@ -579,10 +583,13 @@ private:
 
     // ---- tiles
 
+    // Whether a rank shares no memory with this one, on which both agree.
+    bool isFar(int other) const { return other != rank() && !mailbox_->connection().sharesMemoryWith(other); }
+
     Buffer encode(const InputPixels& tile, int owner)
     {
         const Codec* codec = codecFor(owner);
-        Buffer message = pipeline_->encode(tile, codec);
+        Buffer message = pipeline_->encode(tile, codec, isFar(owner));
         if (codec)
             gains_->add(owner, rawFragmentBytes(message), message.size());
         return message;
@@ -751,6 +758,8 @@ private:
     void checkWire() const
     {
         const Precision& w = config_.precision;
+        if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
+            failArgument("half a level, and another precision");
         if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
             failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
         if (w.color == WireFormat::Bytes)

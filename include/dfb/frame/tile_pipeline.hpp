@@ -29,10 +29,12 @@ namespace dfb::detail {
 
 class TilePipeline {
 public:
-    // `config` and `operations` must live as long as this. Throws InvalidArgument for a configuration that cannot be.
+    // `config` and `operations` must live as long as this. `hasFarRanks`: there are ranks that share no memory with
+    // this one. Throws InvalidArgument for a configuration that cannot be.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
-                 int rankCount, std::uint32_t address, FinalGather::Send sendToDisplay)
+                 int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
+          budget_(budgetOf(config, hasFarRanks)),
           table_(TileLayout(config.image.width, config.image.height, traits().tileSize),
                  config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
@@ -137,12 +139,14 @@ public:
         return header;
     }
 
-    // The message for a tile that has been checked. `codec` may be null.
-    Buffer encode(const InputPixels& tile, const Codec* codec)
+    // The message for a tile that has been checked. `codec` may be null. `isFar`: to a rank that shares no memory with
+    // this one.
+    Buffer encode(const InputPixels& tile, const Codec* codec, bool isFar)
     {
         const FloatEnvironment floatEnvironment;
         InputFaults faults;
-        Buffer message = encodeFragment(*pool_, tile, sent_, address_, codec, coder_, wireColor_, faults);
+        const WireFormat color = config_.precision.isHalfLevel && !isFar ? WireFormat::Float32 : wireColor_.load();
+        Buffer message = encodeFragment(*pool_, tile, sent_, address_, codec, coder_, color, faults);
         faults_.add(faults);
         return message;
     }
@@ -214,7 +218,7 @@ public:
         if (const auto mine = static_cast<ChannelMask>(sent_ | colorChannel); fragment.channels() != mine)
             failMalformed("an input with other channels than this rank's", mine, fragment.channels());
         if (fragment.colorFormat() != WireFormat::Float32 && fragment.colorFormat() != WireFormat::Bytes
-            && fragment.colorFormat() != config_.precision.color && config_.precision.budget == 0)
+            && fragment.colorFormat() != config_.precision.color && budget_ == 0)
             failMalformed("a colour in another format than this rank's",
                           static_cast<std::int64_t>(config_.precision.color),
                           static_cast<std::int64_t>(fragment.colorFormat()));
@@ -251,10 +255,10 @@ public:
     {
         const double largest = largestBackground();
         WireFormat color = config_.precision.color;
-        if (config_.precision.budget > 0) {
+        if (budget_ > 0) {
             const auto maxColor = static_cast<double>(config_.precision.maxColor);
-            const double left = config_.precision.budget
-                                - static_cast<double>(config_.minTransmittance) * std::max({1.0, maxColor, largest});
+            const double left =
+                budget_ - static_cast<double>(config_.minTransmittance) * std::max({1.0, maxColor, largest});
             color = cheapestWithin(left, maxLayers, maxColor, largest);
         }
         wireColor_ = color;
@@ -395,8 +399,19 @@ private:
 
     bool isLossy() const noexcept
     {
-        return config_.precision.color != WireFormat::Float32 || config_.precision.budget > 0
-               || config_.minTransmittance > 0;
+        return config_.precision.color != WireFormat::Float32 || budget_ > 0 || config_.minTransmittance > 0;
+    }
+
+    // The error that colours may have on the way, 0: none, or not by a budget.
+    static double budgetOf(const FrameBufferConfig& config, bool hasFarRanks)
+    {
+        if (!config.precision.isHalfLevel)
+            return config.precision.budget;
+        const double level = 1.0 / 255, steepest = 12.92; // of the sRGB curve
+        const bool isBytes = config.image.format == OutputFormat::RGBA8 || config.image.format == OutputFormat::SRGBA8;
+        if (!hasFarRanks || !isBytes)
+            return 0;
+        return 0.5 * level / (config.image.format == OutputFormat::SRGBA8 ? steepest : 1);
     }
     double largestBackground() const
     {
@@ -421,6 +436,7 @@ private:
     const FrameBufferConfig& config_;
     std::uint32_t address_; // of the framebuffer
     Operations& operations_;
+    const double budget_; // of the error of colours, see budgetOf()
     TileTable table_;
     FinalGather gather_;
     ChannelMask sent_ = 0; // of the inputs of this frame

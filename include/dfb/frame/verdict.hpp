@@ -335,6 +335,7 @@ struct Agreement {
         s.add("messages.compression", c.messages.compression == CompressionMode::Auto ? "Auto" : "Always");
         s.add("precision.color", nameOf(c.precision.color));
         s.add("precision.budget", c.precision.budget);
+        s.add("precision.isHalfLevel", c.precision.isHalfLevel);
         s.add("precision.maxColor", c.precision.maxColor);
         s.add("minTransmittance", c.minTransmittance);
         s.add("messages.poolBytes", c.messages.poolBytes);

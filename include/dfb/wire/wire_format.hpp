@@ -278,8 +278,15 @@ struct ErrorBudget {
     float maxColor = 1; // see Precision
 };
 
-// How inputs travel to the tiles' owners; and to a tile of the same rank as well, or else the image would depend on who
-// owns what. Rounded to nearest, ties to even.
+// Within half a level: an image of 8 bits a channel may be off by half a level before it is rounded, so no level is off
+// by more than one. What travels to ranks whose memory this one does not share takes the cheapest format that is sure
+// to keep that; all else, and an image of floats, is exact. So the image may depend on which ranks share a node.
+struct HalfLevel {
+    float maxColor = 1; // see Precision
+};
+
+// How inputs travel to the tiles' owners; and, but for HalfLevel, to a tile of the same rank as well, or else the image
+// would depend on who owns what. Rounded to nearest, ties to even.
 struct Precision {
     Precision() = default;
     Precision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
@@ -289,9 +296,14 @@ struct Precision {
         : budget(errorBudget.error), maxColor(errorBudget.maxColor)
     {
     }
+    Precision(const HalfLevel& halfLevel) // NOLINT: meant to convert
+        : isHalfLevel(true), maxColor(halfLevel.maxColor)
+    {
+    }
 
     WireFormat color = WireFormat::Float32; // and alpha
     double budget = 0;                      // above 0: in place of `color`
+    bool isHalfLevel = false;               // in place of both
     // Colours that occur, as a renderer would give them before it multiplies by alpha: each channel is within
     // [0, maxColor * alpha]. A tile of which that is not true, such as emission or HDR, travels as Float32.
     float maxColor = 1;
