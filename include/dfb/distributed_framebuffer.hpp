@@ -12,6 +12,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <optional>
 #include <utility>
@@ -94,7 +95,31 @@ public:
         // Tells `rank` that inputs of this generation and higher ones cannot be seen. The owner drops those that come
         // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument unless the operation has opaqueHides()
         // for this frame.
-        void hide(int tileIndex, int generation, int rank) const { engine_->hide(tileIndex, generation, rank); }
+        void hide(int tileIndex, int generation, int rank) const
+        {
+            engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
+        }
+
+        // Whether opaque inputs of that tile hide what is behind them in this frame. Any thread. Waits for nothing.
+        bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
+        // Tells `rank` that inputs of this generation and higher ones are likely to be hidden by one of this rank: it
+        // had better wait for the word that must follow, which is hide(), or show() if they can be seen. Threads and
+        // exceptions as for hide().
+        void mayHide(int tileIndex, int generation, int rank) const
+        {
+            engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
+        }
+        void show(int tileIndex, int generation, int rank) const
+        {
+            engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
+        }
+        // Whether another rank has said mayHide() about an input, and its word has not come yet. Any thread. Waits for
+        // nothing.
+        bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
+        // Waits until heard(), which is called again with every word that comes, or the frame has failed. Runs tasks
+        // meanwhile. Returns false if it takes longer than FrameBufferConfig::quiet: then do not wait any more. By one
+        // thread, which must be able to move messages. Throws TransportError.
+        bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
 
         // Declares the inputs of generation 1 that this rank will send in each pass. In a frame with
         // FrameConfig::declared every rank must call it once, with an empty list if it has no inputs; else end() fails

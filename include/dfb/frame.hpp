@@ -73,7 +73,8 @@ struct FrameBufferConfig {
     TileCallback onTile{};
     // end() waits this long before it checks whether any rank still has something under way, and checks again at
     // growing intervals. If nobody has, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs
-    // a few messages in each slow frame. Ranks may give different ones.
+    // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then renders
+    // it. Ranks may give different ones.
     std::chrono::milliseconds quiet{2000};
 };
 

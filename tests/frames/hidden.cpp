@@ -5,6 +5,7 @@
 #include <array>
 #include <atomic>
 #include <chrono>
+#include <functional>
 #include <memory>
 #include <string>
 #include <thread>
@@ -26,10 +27,10 @@ struct Hidden {
         return c;
     }
 
-    // Brick `i` at a pixel; that with number 2 is opaque on the left.
-    static std::array<float, 4> colorOf(std::uint32_t i, int x, int y)
+    // Brick `i` at a pixel; that with number 2 is opaque on the left, if any is.
+    static std::array<float, 4> colorOf(std::uint32_t i, int x, int y, bool isOpaque)
     {
-        const float alpha = i == 2 && x < 55 ? 1.0f : 0.25f + 0.0625f * static_cast<float>((x + y) % 4);
+        const float alpha = isOpaque && i == 2 && x < 55 ? 1.0f : 0.25f + 0.0625f * static_cast<float>((x + y) % 4);
         return {alpha * 0.125f * static_cast<float>(i), alpha * 0.25f, alpha * static_cast<float>(x % 3) / 4, alpha};
     }
 
@@ -37,7 +38,9 @@ struct Hidden {
     template <class Transport>
     static void renderAll(const typename Transport::Communicator& communicator, Result& result)
     {
-        Fb<Transport> fb(communicator, config(false));
+        auto patient = config(false);
+        patient.quiet = std::chrono::seconds(60); // who waits for a word that is not given waits so long
+        Fb<Transport> fb(communicator, patient);
         dfb::World mine;
         for (std::uint32_t i = 0; i < 6; ++i)
             if (static_cast<int>(i) % fb.size() == fb.rank())
@@ -49,21 +52,28 @@ struct Hidden {
         dfb::RoundRobinBricks owner;
         dfb::OrderedLoop loop(fb, world, owner);
         std::atomic<int> rendered{0};
+        bool isOpaque = true;
+        std::uint64_t hashes[2] = {};
         const auto render = [&](const dfb::Brick& b, auto& tile) {
             ++rendered;
             tile.forEachPixel([&](int x, int y, float* rgba, float&) {
-                const auto c = colorOf(b.id, x, y);
+                const auto c = colorOf(b.id, x, y, isOpaque);
                 std::copy(c.begin(), c.end(), rgba);
             });
         };
-        for (int frame = 0; frame < 5; ++frame) {
+        for (int frame = 0; frame < 8; ++frame) {
             rendered = 0;
+            isOpaque = frame != 4 && frame != 5; // what was hidden shows, and is hidden again
+            const auto start = std::chrono::steady_clock::now();
             loop.render(scene::FlatCamera(), order, render);
+            result.expect(std::chrono::steady_clock::now() - start < std::chrono::seconds(30), "no word");
             const std::int64_t all = fb.allReduce({rendered}, Fb<Transport>::Reduce::Sum)[0];
             // On a single rank at most one worker is at the tile while the other renders what hides it.
             const int tiles = fb.layout().tileCount();
             result.expect(all >= 3 * tiles && all <= 6 * tiles, std::to_string(all) + " tiles rendered");
-            result.expect(fb.size() > 1 || all < 6 * tiles, "all tiles rendered, also those that are hidden");
+            result.expect(isOpaque || all == 6 * tiles, "a tile that shows was left out");
+            result.expect(!isOpaque || fb.size() > 1 || all < 6 * tiles,
+                          "all tiles rendered, also those that are hidden");
             if (!fb.isDisplayRank())
                 continue;
             std::size_t wrong = 0;
@@ -71,7 +81,7 @@ struct Hidden {
                 for (int x = 0; x < 90; ++x) {
                     std::vector<dfb::testing::Sample> samples;
                     for (std::uint32_t i = 0; i < 6; ++i)
-                        samples.push_back({colorOf(i, x, y)});
+                        samples.push_back({colorOf(i, x, y, isOpaque)});
                     const auto exact = dfb::testing::compositeInOrder(samples, {});
                     for (std::size_t c = 0; c < 4; ++c)
                         wrong += dfb::testing::ulpsBetween(
@@ -81,8 +91,9 @@ struct Hidden {
                 }
             result.expect(wrong == 0, std::to_string(wrong) + " values are wrong");
             const std::uint64_t hash = dfb::testing::hashOf(fb.image().bytes(), fb.image().pixelCount() * 16);
-            result.expect(result.hash == 0 || result.hash == hash, "another image");
-            result.hash = hash;
+            result.expect(hashes[isOpaque] == 0 || hashes[isOpaque] == hash, "another image");
+            hashes[isOpaque] = hash;
+            result.hash = hashes[0] * 31 + hashes[1];
         }
     }
 
@@ -125,6 +136,61 @@ struct Hidden {
         }
     }
 
+    // Rank 0 says that it may hide what the next one has, then hides it in some tiles and shows it in others, or never
+    // says a word more: then the other one waits no longer than config.quiet.
+    template <class Transport>
+    static void waiting(const typename Transport::Communicator& communicator, Result& result)
+    {
+        auto c = config(false);
+        c.quiet = std::chrono::milliseconds(20);
+        Fb<Transport> fb(communicator, c);
+        const int other = 1 % fb.size(), tiles = fb.layout().tileCount();
+        for (const bool isSilent : {false, true}) {
+            auto frame = fb.begin();
+            const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+            const auto set = [&](int t, int generation, float alpha) {
+                frame.start(*tile, t);
+                tile->fill({0.25f, 0.25f, 0.25f, alpha});
+                tile->generation = generation;
+                tile->children = generation == 0;
+                frame.setTile(*tile);
+            };
+            if (fb.rank() == 0)
+                for (int t = 0; t < tiles; ++t)
+                    frame.mayHide(t, 1, other);
+            for (int t = 0; t < tiles && fb.rank() == 0; ++t) {
+                set(t, 0, t % 2 == 0 && !isSilent ? 1.0f : 0.5f);
+                if (isSilent)
+                    continue;
+                if (frame.hidesRest(*tile))
+                    frame.hide(t, 1, other);
+                else
+                    frame.show(t, 1, other);
+            }
+            // By the thread of this rank; a minute is for ever.
+            const auto wait = [&](const std::function<bool()>& done) {
+                for (int tries = 0; tries < 3000 && !frame.waitForWord(done); ++tries) {
+                }
+                return done();
+            };
+            for (int t = 0; t < tiles && fb.rank() == other; ++t) {
+                if (isSilent) {
+                    result.expect(wait([&] { return frame.isUndecided(t, 1); }), "an input that waits for nothing");
+                    result.expect(!frame.isUndecided(t, 0), "the front waits");
+                    result.expect(!frame.waitForWord([&] { return !frame.isUndecided(t, 1); }), "word of nobody");
+                    set(t, 1, 0.5f);
+                } else if (t % 2 == 0) {
+                    result.expect(wait([&] { return frame.isHidden(t, 1); }), "a tile that is hidden shows");
+                } else {
+                    result.expect(wait([&] { return !frame.isUndecided(t, 1); }), "no word");
+                    result.expect(!frame.isHidden(t, 1), "a tile that shows is hidden");
+                    set(t, 1, 0.5f);
+                }
+            }
+            frame.end();
+        }
+    }
+
     // Where the image has depths all that there is counts.
     template <class Transport>
     static void withDepth(const typename Transport::Communicator& communicator, Result& result)
@@ -149,6 +215,7 @@ struct Hidden {
         Result result;
         renderAll<Transport>(communicator, result);
         byHand<Transport>(communicator, result);
+        waiting<Transport>(communicator, result);
         withDepth<Transport>(communicator, result);
         return result;
     }

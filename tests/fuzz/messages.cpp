@@ -636,7 +636,10 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("vote_on_no_tile", {}, of(MessageKind::ReduceUp, reductionOf(FrameVerdict, verdict.bytes())));
     for (const int tile : {2, -2})
         add("hidden" + std::to_string(tile), {0, Ordered},
-            of(MessageKind::Hidden, Output().put(tile).put(1).bytes()) + frameOf({0, Ordered}));
+            of(MessageKind::Hidden, Output().put(tile).put(1).put(0).bytes()) + frameOf({0, Ordered}));
+    for (const int word : {1, 2, 3})
+        add("hidden_word" + std::to_string(word), {0, Ordered},
+            of(MessageKind::Hidden, Output().put(2).put(1).put(word).bytes()) + frameOf({0, Ordered}));
     add("image_place", {}, of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));
     add("image_place_of_the_display", {DisplayElsewhere},
         of(MessageKind::ImagePlace, std::string(sizeof(d::ImagePlaces), '\1')));

@@ -2,9 +2,11 @@
 // is made of is in frame/frame_engine.hpp, which a program that links dfb::compiled does not compile.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/hidden_tiles.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile.hpp>
@@ -45,7 +47,9 @@ public:
     virtual void setTile(const InputPixels& tile) = 0;
     virtual bool isHidden(int tile, int generation) const = 0;
     virtual bool opaqueHides(int tile) const = 0;
-    virtual void hide(int tile, int generation, int other) = 0;
+    virtual bool isUndecided(int tile, int generation) const = 0;
+    virtual void tell(int other, const HiddenTiles::Message& word) = 0;
+    virtual bool waitForWord(FunctionRef<bool()> heard) = 0;
     virtual void declare(const std::vector<TileInput>& inputs) = 0;
     virtual void expectLayers(int layers) = 0;
     virtual TileSamples samples(int tile) const = 0;

@@ -205,14 +205,19 @@ public:
     // See Frame.
     bool isHidden(int tile, int generation) const override { return generation >= hidden_.from(tile); }
     bool opaqueHides(int tile) const override { return pipeline_->opaqueHides(tile); }
-    void hide(int tile, int generation, int other) override
+    bool isUndecided(int tile, int generation) const override { return hidden_.isUndecided(tile, generation); }
+    void tell(int other, const HiddenTiles::Message& word) override
     {
-        if (!pipeline_->opaqueHides(tile))
+        if (!pipeline_->opaqueHides(word.tile))
             failArgument("hide() with a tile operation or a frame to which everything counts");
         if (other == rank())
-            hidden_.hide(tile, generation);
+            takeWord(word);
         else
-            mailbox_->sendBody(other, MessageKind::Hidden, open_.number(), HiddenTiles::Message{tile, generation});
+            mailbox_->sendBody(other, MessageKind::Hidden, open_.number(), word);
+    }
+    bool waitForWord(FunctionRef<bool()> heard) override
+    {
+        return mailbox_->wait([&] { return outcome_->failed() || heard(); }, Clock::now() + config_.quiet);
     }
 
     void expectLayers(int layers) override { pipeline_->setLayers(layers); }
@@ -555,12 +560,20 @@ private:
             if (body.tile < 0 || body.tile >= layout().tileCount() || body.generation < 1
                 || !pipeline_->opaqueHides(body.tile))
                 failMalformed("word of hidden inputs of a tile that has none", layout().tileCount() - 1, body.tile);
-            hidden_.hide(body.tile, body.generation);
+            if (body.word < HiddenTiles::Word::Hides || body.word > HiddenTiles::Word::Shows)
+                failMalformed("word of hidden inputs that there is not", 2, static_cast<std::int64_t>(body.word));
+            takeWord(body);
         } else if (kind == MessageKind::Manifest || kind == MessageKind::ManifestAck) {
             receiveDeclaration(source, header, message);
         } else {
             jobs_->receive(source, header, message);
         }
+    }
+
+    void takeWord(const HiddenTiles::Message& word)
+    {
+        hidden_.take(word);
+        mailbox_->notify(); // of waitForWord()
     }
 
     void receiveDeclaration(int source, const MessageHeader& header, const Buffer& message)

@@ -1,4 +1,5 @@
-// HiddenTiles: from which generation on the inputs of a tile cannot be seen, as an opaque one is in front of them.
+// HiddenTiles: which inputs of a tile cannot be seen, as an opaque one is in front of them, and which may turn out to
+// be so.
 #pragma once
 
 #include <algorithm>
@@ -6,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
+#include <mutex>
 #include <vector>
 
 namespace dfb::detail {
@@ -13,37 +15,76 @@ namespace dfb::detail {
 // One per rank: what it has heard. newFrame() apart, members may be called from any thread.
 class HiddenTiles {
 public:
+    // What an input does with those behind it.
+    enum class Word : std::int32_t {
+        Hides,
+        MayHide, // it did so in the last frame; Hides or Shows follows
+        Shows
+    };
     struct Message {
         std::int32_t tile = 0;
-        std::int32_t generation = 0; // the first that is hidden
+        std::int32_t generation = 0; // the first one behind
+        Word word = Word::Hides;
     };
 
     void newFrame(int tileCount)
     {
-        if (from_.size() != static_cast<std::size_t>(tileCount))
+        if (from_.size() != static_cast<std::size_t>(tileCount)) {
             from_ = std::vector<std::atomic<std::int32_t>>(static_cast<std::size_t>(tileCount));
-        else if (!any_)
+            open_ = std::vector<std::vector<Open>>(from_.size());
+        } else if (!any_) {
             return;
+        }
         for (auto& from : from_)
             from = none;
-        any_ = false;
+        for (auto& open : open_)
+            open.clear();
+        any_ = anyOpen_ = false;
     }
 
+    void take(const Message& message)
+    {
+        any_ = true;
+        if (message.word == Word::Hides) {
+            auto& from = from_[static_cast<std::size_t>(message.tile)];
+            std::int32_t before = from;
+            while (message.generation < before && !from.compare_exchange_weak(before, message.generation)) {
+            }
+        }
+        anyOpen_ = anyOpen_ || message.word == Word::MayHide;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        auto& open = open_[static_cast<std::size_t>(message.tile)];
+        auto at =
+            std::find_if(open.begin(), open.end(), [&](const Open& o) { return o.generation == message.generation; });
+        if (at == open.end())
+            at = open.insert(open.end(), {message.generation, 0});
+        at->count += message.word == Word::MayHide ? 1 : -1; // they may overtake each other
+    }
+
+    // The first generation that cannot be seen.
     int from(int tile) const { return any_ ? from_[static_cast<std::size_t>(tile)].load() : none; }
 
-    void hide(int tile, std::int32_t generation)
+    // Whether word is to come that may hide an input which is not hidden yet.
+    bool isUndecided(int tile, int generation) const
     {
-        auto& from = from_[static_cast<std::size_t>(tile)];
-        std::int32_t before = from;
-        while (generation < before && !from.compare_exchange_weak(before, generation)) {
-        }
-        any_ = true;
+        if (!anyOpen_ || generation >= from(tile))
+            return false;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const auto& open = open_[static_cast<std::size_t>(tile)];
+        return std::any_of(open.begin(), open.end(),
+                           [&](const Open& o) { return o.count > 0 && o.generation <= generation; });
     }
 
 private:
+    struct Open {
+        std::int32_t generation;
+        int count;
+    };
     static constexpr std::int32_t none = std::numeric_limits<std::int32_t>::max();
     std::vector<std::atomic<std::int32_t>> from_;
-    std::atomic<bool> any_{false};
+    std::atomic<bool> any_{false}, anyOpen_{false};
+    mutable std::mutex mutex_;
+    std::vector<std::vector<Open>> open_; // by tile; under mutex_
 };
 
 } // namespace dfb::detail

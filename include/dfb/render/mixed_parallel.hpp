@@ -20,6 +20,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <mutex>
 #include <string>
 #include <tuple>
 #include <type_traits>
@@ -219,8 +220,12 @@ struct OrderedWork : MixedWork {
     std::vector<int> place;             // of each brick, from the front
     std::vector<int> firstPair;         // of each tile, or -1
     std::vector<int> empty;             // tiles of this rank
-    std::vector<MixedJob> ordered;      // only renderFrontsFirst() uses it
     std::atomic<bool> anyHidden{false}; // in the last frame: of this rank's inputs, or by one
+    std::vector<std::atomic<int>>
+        hider;                  // of each tile: the brick of this rank that hid others in the last frame, or -1
+    std::vector<int> announced; // of each tile: the brick that may hide others in this frame, or -1
+    std::mutex undecidedMutex;
+    std::vector<MixedJob> undecided; // that another rank may hide
 
     // Throws InvalidArgument.
     void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
@@ -255,30 +260,47 @@ struct OrderedWork : MixedWork {
         return static_cast<int>(job.pair) - firstPair[static_cast<std::size_t>(pairs[job.pair].tile)];
     }
 
-    // First the tiles of which this rank has the front, then the others from the end of the image back: when it comes
-    // to what an opaque input of another rank hides, that one should have been rendered. Not for images that hide
-    // nothing: their tiles would be complete later.
+    // Begins with the tiles of which this rank has the front, so that others hear soon what is hidden. Not for images
+    // that hide nothing: their tiles would be complete later.
     void renderFrontsFirst()
     {
-        const auto tileOf = [&](std::size_t job) { return pairs[jobs[job].pair].tile; };
-        const auto append = [&](std::size_t begin, std::size_t end) {
-            ordered.insert(ordered.end(), jobs.begin() + static_cast<std::ptrdiff_t>(begin),
-                           jobs.begin() + static_cast<std::ptrdiff_t>(end));
-        };
-        ordered.clear();
-        for (std::size_t begin = 0, end = 0; begin < jobs.size(); begin = end) {
-            while (end < jobs.size() && tileOf(end) == tileOf(begin))
-                ++end;
-            if (generationOf(jobs[begin]) == 0)
-                append(begin, end);
+        std::stable_partition(jobs.begin(), jobs.end(), [this](const MixedJob& job) { return generationOf(job) == 0; });
+    }
+
+    // Tells the ranks behind them of this rank's inputs that hid others in the last frame: they are likely to do so
+    // again.
+    template <class Frame, class Owner>
+    void announceHiders(const Frame& frame, const SharedWorld& world, int tileCount, Owner& owner)
+    {
+        if (hider.size() != static_cast<std::size_t>(tileCount)) {
+            hider = std::vector<std::atomic<int>>(static_cast<std::size_t>(tileCount));
+            std::fill(hider.begin(), hider.end(), -1);
         }
-        for (std::size_t end = jobs.size(), begin = end; end > 0; end = begin) {
-            while (begin > 0 && tileOf(begin - 1) == tileOf(end - 1))
-                --begin;
-            if (generationOf(jobs[begin]) > 0)
-                append(begin, end);
+        announced.assign(hider.size(), -1);
+        for (const MixedJob& job : jobs) {
+            const BrickInTile& pair = pairs[job.pair];
+            const auto tile = static_cast<std::size_t>(pair.tile);
+            if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
+                continue;
+            announced[tile] = pair.brick;
+            forEachRankBehind(world, job, owner,
+                              [&](int generation, int rank) { frame.mayHide(pair.tile, generation, rank); });
         }
-        jobs.swap(ordered);
+    }
+
+    // Calls f(generation, rank) for the ranks that render something behind a job; `generation`: the first one behind.
+    template <class Owner, class F>
+    void forEachRankBehind(const SharedWorld& world, const MixedJob& job, Owner& owner, const F& f) const
+    {
+        const int tile = pairs[job.pair].tile;
+        std::vector<int> told;
+        for (std::size_t p = job.pair + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
+            const int rank = owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], tile, 0);
+            if (std::find(told.begin(), told.end(), rank) != told.end())
+                continue;
+            f(generationOf(job) + 1, rank);
+            told.push_back(rank);
+        }
     }
 };
 
@@ -298,22 +320,6 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
         renderBrick(brick, tile);
         frame.addFigure(key,
                         std::chrono::duration<double, std::nano>(std::chrono::steady_clock::now() - start).count());
-    }
-}
-
-// Lets those know who render what is behind a pair, which is opaque.
-template <class Frame, class Owner>
-void hideBehind(const Frame& frame, const SharedWorld& world, const std::vector<BrickInTile>& pairs, std::size_t opaque,
-                int generation, Owner& owner)
-{
-    const int tile = pairs[opaque].tile;
-    std::vector<int> told;
-    for (std::size_t p = opaque + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
-        const int rank = owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], tile, 0);
-        if (std::find(told.begin(), told.end(), rank) != told.end())
-            continue;
-        frame.hide(tile, generation + 1, rank);
-        told.push_back(rank);
     }
 }
 
@@ -385,8 +391,8 @@ private:
 
 // The mixed-parallel loop for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing
 // and wait for no manifest. Tiles that an opaque one hides are not sent, and not rendered by ranks that hear of it in
-// time. Ranks that hid others or were hidden in the last frame begin with the tiles of which they have the front. Use
-// it only if one order is right for all rays of a frame: not with an extended lens or several eyes.
+// time. What an opaque tile hid in the last frame waits until that one is rendered again. Use it only if one order is
+// right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:
@@ -422,11 +428,10 @@ public:
                 });
             if (work_.anyHidden.exchange(false))
                 work_.renderFrontsFirst();
-            const auto count = static_cast<std::int64_t>(work_.jobs.size());
-            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
-                count, [&](std::int64_t i, auto& tile) {
-                    renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile);
-                });
+            work_.announceHiders(frame, world_, fb_.layout().tileCount(), owner_);
+            work_.undecided.clear();
+            renderJobs(frame, renderBrick, true);
+            renderUndecided(frame, renderBrick);
         });
         return frame;
     }
@@ -441,9 +446,40 @@ public:
     }
 
 private:
+    template <class RenderBrick>
+    void renderJobs(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick, bool mayWait)
+    {
+        frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
+            static_cast<std::int64_t>(work_.jobs.size()), [&](std::int64_t i, auto& tile) {
+                renderJob(frame, work_.jobs[static_cast<std::size_t>(i)], renderBrick, tile, mayWait);
+            });
+    }
+
+    // Renders what other ranks may hide, each as soon as they have said that they do not.
+    template <class RenderBrick>
+    void renderUndecided(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick)
+    {
+        auto& undecided = work_.undecided;
+        const auto isUndecided = [&](const detail::MixedJob& job) {
+            return frame.isUndecided(work_.pairs[job.pair].tile, work_.generationOf(job));
+        };
+        for (bool mayWait = true; !undecided.empty() && !frame.failed();) {
+            const auto decided =
+                mayWait ? std::stable_partition(undecided.begin(), undecided.end(), isUndecided) : undecided.begin();
+            if (decided == undecided.end()) {
+                mayWait =
+                    frame.waitForWord([&] { return !std::all_of(undecided.begin(), undecided.end(), isUndecided); });
+                continue;
+            }
+            work_.jobs.assign(decided, undecided.end());
+            undecided.erase(decided, undecided.end());
+            renderJobs(frame, renderBrick, false);
+        }
+    }
+
     template <class RenderBrick, class Tile>
     void renderJob(typename FrameBuffer::Frame& frame, const detail::MixedJob& job, const RenderBrick& renderBrick,
-                   Tile& tile)
+                   Tile& tile, bool mayWait)
     {
         const std::vector<BrickInTile>& pairs = work_.pairs;
         const BrickInTile& pair = pairs[job.pair];
@@ -453,16 +489,40 @@ private:
             work_.anyHidden = true;
             return;
         }
+        if (mayWait && frame.isUndecided(pair.tile, generation)) {
+            const std::lock_guard<std::mutex> lock(work_.undecidedMutex);
+            work_.undecided.push_back(job);
+            return;
+        }
         frame.start(tile, pair.tile, job.pass);
         tile.generation = generation;
         tile.children = job.pair + 1 < pairs.size() && pairs[job.pair + 1].tile == pair.tile;
         tile.source = brick.id;
         detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
         frame.setTile(tile);
-        if (tile.children > 0 && frame.hidesRest(tile)) {
+        if (tile.children > 0 && frame.opaqueHides(pair.tile))
+            tellBehind(frame, job, frame.hidesRest(tile));
+    }
+
+    // Tells the ranks behind an input that it hides theirs, or does not, if they wait for that.
+    void tellBehind(typename FrameBuffer::Frame& frame, const detail::MixedJob& job, bool hides)
+    {
+        const BrickInTile& pair = work_.pairs[job.pair];
+        const auto tile = static_cast<std::size_t>(pair.tile);
+        const bool isAwaited = work_.announced[tile] == pair.brick;
+        if (hides) {
             work_.anyHidden = true;
-            detail::hideBehind(frame, world_, pairs, job.pair, generation, owner_);
+            work_.hider[tile] = pair.brick;
+        } else if (isAwaited) {
+            work_.hider[tile] = -1;
         }
+        if (hides || isAwaited)
+            work_.forEachRankBehind(world_, job, owner_, [&](int generation, int rank) {
+                if (hides)
+                    frame.hide(pair.tile, generation, rank);
+                else
+                    frame.show(pair.tile, generation, rank);
+            });
     }
 
     FrameBuffer& fb_;

@@ -243,7 +243,7 @@ TEST_CASE("A message that says what cannot be fails its frame on every rank, and
         {"hidden inputs where everything counts", MessageKind::Manifest, 2,
          [](dfb::Buffer& m) {
              put(m, offsetof(MessageHeader, kind), MessageKind::Hidden);
-             m.shrink(body + 8);
+             m.shrink(body + sizeof(dfb::detail::HiddenTiles::Message));
          },
          "word of hidden inputs"},
         {"a finished tile of another owner", MessageKind::FinishedTiles, 1,

@@ -8,7 +8,7 @@
 
 namespace mixed_parallel_cases {
 
-TEST_CASE("Where something is hidden, fronts come first, and what may be hidden from the end back", "[mixed]")
+TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
 {
     // In tiles 0 to 3 bricks 0 to 2 are behind each other, in tile 4 is brick 2 alone.
     dfb::detail::OrderedWork work;
@@ -31,19 +31,19 @@ TEST_CASE("Where something is hidden, fronts come first, and what may be hidden 
         order.push_back({work.pairs[job.pair].tile, work.pairs[job.pair].brick, job.pass});
     CHECK(order
           == Order{{1, 0, 0},
+                   {4, 2, 0}, // these two are fronts
+                   {0, 1, 0},
+                   {0, 2, 0},
                    {1, 1, 0},
                    {1, 2, 0},
-                   {4, 2, 0}, // front to back
+                   {2, 1, 0},
+                   {2, 2, 0},
                    {3, 1, 0},
                    {3, 1, 1},
                    {3, 2, 0},
-                   {3, 2, 1},
-                   {2, 1, 0},
-                   {2, 2, 0},
-                   {0, 1, 0},
-                   {0, 2, 0}});
-    CHECK(work.generationOf(work.jobs[2]) == 2);
-    CHECK(work.generationOf(work.jobs[3]) == 0);
+                   {3, 2, 1}});
+    CHECK(work.generationOf(work.jobs[1]) == 0);
+    CHECK(work.generationOf(work.jobs[5]) == 2);
 }
 
 } // namespace mixed_parallel_cases
