@@ -115,16 +115,21 @@ struct WithinHalfALevel {
             bool hasFarRanks = false;
             for (int other = 0; other < connection->size(); ++other)
                 hasFarRanks = hasFarRanks || (other != connection->rank() && !connection->sharesMemoryWith(other));
-            for (const auto format :
-                 {dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8, dfb::OutputFormat::RGBA32F}) {
+            // 200 layers are too many for 16 bits and half a level of sRGB, whose curve is steep where it is dark.
+            for (const auto& [format, layers] :
+                 {std::make_pair(dfb::OutputFormat::RGBA8, 5), std::make_pair(dfb::OutputFormat::RGBA8, 200),
+                  std::make_pair(dfb::OutputFormat::SRGBA8, 5), std::make_pair(dfb::OutputFormat::SRGBA8, 200),
+                  std::make_pair(dfb::OutputFormat::RGBA32F, 5)}) {
+                const dfb::OutputFormat output = format;
+                const int maxLayers = layers;
                 const auto frame = [&](const dfb::Precision& precision) {
                     auto config = configOf(s, 1);
-                    config.image.format = format;
+                    config.image.format = output;
                     config.precision = precision;
                     dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(connection,
                                                                                                         config);
                     auto params = paramsOf(s);
-                    params.maxLayers = 5;
+                    params.maxLayers = maxLayers;
                     const auto report =
                         dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
                             .render(
@@ -137,11 +142,12 @@ struct WithinHalfALevel {
                     return std::make_pair(bytes, report);
                 };
                 const auto exact = frame({}), half = frame(dfb::HalfLevel{});
-                const bool isFloat = format == dfb::OutputFormat::RGBA32F, isLossy = hasFarRanks && !isFloat;
+                const bool isFloat = output == dfb::OutputFormat::RGBA32F, isSrgb = output == dfb::OutputFormat::SRGBA8;
+                const bool isLossy = hasFarRanks && !isFloat && !(isSrgb && maxLayers == 200);
                 const std::string name =
-                    std::string(dfb::nameOf(format)) + (sharesMemory ? ", shared memory" : ", through MPI");
-                const double budget = format == dfb::OutputFormat::SRGBA8 ? 0.5 / 255 / 12.92 : 0.5 / 255;
-                result.expect(half.second.wireColor == (isLossy ? dfb::WireFormat::Unorm16 : dfb::WireFormat::Float32),
+                    std::string(dfb::nameOf(output)) + (sharesMemory ? ", shared memory" : ", through MPI");
+                const double budget = isSrgb ? 0.5 / 255 / 12.92 : 0.5 / 255;
+                result.expect((half.second.wireColor != dfb::WireFormat::Float32) == isLossy,
                               name + ": travels as " + dfb::nameOf(half.second.wireColor));
                 result.expect(half.second.wireErrorBound <= (isLossy ? budget : 0),
                               name + ": a bound of " + std::to_string(half.second.wireErrorBound));

@@ -353,11 +353,12 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
     PixelsInPlace& p = parts.inPlace;
     p.valid = {place.x0, place.y0, place.x1, place.y1};
     const std::int64_t largest = std::int64_t{1} << 40; // of an offset or a row, so that sums cannot overflow
+    const auto isSmall = [&](std::int64_t value) { return value >= -largest && value <= largest; };
     if (p.valid.x0 >= p.valid.x1 || p.valid.y0 >= p.valid.y1 || p.valid.x1 > region.width()
         || p.valid.y1 > region.height())
         failMalformed("valid pixels outside the tile", region.width(), p.valid.x1);
-    if (std::abs(place.stride) < region.width() || std::abs(place.stride) > largest || std::abs(place.color) > largest
-        || std::abs(place.depth) > largest || place.color % 4 != 0)
+    if (!isSmall(place.stride) || !isSmall(place.color) || !isSmall(place.depth)
+        || std::abs(place.stride) < region.width() || place.color % 4 != 0)
         failMalformed("rows that cannot be", region.width(), place.stride);
     // The address of the region's first pixel, which need not lie in the memory itself.
     const auto planeAt = [&](std::int64_t first, std::int64_t pixelBytes) {

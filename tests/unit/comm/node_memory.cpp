@@ -51,12 +51,21 @@ TEST_CASE("A bell ends a nap, or the next one, and wakes only who wants to be wo
     const auto nothing = [] {};
     const auto ring = [&] { others.ring(); };
     const auto interrupt = [&] { mine.interrupt(); };
+    // Whether the nap has begun by then decides only which of two ways is tested.
+    const auto later = [](const auto& f) {
+        return [&f] {
+            std::this_thread::sleep_for(milliseconds(20));
+            f();
+        };
+    };
     for (const bool isAwaiting : {true, false}) {
         CHECK(isShort(isAwaiting, ring, nothing));
         CHECK(isShort(isAwaiting, interrupt, nothing));
         CHECK(isShort(isAwaiting, nothing, interrupt));
+        CHECK(isShort(isAwaiting, nothing, later(interrupt)));
     }
     CHECK(isShort(true, nothing, ring));
+    CHECK(isShort(true, nothing, later(ring)));
     // An interrupt ends one nap, also if it has looked since; a ring that it has looked after ends none.
     mine.interrupt();
     others.ring();
