@@ -21,7 +21,7 @@ namespace frame_cases {
 
 namespace {
 
-constexpr int inPlaceWidth = 83, inPlaceHeight = 59;
+constexpr int inPlaceWidth = 83, inPlaceHeight = 59, spoiledTile = 8;
 
 // One image per rank, with empty and faulty pixels, as floats or bytes, rows top-down or bottom-up.
 class RankImage {
@@ -73,7 +73,7 @@ public:
         view.valid = {5, 3, 77, 50};
         view.staysUntilEnd = memory_ != Memory::Copied;
     }
-    void spoil() { color_[16 * (20 * stride + 40)] ^= std::byte{1}; } // within the valid part
+    void spoil() { color_[16 * (20 * stride + 40)] ^= std::byte{1}; } // in the valid part of spoiledTile
 
 private:
     static constexpr std::size_t rows = inPlaceHeight, stride = inPlaceWidth + 4;
@@ -88,8 +88,8 @@ private:
 using Memory = RankImage::Memory;
 
 template <class TileOp, class FrameBuffer>
-dfb::FrameReport frameOf(
-    FrameBuffer& fb, const RankImage& image, int passes, const std::function<void()>& late = [] {})
+dfb::FrameReport frameOf(FrameBuffer& fb, const RankImage& image, int passes,
+                         const std::function<void()>& beforeLastInput = nullptr)
 {
     dfb::FrameConfig params;
     params.declared = true;
@@ -99,6 +99,9 @@ dfb::FrameReport frameOf(
     std::vector<dfb::TileInput> inputs;
     for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
         inputs.push_back({tile, static_cast<std::uint32_t>(fb.rank()), 0});
+    const auto lastSource = static_cast<std::uint32_t>(fb.size());
+    if (beforeLastInput)
+        inputs.push_back({spoiledTile, lastSource, 0});
     frame.declare(inputs);
     for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
         for (int pass = 0; pass < passes; ++pass) {
@@ -108,7 +111,15 @@ dfb::FrameReport frameOf(
             image.place(view);
             frame.setTile(view);
         }
-    late();
+    if (beforeLastInput) { // its owner reads a tile only when it has all inputs, so nobody reads this one yet
+        beforeLastInput();
+        typename FrameBuffer::TileView view;
+        frame.start(view, spoiledTile, 0);
+        view.generation = 1;
+        view.source = lastSource;
+        image.place(view);
+        frame.setTile(view);
+    }
     return frame.end();
 }
 
@@ -185,10 +196,10 @@ struct BrokenPromise {
         for (const Memory memory : {Memory::Own, Memory::Shared}) {
             RankImage image(fb, memory, false, false);
             const std::string text = scene::outcomeOf([&] {
-                frameOf<TileOp>(fb, image, 1, [&] {
-                    if (fb.rank() == fb.size() - 1)
-                        image.spoil();
-                });
+                if (fb.rank() == fb.size() - 1)
+                    frameOf<TileOp>(fb, image, 1, [&] { image.spoil(); });
+                else
+                    frameOf<TileOp>(fb, image, 1);
             });
             const std::string rank = "rank " + std::to_string(fb.size() - 1);
             result.expect(text.find("FrameError") != std::string::npos
