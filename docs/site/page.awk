@@ -46,8 +46,13 @@ function reference(link,    hash, page)
     return "@ref " pageName(page) (hash ? "_" substr(link, hash + 1) : "")
 }
 
-function withReferences(line,    out, at, end)
+function withReferences(line,    out, at, end, text)
 {
+    while (match(line, /\[`[^`]*`\]\(/)) { # Doxygen shows the marks of code within a link
+        text = substr(line, RSTART, RLENGTH)
+        gsub(/`/, "", text)
+        line = substr(line, 1, RSTART - 1) text substr(line, RSTART + RLENGTH)
+    }
     out = ""
     while (at = index(line, "](")) {
         end = index(substr(line, at), ")")
