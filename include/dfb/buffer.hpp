@@ -18,7 +18,7 @@
 
 namespace dfb {
 
-// There is no memory for what was asked for: what() says how many bytes that were, and what for.
+// There is not enough memory. what() says how many bytes were asked for, and for which use.
 class OutOfMemory final : public std::bad_alloc {
 public:
     // No more than 150 characters of the purpose are kept: there may be no memory for a text either.
@@ -100,7 +100,8 @@ public:
     // A block that is never given back, 64-byte aligned; null if there is no more.
     virtual std::byte* take(std::size_t byteCount) noexcept = 0;
     virtual bool holds(const std::byte* block) const noexcept = 0;
-    // Of a block that it holds: who has it lends it to another process, and whether that one has not yet given it back.
+    // Of a block that it holds: its owner lends it to another process; and whether that process has not yet given it
+    // back.
     virtual void lend(std::byte* block) noexcept = 0;
     virtual bool isLent(const std::byte* block) const noexcept = 0;
 

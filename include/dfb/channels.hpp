@@ -1,4 +1,4 @@
-// Channels: what a pixel can have, how wide it is, and how it is blended.
+// Channels: the values that a pixel can have, how wide each is, and how it is blended.
 #pragma once
 
 #include <array>

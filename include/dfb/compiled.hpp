@@ -1,5 +1,6 @@
 // Where the functions of dfb are compiled: in each source file that uses them, which is the default, or once, in the
-// target dfb::compiled, which defines DFB_COMPILED for all that link it. What is compiled once stands in its header as
+// target dfb::compiled, which defines DFB_COMPILED for all that link it. A function that is compiled once stands in its
+// header as
 //
 //   DFB_COMPILED_ONCE void f();
 //

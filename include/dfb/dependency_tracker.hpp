@@ -1,5 +1,5 @@
-// DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper): what has arrived,
-// what is missing, and every way in which the two can contradict each other.
+// DependencyTracker: the dependency tree of one tile and pass (section 3.1.1 of the paper): which inputs have arrived,
+// which are missing, and every way in which inputs can contradict each other.
 //
 // An input is a member of a generation and announces children in the next; the sum over generation g is the size
 // of generation g + 1. Generation 0 has `rootCount` members. Inputs arrive in any order. The tree is complete when
@@ -38,9 +38,9 @@ public:
         generation(0).expected = rootCount;
     }
 
-    // The owner's own root (generation 0) has come, and what follows in generation 1 are exactly these
-    // (source, part) pairs, each once. Used where the counts come from the senders' manifests; call it once, in
-    // place of an arriving root. Throws as arrive() does, if what came before was not declared.
+    // The owner's own root (generation 0) has come, and generation 1 has exactly these (source, part) pairs, each once.
+    // Used where the counts come from the senders' manifests; call it once, in place of an arriving root. Throws as
+    // arrive() does, if an input came before that was not declared.
     void declare(const std::vector<std::pair<std::uint32_t, std::uint16_t>>& inputs)
     {
         declared_ = inputs; // into memory that it has already
@@ -62,7 +62,7 @@ public:
     // Takes note of one input. Throws Error, naming generation, source, expected and got, for: a negative number
     // of children, a duplicate (generation, source, part), more inputs than announced, and an input of a
     // generation or source that nobody announced. After a throw the tree is of no further use until reset(). `rank`:
-    // that it comes from, if that is known; for what is said of errors.
+    // the rank that it comes from, if that is known, for the text of errors.
     void arrive(int generationIndex, std::uint32_t source, std::uint16_t part, int children, int rank = -1)
     {
         const Input input{generationIndex, source, part, rank, children};
@@ -200,7 +200,7 @@ private:
         return true;
     }
 
-    // Steps over every generation that is complete; its children are what the next one expects.
+    // Steps over every generation that is complete; the next one expects its children.
     void advance()
     {
         while (!closed_) {

@@ -100,7 +100,7 @@ public:
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
         }
 
-        // Whether opaque inputs of that tile hide what is behind them in this frame. Any thread. Waits for nothing.
+        // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
         // Tells `rank` that inputs of this generation and higher ones are likely to be hidden by one of this rank: it
         // had better wait for the word that must follow, which is hide(), or show() if they can be seen. Threads and

@@ -1,7 +1,7 @@
-// The errors of dfb: one record of what went wrong where, and the exceptions that carry it.
+// The errors of dfb: a record of each error and its place, and the exceptions that carry it.
 //
-// InvalidArgument is thrown at once by the call that was wrong, before anything is sent. What goes wrong in
-// the background of a frame comes out of Frame::end() as FrameError, the same on every rank.
+// InvalidArgument is thrown at once by the call that was wrong, before anything is sent. An error in the background of
+// a frame comes out of Frame::end() as FrameError, the same on every rank.
 #pragma once
 
 #include <dfb/version.hpp>

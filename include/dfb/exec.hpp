@@ -118,7 +118,7 @@ private:
     detail::Fifo<Task> tasks_;
 };
 
-// A fixed number of threads. The destructor runs what was submitted, then joins.
+// A fixed number of threads. The destructor runs the tasks that were submitted, then joins.
 class ThreadExecutor final : public Executor {
 public:
     // `threadCount` workers; 0: one for each processor that the calling thread may run on. Where several ranks share

@@ -1,5 +1,5 @@
-// Image: what the display rank gets, in one of the output formats; and the exact conversion of linear pixels
-// to those formats.
+// Image: the picture that the display rank gets, in one of the output formats; and the exact conversion of linear
+// pixels to those formats.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -122,7 +122,7 @@ inline void storesAreDone() noexcept
 
 // Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
 // rounded to nearest. Returns how far the farthest value was from an 8-bit level, up to 1/2, which is a tie between
-// two; an sRGB colour next to where another level begins counts as one. What is no tie may be taken for up to 2^-15
+// two; an sRGB colour next to where another level begins counts as one. A value that is no tie may count as up to 2^-15
 // farther.
 template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
@@ -198,7 +198,7 @@ public:
         return reinterpret_cast<const float*>(bytes());
     }
     // One float a pixel, +infinity where nothing was hit. This and the next throw InvalidArgument if the channel was
-    // not asked for. What they mean where inputs were blended: channels.hpp.
+    // not asked for. channels.hpp says what they mean where inputs were blended.
     const float* depth() const { return detail::floatsOf(plane(detail::Depth, "depth")); }
     const float* normal() const { return detail::floatsOf(plane(detail::Normal, "normals")); }       // 3 a pixel
     const float* albedo() const { return detail::floatsOf(plane(detail::Albedo, "albedo")); }        // 3 a pixel
@@ -265,13 +265,14 @@ private:
 };
 
 // Dither: conversion to 8 bit that leaves no bands in gradients. Each pixel's place in the image says from which part
-// of the way between two levels on it takes the upper one, so that the mean over neighbours is what no level is.
+// of the way between two levels on it takes the upper one, so that the mean over neighbours lies between the levels,
+// too.
 //
 // The thresholds are those of B. E. Bayer, "An optimum method for two-level rendition of continuous-tone pictures",
 // IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64 once in any 8x8 pixels. Unlike noise they keep the
 // mean over every such block, and are made of integers alone. Colours are rounded to float first: then each step is
-// exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so grey stays grey
-// and what is less in one channel does not become more.
+// exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so grey stays grey,
+// and a darker channel does not become a lighter one.
 
 namespace detail {
 

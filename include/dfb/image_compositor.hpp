@@ -68,8 +68,8 @@ struct InputImage {
 // they work on all threads of config.executor.
 class ImageCompositor {
 public:
-    // Makes a compositor on a connection. config.image: the picture of the display rank. Throws what the constructor of
-    // DistributedFrameBuffer throws.
+    // Makes a compositor on a connection. config.image: the picture of the display rank. Throws as the constructor of
+    // DistributedFrameBuffer.
     ImageCompositor(std::shared_ptr<Connection> connection, ImageBlend blend, FrameBufferConfig config);
 #if defined(DFB_HAS_MPI)
     // Makes a compositor on a connection of its own.
@@ -204,8 +204,8 @@ public:
 
     const Region& valid() const noexcept { return valid_; } // in the picture
 
-    // Returns where the pixels of a tile are; `view` is used for them. What has to be converted is in memory of this
-    // thread, until its next call.
+    // Returns where the pixels of a tile are; `view` is used for them. Pixels that have to be converted are in memory
+    // of this thread until its next call.
     InputPixels find(View& view) const
     {
         const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();

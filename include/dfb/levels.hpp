@@ -114,7 +114,7 @@ public:
     const std::uint32_t* data() const noexcept { return cells_.data(); }
 
 private:
-    static constexpr std::uint32_t edge = 8; // floats; what is looked for is nearer than 2
+    static constexpr std::uint32_t edge = 8; // floats; the threshold is nearer than 2
 
     std::array<std::uint32_t, count> cells_{};
     std::array<double, 256> thresholds_{};
@@ -303,14 +303,15 @@ DFB_AVX2 inline __m256 loadAsFloats(const double* values) noexcept
 // Of as many pixels as there are whole eights, which it returns; the rest is for toLevels(). Rounds in float: the value
 // is off by half an ulp, and so is the product, by 255 * 2^-25 + 2^-17 < 2^-16 together. Where that comes near enough
 // to a tie to matter, or a colour within 2 floats of an sRGB threshold, all eight go through toLevels(). `farthest` is
-// no less than that of toLevels(), and a tie for the same pixels; what is no tie may be up to 2^-15 farther.
+// no less than that of toLevels(), and a tie for the same pixels; a value that is no tie may count as up to 2^-15
+// farther.
 template <bool IsSrgb, class Real>
 DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out, double& farthest) noexcept
 {
     const float off = 0x1p-16f;
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
     const __m256 limit = _mm256_set1_ps(0.5f - 2 * off), low = _mm256_set1_ps(0x1p-13f);
-    // Without the sign; of alpha alone if that is what is linear.
+    // Without the sign; of alpha alone if only that is linear.
     const int noSign = 0x7fffffff, ofColor = IsSrgb ? 0 : noSign;
     const __m256 distanceBits =
         _mm256_castsi256_ps(_mm256_setr_epi32(ofColor, ofColor, ofColor, noSign, ofColor, ofColor, ofColor, noSign));
@@ -362,7 +363,7 @@ DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out,
 }
 #endif
 
-// Levels of `count` premultiplied RGBA pixels, as fast as the processor can. Returns what convertPixels() does.
+// Levels of `count` premultiplied RGBA pixels, as fast as the processor can. Returns the same as convertPixels().
 template <bool IsSrgb, class Real>
 double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
 {

@@ -1,5 +1,5 @@
-// The contract of a pixel operation (PixelOp): what happens to a finished tile on its owner, before it is
-// converted to the output format (section 3.1.2 of the paper).
+// The contract of a pixel operation (PixelOp): it changes a finished tile on its owner, before it is converted to the
+// output format (section 3.1.2 of the paper).
 //
 // A PixelOp is a copyable type; the framebuffer keeps one object per rank and calls process() for several tiles
 // at once.
@@ -30,7 +30,7 @@ struct PixelTile {
     Region region;
     float* color = nullptr;       // 4 a pixel, premultiplied linear RGBA
     const float* depth = nullptr; // 1 a pixel; null unless the image has depth
-    AuxRow aux{};                 // of all pixels; null what the image does not have
+    AuxRow aux{};                 // of all pixels; null if the image does not have it
     std::int64_t frame = 0;       // its number
 
     std::size_t pixelCount() const noexcept

@@ -64,9 +64,9 @@ struct TileInfo {
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
     int emptySamples = 0;                        // those before it, if there was nothing in any: they are background
-    std::uint64_t accumulationId = 0;            // another one: what was accumulated before is of no use
-    float minTransmittance = 0;                  // what lets less through counts as opaque
-    ChannelMask wanted = 0;                      // what the image has beside the colour
+    std::uint64_t accumulationId = 0;            // another one: the samples accumulated before are of no use
+    float minTransmittance = 0;                  // a pixel that lets less through counts as opaque
+    ChannelMask wanted = 0;                      // channels of the image beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
 };
 
@@ -83,7 +83,7 @@ struct AuxRow {
 class FinishedTile {
 public:
     // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
-    // `background`: what is known of these pixels; may be null.
+    // `background`: which of these pixels are known to be background; may be null.
     FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
                  bool dither = false, detail::BackgroundPixels* background = nullptr)
         : region_(region), format_(format), to_(to), stride_(stride), dither_(dither), background_(background)
@@ -256,8 +256,8 @@ public:
         color_.assign(4 * pixels_ * passes_, 0.0);
     }
 
-    // The number of a pixel, for what else an operation keeps of it: 0 to count() - 1. `pass` is TileHeader::pass; x
-    // and y count from the tile's upper left corner.
+    // The number of a pixel, for other values that an operation keeps of it: 0 to count() - 1. `pass` is
+    // TileHeader::pass; x and y count from the tile's upper left corner.
     std::size_t index(int pass, int x, int y) const noexcept
     {
         return static_cast<std::size_t>(pass) * pixels_ + static_cast<std::size_t>(y * width_ + x);

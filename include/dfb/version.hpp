@@ -1,4 +1,4 @@
-// The version of dfb, and what it requires of the compiler.
+// The version of dfb, and its demands on the compiler.
 #pragma once
 
 #define DFB_VERSION_MAJOR 0

@@ -14,8 +14,8 @@ namespace dfb::detail {
 // One per tile; used by one thread at a time.
 class BackgroundPixels {
 public:
-    // To be called for each frame in which the tile is written. `epoch`: as long as it stays the same, what was written
-    // is still there, and the background is stored alike; 0: nothing is known of what will be there.
+    // Call it for each frame in which the tile is written. While `epoch` stays the same, the pixels of the last frame
+    // are still there, and the background is stored alike. 0: the pixels may be anything.
     void newFrame(int width, int height, std::int64_t epoch)
     {
         if (epoch != 0 && epoch == epoch_)

@@ -2,8 +2,8 @@
 // by hand for AVX2; the two give the same bits, as products and sums are the same and rounded one by one.
 //
 // A pixel that nothing comes through any more is blended like the others, unless its whole block is opaque: then the
-// layers behind are left out. That is looked at after the first layer and every fourth from there. Of what is behind,
-// an infinity or a NaN can therefore show in an opaque pixel, or not; nothing that is finite can.
+// layers behind are left out. That is checked after the first layer and every fourth from there. So an infinity or a
+// NaN of a layer behind may show in an opaque pixel, or not. A finite value never does.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -25,8 +25,8 @@ struct BlendGroup {
 
     const float* colors[mostLayers]; // RGBA of the run's first pixel
     int layers = 0;
-    bool isFirst = true;         // the layers are in front of all others: what the pixels hold does not count
-    double minTransmittance = 0; // what lets less through counts as opaque
+    bool isFirst = true;         // the layers are in front of all others: the old pixels do not count
+    double minTransmittance = 0; // a pixel that lets less through counts as opaque
 };
 
 // Up to which layer, of `layers`, to go on after k of them before it is looked whether the pixels are opaque.
@@ -34,7 +34,7 @@ constexpr int nextLook(int k, int layers) noexcept { return std::min(layers, k =
 
 // ---- plain
 
-// A single layer: what it has, in double.
+// A single layer: its values, in double.
 inline void takeLayerPlain(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
 {
     for (int i = 0; i < 4 * count; ++i)
@@ -184,7 +184,7 @@ DFB_AVX2 inline void takeNearestAvx2(float* nearest, int count, const float* col
     takeNearestPlain(nearest + inBlocks, count % 4, color + 4 * inBlocks, depth + inBlocks);
 }
 
-// A pixel is one register, and so is what it lets through, four times.
+// A pixel is one register. Its transmittance is another, four times.
 template <bool HasLeast>
 struct Avx2Pixel {
     __m256d sum, through;
@@ -209,7 +209,7 @@ struct Avx2Pixel {
         const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
         sum = _mm256_add_pd(sum, _mm256_mul_pd(through, v));
         through = _mm256_mul_pd(through, _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff)));
-        if constexpr (HasLeast) // what is less than that becomes 0, a NaN stays
+        if constexpr (HasLeast) // values below it become 0, a NaN stays
             through = _mm256_and_pd(through, _mm256_cmp_pd(through, _mm256_set1_pd(minTransmittance), _CMP_NLT_UQ));
     }
 };

@@ -69,10 +69,10 @@ struct CompositeRow {
     // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
-    double minTransmittance = 0;           // what lets less through counts as opaque
+    double minTransmittance = 0;           // a pixel that lets less through counts as opaque
     bool wantsDepth = true;                // else `depth` is empty
-    bool wantsGaps = true;                 // else what no layer covers need not be cleared
-    bool wantsSingles = true;              // else what a single layer covers need not be there
+    bool wantsGaps = true;                 // else pixels under no layer need not be cleared
+    bool wantsSingles = true;              // else pixels under one layer need not be there
 
     // Sizes it for `width` pixels, of which nothing is known then. `wanted`: of the auxiliary channels. `exactly`: in
     // twice the precision of double.
@@ -114,7 +114,7 @@ struct Layer {
 
 namespace detail {
 
-// Adds to a pixel of a row what is let through of `rgba`, in twice the precision, and darkens what is behind.
+// Blends `rgba` under a pixel of a row, in twice the precision, and lowers the pixel's transmittance.
 inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
 {
     DoubleDouble t{row.transmittance[x], row.transmittanceLow[x]};
@@ -131,7 +131,7 @@ inline void overExactly(CompositeRow& row, std::size_t x, const float* rgba)
 
 } // namespace detail
 
-// Composites `count` pixels of a layer under what is already in `row` at pixels [x, x + count).
+// Composites `count` pixels of a layer under the pixels [x, x + count) of `row`.
 inline void over(CompositeRow& row, int x, int count, const Layer& layer)
 {
     const bool exactly = !row.rgbaLow.empty();
@@ -152,8 +152,7 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         detail::takeNearestPlain(row.depth.data() + x, count, layer.color, layer.depth); // often one pixel
 }
 
-// Makes those of `count` pixels from x on opaque that count as such. True if nothing of what is behind any of them can
-// be seen.
+// Makes those of `count` pixels from x on opaque that count as opaque. True if no layer behind any of them can be seen.
 inline bool closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
@@ -398,8 +397,8 @@ inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vec
 
 // Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to
 // back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
-// without depth makes all depths count as equal. `order` is scratch space; with `orderIsKept`, which is quicker, it is
-// what the last call left of it.
+// without depth makes all depths count as equal. `order` is scratch space; with `orderIsKept`, which is quicker, it
+// holds the order that the last call left.
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order,
                          bool orderIsKept = false)
 {

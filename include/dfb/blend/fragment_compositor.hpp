@@ -48,7 +48,7 @@ public:
     }
 
     // Composites the next row of all fragments into `row`, which has been sized for the region's width. With
-    // row.wantsGaps or row.wantsSingles false only what runs() says is there then.
+    // row.wantsGaps or row.wantsSingles false only the pixels that runs() names are there then.
     void nextRow(CompositeRow& row)
     {
         runs_.clear();
@@ -103,7 +103,7 @@ private:
     bool takeRows(bool wantsAux)
     {
         bool isOneRun = true;
-        active_.resize(cursors_.size()); // filled in place: copying what was just written piece by piece is slow
+        active_.resize(cursors_.size()); // filled in place: copying values that were just written is slow
         std::size_t rows = 0;
         for (FragmentCursor& cursor : cursors_) {
             FragmentRow& r = active_[rows];

@@ -69,7 +69,7 @@ DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, i
         for (int k = 0; k + 1 < order.layers; ++k) {
             const __m256 back = _mm256_maskload_ps(depths[k + 1] + x, lanes);
             _mm_prefetch(reinterpret_cast<const char*>(depths[k + 1] + x + 128), _MM_HINT_T0); // rows to come
-            // Without a branch, as who wins is random where depths are.
+            // Without a branch, as the winner is random where depths are.
             const __m256 losesTies = _mm256_castsi256_ps(_mm256_set1_epi32(order.losesTies[k]));
             wrong = _mm256_or_ps(wrong, _mm256_cmp_ps(front, back, _CMP_NLE_UQ));
             wrong = _mm256_or_ps(wrong, _mm256_and_ps(losesTies, _mm256_cmp_ps(front, back, _CMP_EQ_OQ)));
@@ -96,7 +96,8 @@ inline int firstOutOfOrder(const OrderedDepths& order, int begin, int end)
 // ---- sorting four pixels at once
 
 // Batcher's odd-even merge sort (1968): which two places to compare and exchange, one after the other, whatever is in
-// them. Of the network for the next power of 2, what is beyond the layers would be the largest already and is left out.
+// them. Of the network for the next power of 2, the places beyond the layers would hold the largest already and are
+// left out.
 class SortNetwork {
 public:
     static constexpr int mostLayers = 128;
@@ -138,7 +139,7 @@ using FourOrders = std::uint32_t[SortNetwork::mostLayers][4];
 // Sorting moves one number for a layer: its depth as a double, whose last 29 bits are 0, with its index in there. That
 // orders by depth, then index: among negative numbers more bits are less, so that the index is complemented there.
 // Infinities become numbers, as with more bits they were NaN; both zeros become the same one, which is less than all
-// that is above 0; a NaN becomes what infinity does.
+// that is above 0; a NaN counts as infinity.
 constexpr double infinityKey = 0x1p200, zeroKey = 0x1p-200;
 constexpr std::int64_t layerBits = SortNetwork::mostLayers - 1;
 

@@ -118,7 +118,7 @@ public:
         if (left_ > 0)
             fail("a control message is too long", 0);
     }
-    // Throws Error (MalformedMessage) unless what was read can be.
+    // Throws Error (MalformedMessage) unless the value read is a possible one.
     void require(bool canBe) const
     {
         if (!canBe)

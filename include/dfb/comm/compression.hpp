@@ -42,8 +42,8 @@ enum class CompressionMode : std::uint8_t {
 
 } // namespace dfb
 
-// CompressionGains: for which ranks the messages of this one become smaller by being compressed. What goes to one can
-// be noise, and to another all alike.
+// CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
+// noise, those for another all alike.
 
 namespace dfb::detail {
 
@@ -99,12 +99,12 @@ private:
     std::vector<Peer> peers_;
 };
 
-// CompressionTrial: whether a framebuffer's messages are worth compressing, found out by trying: what a network, a
-// codec and the cores beside them do together no formula knows.
+// CompressionTrial: whether a framebuffer's messages are worth compressing, found out by trying, because no formula
+// knows how a network, a codec and the cores work together.
 //
-// Ranks that are told the same times choose the same. To begin with, frames with and without take turns. Then those of
-// the better kind are made, and of the other one a few now and then, more and more seldom, and when frames have become
-// much slower or faster. Only who was better by a tenth replaces the other.
+// Ranks that are told the same times choose the same. To begin with, frames with and without compression take turns.
+// Then the better kind is used. The other is tried again now and then, more and more seldom, and when frames have
+// become much slower or faster. It must be better by a tenth to replace the first.
 class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.

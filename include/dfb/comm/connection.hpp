@@ -32,7 +32,7 @@ namespace dfb {
 // How messages travel between ranks, for all framebuffers and walls of a connection. `checksums` must be the same on
 // all ranks; the first object that is made on the connection checks it.
 struct NetworkConfig {
-    Progress progress = Progress::Auto; // who moves messages
+    Progress progress = Progress::Auto; // which calls or thread move messages
     // True: each message carries a CRC-32C, for networks that are not trusted. Costs a pass over each message.
     bool checksums = false;
     // True: ranks of one node hand messages over in memory that both see. False: all messages go through MPI.
@@ -544,7 +544,7 @@ private:
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::vector<Receiver> receivers_;
     std::vector<Early> early_;                       // for receivers to come
-    std::optional<std::pair<int, ErrorInfo>> stray_; // what was malformed when there was no receiver
+    std::optional<std::pair<int, ErrorInfo>> stray_; // the malformed message that came before its receiver
     std::uint32_t addresses_ = 0;
     int expecting_ = 0;
 
@@ -556,7 +556,7 @@ private:
                              [this](Clock::time_point now) { beat(now, progress_.expectsMessages()); }};
 };
 
-// Connects the ranks of a communicator. Collective, as is the destruction of what it returns. Waits for all ranks.
+// Connects the ranks of a communicator. Collective, as is the destruction of the connection. Waits for all ranks.
 // Throws TransportError.
 template <class Transport = MpiTransport>
 std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})

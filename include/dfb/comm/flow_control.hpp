@@ -1,8 +1,8 @@
 // FlowControl: how much a rank may send to another before that one has room again: credit in bytes, from one
 // pool per receiver.
 //
-// Each sender has a part of half the pool without asking. What is more it asks for (CreditRequest) and gets from the
-// other half, in the order of asking and always for whole messages, so that what is granted is used and comes back. A
+// Each sender has a part of half the pool without asking. It asks for more (CreditRequest) and gets it from the other
+// half, in the order of asking and always for whole messages, so that credit that is granted is used and comes back. A
 // credit returns when the receiver has taken the message out of its inbox. Thus the messages on the way to a rank and
 // in its inbox never exceed its pool, however many senders there are. Counts are running totals within an epoch (a
 // frame): a Credit that overtakes another does no harm, and nothing that got lost outlives its epoch.
@@ -64,8 +64,8 @@ public:
         matters_ = nullptr;
     }
 
-    // From now on nothing of this epoch matters but what `matters(message)`: forgets the rest of what waits, and does
-    // not keep it when it comes.
+    // From now on only messages of this epoch count for which `matters(message)` is true. Forgets the others that wait,
+    // and drops those that still come.
     void drop(std::function<bool(const Buffer&)> matters)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -126,7 +126,7 @@ public:
         return underWay_;
     }
 
-    // In words: who has not taken how much.
+    // In words: which ranks have not taken how much.
     std::string notTaken() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -138,7 +138,7 @@ public:
         return text;
     }
 
-    // Throws Error (MalformedMessage) for more than its pool, and for what was not sent.
+    // Throws Error (MalformedMessage) for more bytes than its pool, or than were sent.
     void credited(int from, const Credit& credit)
     {
         if (credit.granted > credit.consumed && credit.granted - credit.consumed > pool_)
@@ -156,7 +156,7 @@ public:
             underWay_ -= more;
         }
         for (;;) {
-            if (out.granted >= out.askedFor) // each time: others may have asked for what has just been sent
+            if (out.granted >= out.askedFor) // each time: the last message may have made room
                 out.asked = false;
             if (out.queue.empty() || out.sent + out.queue.front().size() > out.granted)
                 break;
@@ -199,14 +199,15 @@ public:
         in.consumed += byteCount;
         inboxBytes_ -= byteCount;
         updateExtra(in);
-        // Not for each message; but what no sender is told of must stay below a part of its pool, as it may be waiting.
+        // Not for each message. But the bytes that no sender has been told of must stay below its part of the pool, as
+        // it may be waiting for them.
         if (in.consumed - in.told >= allowance_ / 2)
             grant(source, in, in.consumed + allowance_);
         serve(lock);
     }
 
-    // Throws Error (MalformedMessage) for what could never be met: others would wait behind it. An honest sender has
-    // sent no more than it was granted, and asks for one message at least.
+    // Throws Error (MalformedMessage) for a request that could never be met: others would wait behind it. An honest
+    // sender has sent no more than it was granted, and asks for one message at least.
     void requested(int source, const Request& request)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -253,7 +254,7 @@ private:
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
         std::uint64_t told = 0;                  // of consumed
-        std::uint64_t extra = 0;                 // of what is granted and not consumed, that beyond the allowance
+        std::uint64_t extra = 0;                 // granted beyond the allowance and not consumed
         Request request;
         bool asks = false;
 
@@ -327,7 +328,7 @@ private:
         grants_.push({source, {in.granted, in.consumed}});
     }
 
-    // Answers who has asked, the first one first, as far as the pool reaches; then tells what was granted.
+    // Answers the senders that have asked, the first one first, as far as the pool reaches; then tells them.
     void serve(std::unique_lock<std::mutex>& lock)
     {
         while (!asking_.empty()) {

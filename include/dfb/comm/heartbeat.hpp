@@ -69,9 +69,9 @@ public:
         int lost = -1; // nothing has been heard of this rank for the whole time-out
     };
 
-    // Returns what is due, for a rank that has polled since the last call. Time counts only while the rank is
-    // `expecting` messages. It does not count after a long time without a call: this rank was then held up itself, and
-    // messages of the others may still wait to be received.
+    // Returns the messages that are due, for a rank that has polled since the last call. Time counts only while the
+    // rank is `expecting` messages. It does not count after a long time without a call: this rank was then held up
+    // itself, and messages of the others may still wait to be received.
     Due due(Time now, bool expecting)
     {
         const bool wasHere = isExpecting_ && now - last_ <= patience();

@@ -84,7 +84,7 @@ public:
         isEnding_ = true;
         while (tasks_ > 0) {
             lock.unlock();
-            const bool did = executor_->help(); // who else would, if it has no workers?
+            const bool did = executor_->help(); // nobody else does if it has no workers
             lock.lock();
             if (!did)
                 changed_.wait_for(lock, std::chrono::milliseconds(2), [this] { return tasks_ == 0; });
@@ -325,7 +325,7 @@ public:
             // tree.
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
-                // Before a task, as other ranks may wait for what this one has queued.
+                // Before a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
                 if (!executor_->help() && !moved && !over())
                     connection_->nap(std::chrono::microseconds(50));
@@ -352,7 +352,7 @@ public:
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         const std::int64_t number = reductionCount_++;
-        auto damage = takeDamage(); // now: when the others have this rank's part, they may go on to what comes after
+        auto damage = takeDamage(); // now: the others go on when they have this rank's part
         connection_->expectMessages(true);
         try {
             try {
@@ -362,7 +362,7 @@ public:
                                       result->there = true;
                                       notify();
                                   });
-            } catch (const Error& e) { // of what ranks below in the tree have sent before
+            } catch (const Error& e) { // from an earlier message of a rank below in the tree
                 ErrorInfo error = e.info();
                 error.rank = rank();
                 connection_->giveUp(error);
@@ -426,8 +426,8 @@ public:
     }
 
 private:
-    // A message that could not be read may have been a part of this, for which others may not be here yet, or of what
-    // comes after, if they are through. The first one is what its owner's constructor does. `damage`: from before.
+    // A message that could not be read may have been a part of this reduction, if others are not here yet, or of the
+    // next, if they are through. The first reduction is that of its owner's constructor. `damage`: from before.
     void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here

@@ -109,7 +109,7 @@ enum class MessageKind : std::uint8_t {
     ReduceUp,      // a partial result of a reduction
     ReduceDown,    // its result
     Fragment,      // an input of a tile, to its owner
-    Manifest,      // what a rank will send to this owner
+    Manifest,      // the inputs that a rank will send to this owner
     ManifestAck,   // the owner has it
     FinishedTiles, // a batch, to the display rank
     TilesDone,     // how many finished tiles a rank has for the display rank, and which it has put into the image
@@ -119,7 +119,7 @@ enum class MessageKind : std::uint8_t {
     JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
     Jobs,          // a range of them
     ImagePlace,    // where in shared memory the image of the display rank lies
-    Failure,       // the sender's connection cannot go on, nor can anybody who waits for it
+    Failure,       // the sender's connection cannot go on, nor can ranks that wait for it
     AreYouThere,   // to be answered at once with the next
     Present,       // the sender is there, and answers whenever it is asked
     Hidden         // from which generation on inputs of a tile cannot be seen

@@ -78,7 +78,7 @@ private:
     }
 
     // Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
-    // second at most. Then waits for the launcher: it may drop what a rank has written just before MPI_Abort.
+    // second at most. Then waits for the launcher: it may drop output that a rank has written just before MPI_Abort.
     static void abortJob()
     {
         int finalized = 0, done = 0;
@@ -106,8 +106,8 @@ private:
     }
 
     // MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
-    // what it has left in its connections, but one that has got further answers no more. With no connection in use,
-    // and nothing new on them for a while, it does not.
+    // the rest in its connections, but a rank that has got further answers no more. With no connection in use, and
+    // nothing new on them for a while, it does not.
     void partFromAll()
     {
         if (size_ == 1)

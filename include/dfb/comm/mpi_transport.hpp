@@ -1,8 +1,8 @@
 // MpiTransport: ranks are MPI processes. The only header that includes mpi.h.
 //
-// All MPI calls are made by the constructor, poll() and stop(), and none of them blocks (MPI libraries spin while they
-// block): what has to wait tests and naps. Works on a duplicate of the caller's communicator; never initialises or
-// finalises MPI.
+// All MPI calls are made by the constructor, poll() and stop(), and none of them blocks, because MPI libraries spin
+// while they block: a caller that has to wait tests and naps. Works on a duplicate of the caller's communicator; never
+// initialises or finalises MPI.
 //
 // Small messages to one rank travel together, in packets (comm/packet.hpp) of at most 8 KiB, which the libraries send
 // without asking the receiver first. A larger message is announced in a packet. To a rank of the same node the packet
@@ -92,14 +92,14 @@ public:
     using Communicator = MPI_Comm;
     static constexpr const char* name = "mpi";
 
-    static constexpr int postedPackets = 8;                         // receives; together they are what is said above
-    static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // what is sent with one call: counts are ints
+    static constexpr int postedPackets = 8;                         // receives; their memory is said above
+    static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
     // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
     // below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all ranks if they were built with different packet
-    // formats, or if one of them cannot make its transport, with its rank and what has failed there. The others can
-    // not be told, and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result.
-    // Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
+    // formats, or if one of them cannot make its transport, with its rank and the reason. The others cannot be told,
+    // and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result. Below
+    // MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
@@ -236,7 +236,7 @@ public:
     {
         std::fprintf(stderr, "%s\n", text.c_str());
         std::fflush(stderr);
-        std::this_thread::sleep_for(std::chrono::milliseconds(500)); // launchers drop what they have not passed on yet
+        std::this_thread::sleep_for(std::chrono::milliseconds(500)); // launchers drop output not passed on yet
         MPI_Abort(MPI_COMM_WORLD, 1);
         std::abort(); // it should not return
     }
@@ -449,7 +449,7 @@ private:
 
     using Record = detail::PacketRecord;
 
-    // Bytes that MPI has in hand. What is longer than a chunk goes on when the chunk has gone.
+    // Bytes that MPI has in hand. A longer message goes on when its chunk has gone.
     struct Transfer {
         Buffer data;
         std::size_t offset = 0; // of the chunk
@@ -516,7 +516,7 @@ private:
             handler_->fail(error);
     }
 
-    // As far as it can be done: MPI itself may be what has failed.
+    // As far as it can be done: MPI itself may have failed.
     void tellFailure(const std::string& text)
     {
         try {
@@ -849,7 +849,7 @@ private:
 
     // --- the end
 
-    // False if the handler has failed: then what it waits for may never be.
+    // False if the handler has failed: then the event that it waits for may never come.
     bool moveUntil(detail::FunctionRef<bool()> done)
     {
         for (detail::Patience patience; !done();) {
@@ -937,8 +937,8 @@ private:
         }
     }
 
-    // MPI may still use the buffers, and freeing a communicator is collective: what cannot be taken back is left to
-    // it.
+    // MPI may still use the buffers, and freeing a communicator is collective: requests that cannot be taken back are
+    // left to it.
     void abandon()
     {
         int finalized = 0, done = 0;

@@ -40,7 +40,7 @@ public:
     public:
         explicit Listener(Bell& bell) : bell_(bell), heard_(bell.word_.load()), seen_(bell.word_.load()) {}
 
-        // Before it looks for messages: what was rung up to now needs no nap to end.
+        // Before it looks for messages: rings up to now need not end a nap.
         void look() noexcept { heard_ = bell_.word_.load(); }
 
         // Naps for `limit`, or until it is interrupted, or with `isAwaiting` until a rank rings. Ends at once if either

@@ -70,7 +70,8 @@ private:
 };
 
 // Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the
-// bytes, which need not be trusted, are no packet: then what came before has been visited. An empty packet is one.
+// bytes, which need not be trusted, are no packet: then the records before that have been visited. An empty packet is
+// one.
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
 {

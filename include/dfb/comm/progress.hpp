@@ -1,6 +1,6 @@
 // ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a
 // few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
-// In between it calls who wants to look at the clock.
+// In between it calls objects that look at the clock.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -83,7 +83,7 @@ private:
     static constexpr std::chrono::microseconds pollTime{5};
 
     // Waking up costs some 10 us of a core, which rendering threads lose. While nobody waits here, a message that is
-    // taken a little later delays nobody; what this rank sends interrupts the nap anyway.
+    // taken a little later delays nobody; a message that this rank sends ends the nap anyway.
     Clock::duration napAfter(Clock::duration idle, bool quiet) const
     {
         using std::chrono::microseconds;

@@ -1,4 +1,4 @@
-// Quiescence: whether anything is still under way among ranks that all wait: if not, what they wait for never comes.
+// Quiescence: whether anything is still under way among ranks that all wait. If not, they would wait for ever.
 //
 // They look together, in rounds. In each a rank says once, at a moment at which it rests, how many messages it has sent
 // and how many it has taken that make a rank go on. A rank that has something to do lets the others wait with that. If

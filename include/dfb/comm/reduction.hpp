@@ -22,7 +22,7 @@
 namespace dfb {
 
 struct ReductionKey {
-    std::uint32_t scope = 0; // what it is for
+    std::uint32_t scope = 0; // its purpose
     std::int64_t number = 0; // which one
     bool operator==(const ReductionKey& o) const { return scope == o.scope && number == o.number; }
 };
@@ -47,8 +47,8 @@ public:
         }
     }
 
-    // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1:
-    // what follows is a text, on arrays that are not equally long. Throws Error (MalformedMessage).
+    // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1: a
+    // text follows, on arrays that are not equally long. Throws Error (MalformedMessage).
     template <class Operation>
     static Bytes combineElements(const Bytes& a, const Bytes& b, Operation operation)
     {
@@ -86,7 +86,7 @@ public:
         advance(lock, state);
     }
 
-    // Throws Error (MalformedMessage) for what the tree has no place for, and what `combine` throws.
+    // Throws Error (MalformedMessage) for a message that has no place in the tree, and the exceptions of `combine`.
     void receive(int source, const ReductionKey& key, bool up, Bytes bytes)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -140,7 +140,7 @@ public:
         return parts;
     }
 
-    // Drops what is known of this scope up to `number`, now and when it comes later.
+    // Drops the parts of this scope up to `number`, now and when they come later.
     void forget(std::uint32_t scope, std::int64_t number)
     {
         std::lock_guard<std::mutex> lock(mutex_);
@@ -198,7 +198,7 @@ private:
     {
         if (!hasAll(state))
             return;
-        // In order of rank, so that the result does not depend on who came first.
+        // In order of rank, so that the result does not depend on the order of arrival.
         std::sort(state.parts.begin(), state.parts.end(),
                   [](const auto& a, const auto& b) { return a.first < b.first; });
         Bytes result = std::move(state.parts.front().second);

@@ -83,8 +83,8 @@ enum class Progress {
     Caller
 };
 
-// Gets what a transport delivers. Its members are quick and never block. Any thread may call them. They must not call
-// the transport.
+// Gets the messages that a transport delivers. Its members are quick and never block. Any thread may call them. They
+// must not call the transport.
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;

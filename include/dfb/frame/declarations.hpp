@@ -72,7 +72,7 @@ private:
 
 class Declarations {
 public:
-    // `lastHolds`: what was declared up to the last frame has arrived at all owners. It must be the same on all ranks.
+    // `lastHolds`: the declarations up to the last frame have arrived at all owners. It must be the same on all ranks.
     // False: all of it is forgotten.
     void newFrame(bool lastHolds)
     {
@@ -88,8 +88,8 @@ public:
         declared_ = isComplete_ = false;
     }
 
-    // Takes note of what this rank will send: calls send(owner, bytes) for each other owner for which it has changed.
-    // `ownerOf(tile)` gives the owner. Returns whether answers are to come. By one thread at a time.
+    // Takes note of the inputs that this rank will send: calls send(owner, bytes) for each other owner whose inputs
+    // have changed. `ownerOf(tile)` gives the owner. Returns whether answers are to come. By one thread at a time.
     template <class OwnerOf, class Send>
     bool declare(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
     {
@@ -195,7 +195,7 @@ public:
         return declared_;
     }
 
-    // Per owned tile what will come. To be read after complete().
+    // The inputs that will come, per owned tile. Read it after complete().
     const ExpectedInputs& expected() const { return expected_; }
 
 private:
@@ -236,13 +236,13 @@ private:
     mutable std::mutex mutex_;
     ExpectedInputs expected_;                  // since the last complete()
     std::vector<int> changedRanks_;            // of those that have told this owner something new in this frame
-    std::vector<ExpectedInput> changedInputs_; // what it is
+    std::vector<ExpectedInput> changedInputs_; // their new inputs
     std::vector<int> acksMissing_;             // of these owners
     bool declared_ = false, isComplete_ = false;
 
     // Only declare() and newFrame() use them.
     std::vector<TileInput> mine_;          // as it was declared last
-    std::vector<Addressed> told_, toTell_; // the same by owner; what replaces it
+    std::vector<Addressed> told_, toTell_; // by owner: told in the last frame; its successor
     std::vector<Part> news_;               // the parts of toTell_ that are not as in told_
     ByteWriter manifest_;                  // for one owner
 };

@@ -1,5 +1,5 @@
-// Engine: what is behind the door of a framebuffer: frames of one set of tiles, with operations of any type. What it
-// is made of is in frame/frame_engine.hpp, which a program that links dfb::compiled does not compile.
+// Engine: the inside of a framebuffer: frames of one set of tiles, with operations of any type. What it is made of is
+// in frame/frame_engine.hpp, which a program that links dfb::compiled does not compile.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -43,7 +43,7 @@ public:
     virtual void begin(const FrameConfig& params) = 0;
     virtual std::int64_t frame() const noexcept = 0; // the number of the one that has begun last
     virtual TileHeader headerOf(int tile, int pass) const = 0;
-    virtual ChannelMask sent() const noexcept = 0; // what of the inputs travels in this frame
+    virtual ChannelMask sent() const noexcept = 0; // the channels of inputs that travel in this frame
     virtual void setTile(const InputPixels& tile) = 0;
     virtual bool isHidden(int tile, int generation) const = 0;
     virtual bool opaqueHides(int tile) const = 0;
@@ -62,11 +62,11 @@ public:
     virtual void requireProgress() const = 0;
     virtual bool isDone() = 0;
     virtual FrameReport end() = 0;
-    virtual void leave() noexcept = 0; // in place of end(), by who throws
+    virtual void leave() noexcept = 0; // in place of end(), when an exception passes
 };
 
-// Collective. `operations` must live as long as what it returns; `slot`: which of config.framesInFlight engines this
-// is. Throws as the constructor of DistributedFrameBuffer does.
+// Collective. `operations` must live as long as the engine; `slot`: which of config.framesInFlight engines this is.
+// Throws as the constructor of DistributedFrameBuffer does.
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot);
 

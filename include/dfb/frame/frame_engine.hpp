@@ -1,4 +1,4 @@
-// FrameEngine: what DistributedFrameBuffer does behind its interface: it joins the tile pipeline, the messaging
+// FrameEngine: the work of DistributedFrameBuffer behind its interface: it joins the tile pipeline, the messaging
 // layer, the declarations and the verdict into frames.
 #pragma once
 
@@ -91,7 +91,7 @@ public:
         }
         const auto all = agree(*mailbox_, mine);
         if (!all.fine) {
-            mailbox_->stop(); // what has come already is for this object, as long as it is whole
+            mailbox_->stop(); // messages that have come are handled while this object is whole
             jobs_.reset();
             outcome_.reset();
             mailbox_.reset(); // before the exception passes: all ranks throw it, so this end is in order
@@ -272,12 +272,12 @@ public:
         Executor& executor = mailbox_->executor();
         while (!executor.hasWorkers() && executor.help()) {
             did = true;
-            mailbox_->connection().poll(); // other ranks may wait for what this one has queued
+            mailbox_->connection().poll(); // other ranks may wait for messages that this one has queued
         }
         return did;
     }
 
-    // Where nobody else does, for a renderer that does not call poll(). What takes no time gets on quicker without.
+    // Polls where no thread does, for a renderer that does not call poll(). Not at each call, as a poll takes time.
     void pollNowAndThen()
     {
         if (!mailbox_->connection().needsCaller() && mailbox_->executor().hasWorkers())
@@ -427,7 +427,7 @@ private:
     }
 
     // Lets messages of the frame in. `tiles`: that this rank expects to finish, beside those of `withoutSamples`, of
-    // which the pixel operation sees what is there.
+    // which the pixel operation sees the pixels that are there.
     void open(const std::exception_ptr& userError, std::int64_t tiles, const std::vector<int>& withoutSamples)
     {
         auto& early = open_.open();
@@ -630,8 +630,8 @@ private:
             saysInPlace(message), source == rank() ? -1 : source);
     }
 
-    // Takes an input by `take(where, arrival)`; `where` says what is known of the place. `source`: the rank whose
-    // message it is, or -1.
+    // Takes an input by `take(where, arrival)`; `where` says which place is known. `source`: the rank whose message it
+    // is, or -1.
     template <class Take>
     void arrive(const Take& take, bool isInPlace, int source = -1)
     {
@@ -683,7 +683,7 @@ private:
         outcome_->tryVote();
     }
 
-    // ---- what is expected, by manifest
+    // ---- inputs that are expected, by manifest
 
     void enterAllDeclared()
     {
@@ -697,7 +697,7 @@ private:
             });
     }
 
-    // Every manifest is here: now it is known what each owned tile waits for.
+    // Every manifest is here, so the inputs of each owned tile are known.
     void applyDeclarations()
     {
         declarations_.complete();
@@ -781,7 +781,7 @@ private:
             failArgument("a least transmittance of %f", config_.minTransmittance);
     }
 
-    // Whether what the last frame left behind is of use.
+    // Whether the state that the last frame left is of use.
     bool accumulates(const FrameConfig& params) const
     {
         return traits().keepsState && !outcome_->lastFailed() && params.accumulationId == lastAccumulationId_;

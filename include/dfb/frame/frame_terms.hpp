@@ -1,4 +1,4 @@
-// FrameTerms: what a frame was begun with, as far as it must be the same on all ranks; and which of it is not.
+// FrameTerms: the parameters of a frame that must be equal on all ranks, and a search for those that are not.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -27,7 +27,7 @@ struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan
     std::uint64_t accumulationId = 0;
-    std::array<std::uint32_t, 4> background{}; // bits: what is no number is the same as itself
+    std::array<std::uint32_t, 4> background{}; // bits: so that a NaN equals itself
     std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
     std::int32_t declared = 0, allowPartial = 0;
     std::int32_t rank = 0; // whose; the lowest of those that are alike

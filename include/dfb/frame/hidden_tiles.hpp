@@ -12,10 +12,10 @@
 
 namespace dfb::detail {
 
-// One per rank: what it has heard. newFrame() apart, members may be called from any thread.
+// One per rank: the words that it has heard. Any thread may call the members, but newFrame().
 class HiddenTiles {
 public:
-    // What an input does with those behind it.
+    // What an input does to those behind it.
     enum class Word : std::int32_t {
         Hides,
         MayHide, // it did so in the last frame; Hides or Shows follows

@@ -1,5 +1,5 @@
 // The jobs of a frame that every rank could do, half of them shared out beforehand, the other half on demand (guided
-// self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with what is left. JobShare has the numbers,
+// self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with the work that is left. JobShare has the numbers,
 // JobExchange the messages.
 #pragma once
 

@@ -30,7 +30,7 @@ enum class FrameState : std::uint8_t {
     Finishing, // end() waits for the tiles that this rank owns and, on the display rank, for those of the others
     Failed,    // on this rank or another; this rank has not voted yet
     Voted,     // this rank has said how the frame went for it, and waits for the others
-    Decided    // all ranks have: what still runs may come to its end
+    Decided    // all ranks have: running work may come to its end
 };
 
 // All members may be called from any thread, but for open(), finish() and close(): one at a time.
@@ -134,8 +134,8 @@ public:
             state_ = FrameState::Decided;
     }
 
-    // Lets nothing more in, and waits until all have left. `help()` runs what some of them may be waiting for, and is
-    // false if there is nothing.
+    // Lets nothing more in, and waits until all have left. `help()` runs work that some of them may be waiting for, and
+    // is false if there is nothing.
     template <class Help>
     void close(const Help& help)
     {
@@ -187,10 +187,10 @@ public:
     }
     bool areTilesKnown() const noexcept { return areTilesKnown_; }
     bool areTilesFinished() const noexcept { return areTilesFinished_; }
-    // To be called when what the last of them leaves to do is done, before vote().
+    // Call it when the work that the last of them leaves is done, before vote().
     void setTilesFinished() noexcept { areTilesFinished_ = true; }
 
-    // ---- what belongs to it
+    // ---- entering and leaving
 
     enum class Entry : std::uint8_t {
         Inside, // it may be worked on now; leave() must follow
@@ -235,7 +235,7 @@ public:
         return isOpen;
     }
 
-    // Once more, by somebody who is inside, for work that goes on after he has left: close() waits for that, too, also
+    // Enters once more from inside, for work that goes on after the caller has left: close() waits for that, too, also
     // if it has begun to wait already.
     void enterAgain()
     {

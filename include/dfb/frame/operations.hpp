@@ -1,4 +1,4 @@
-// Operations: a tile operation and a pixel operation of any type, behind one abstract class. What uses it is no
+// Operations: a tile operation and a pixel operation of any type, behind one abstract class. Code that uses it is no
 // template: it costs a virtual call per input and a few per tile, while the loops over pixels stay in the operation.
 #pragma once
 
@@ -63,8 +63,8 @@ public:
 
     const OperationTraits& traits() const noexcept { return traits_; }
 
-    // With copies of what was given to begin(). Throws what copying it and the pixel operation throw. No other member
-    // may be running.
+    // With copies of the data given to begin(). Throws the exceptions of the copies and of the pixel operation. No
+    // other member may be running.
     virtual void newFrame() = 0;
     // Must not live longer than this object.
     virtual std::unique_ptr<TileStage> makeTile() const = 0;

@@ -37,7 +37,7 @@ public:
     }
 
     struct Terms {
-        FrameTerms terms; // what all ranks must have in common
+        FrameTerms terms; // equal on all ranks
         bool declared = false, allowPartial = false;
         std::chrono::milliseconds timeout{0}; // 0: none
         std::chrono::milliseconds quiet{1};   // until the first look whether anything is under way
@@ -59,8 +59,8 @@ public:
 
     // ---- failure
 
-    // Runs `body`; what it throws makes the frame fail. `where` says what is known of the place by then, `source` whose
-    // message it was about, or -1. False if it did throw.
+    // Runs `body`; an exception makes the frame fail. `where` says which place is known by then, `source` whose message
+    // it was about, or -1. False if it did throw.
     bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {}, int source = -1)
     {
         try {
@@ -101,7 +101,7 @@ public:
     }
     bool failWhole(const std::exception_ptr& reason) { return failWhole(errorInfoOf(reason, {})); }
 
-    // The frame has failed: what has not left matters no more, unless what is finished is wanted.
+    // The frame has failed: messages that have not left count no more, unless finished tiles are wanted.
     void dropRest()
     {
         mailbox_.flow().drop([this](const Buffer& message) {
@@ -157,7 +157,7 @@ public:
         tryVote();
     }
 
-    // Whether conclude() need not wait for the verdict. Does what has to be done while it is waited for.
+    // Whether conclude() need not wait for the verdict. Does the work of a rank that waits for it.
     bool isConcluded()
     {
         const auto now = Clock::now();
@@ -209,7 +209,7 @@ public:
     }
 
 private:
-    // So long end() waits between two looks at what nobody tells it.
+    // How long end() waits between two looks at things that no message tells.
     static constexpr std::chrono::milliseconds untilAsked{2000};
 
     ReductionKey verdictKey() const { return {FrameVerdict, frame_.number()}; }
@@ -221,7 +221,7 @@ private:
         return info;
     }
 
-    // Whether a frame that may be partial goes on without what this was about.
+    // Whether a frame that may be partial goes on without the tile of this error.
     bool isBearable(ErrorKind kind) const
     {
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
@@ -246,7 +246,7 @@ private:
         std::optional<ErrorInfo> mine;
         if (isMissing(info.kind)) {
             if (!failed())
-                mine = missing(info.kind);  // this rank's part of what is missing
+                mine = missing(info.kind);  // this rank's part of the text
             info.tile = info.expected = -1; // it must not pass for the list of the rank that it came from
         }
         frame_.failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
@@ -306,7 +306,8 @@ private:
         return mailbox_.wait(isDecided, deadline) ? &*verdict_ : nullptr;
     }
 
-    // The verdict, or a frame that fails for what is missing, or, if even that cannot be agreed on, TransportError.
+    // Returns the verdict. Makes the frame fail for missing inputs. Throws TransportError if the ranks cannot even
+    // agree on that.
     Verdict waitInTime()
     {
         if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout))
@@ -361,7 +362,7 @@ private:
     {
         const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
         const bool hasLimit = terms_.timeout.count() > 0;
-        if (!hasLimit) // but what could not be read does not come again
+        if (!hasLimit) // a message that could not be read does not come again
             mailbox_.wait([&] { return areThere() || frame_.isDamaged(); });
         mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout : untilAsked));
     }
@@ -413,9 +414,9 @@ private:
                                     });
     }
 
-    // ---- what is missing
+    // ---- missing inputs
 
-    // Returns an error of this kind that names what this rank waits for.
+    // Returns an error of this kind that names the inputs this rank waits for.
     ErrorInfo missing(ErrorKind kind)
     {
         ErrorInfo info;

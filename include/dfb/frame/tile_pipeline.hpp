@@ -77,8 +77,8 @@ public:
     const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running.
-    // `compresses`: whether finished tiles are compressed. Throws what user code throws: then all is ready but its
-    // data.
+    // `compresses`: whether finished tiles are compressed. Throws the exceptions of user code: then all is ready but
+    // its data.
     void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses)
     {
         faults_.reset();
@@ -100,7 +100,7 @@ public:
 
     ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame
 
-    // Throws InvalidArgument if there is a colour but not what else has to travel.
+    // Throws InvalidArgument if there is a colour but another channel that must travel is missing.
     void checkPlanes(const InputPixels& tile) const
     {
         const ConstPlanes& planes = tile.planes();
@@ -195,7 +195,7 @@ public:
         return -1;
     }
 
-    // Takes an input of rank `from`. `where` gets what is known of the place: the tile. See TileTable::arrive() for the
+    // Takes an input of rank `from`. `where` gets the tile as soon as it is known. See TileTable::arrive() for the
     // rest.
     void arrive(Buffer&& message, int from, const SharedBytes& sharedBytes, ErrorInfo& where,
                 TileTable::Arrival& arrival)
@@ -265,7 +265,7 @@ public:
     }
     WireFormat wireColor() const noexcept { return wireColor_; }
 
-    // Runs the pixel operation on the background. Throws what it throws.
+    // Runs the pixel operation on the background. Throws its exceptions.
     void finishBackground()
     {
         if (!traits().pixelOpIsPointwise)

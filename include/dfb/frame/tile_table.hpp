@@ -90,7 +90,7 @@ public:
     bool ownsTiles(int rank) const { return std::find(owners_.begin(), owners_.end(), rank) != owners_.end(); }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
-    // `info` is what all tiles have in common. No other member may be running.
+    // `info` is common to all tiles. No other member may be running.
     void newFrame(const TileInfo& info, const SamplePlan& plan)
     {
         expected_ = nullptr;
@@ -126,8 +126,8 @@ public:
         bool spoilt = false; // the tile is: call saidWhy() when it is known why
     };
 
-    // Hands an input of rank `from` to its tile. Throws what the tracker and the op throw: then the tile is spoilt, and
-    // no more is waited for, so that both may be set in `arrival`.
+    // Hands an input of rank `from` to its tile. Throws the exceptions of the tracker and of the op: then the tile is
+    // spoilt, and no more is waited for, so that both may be set in `arrival`.
     void arrive(Fragment&& fragment, int from, Arrival& arrival)
     {
         const TileHeader h = fragment.header();
@@ -214,7 +214,7 @@ public:
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op->finish(out); }
 
-    // Of the tile's place in the image; for whoever finishes it.
+    // Of the tile's place in the image; for the thread that finishes it.
     BackgroundPixels& backgroundPixels(int tile) { return slotFor(tile).background; }
 
     // A complete tile has been finished, and is on its way.
@@ -245,8 +245,8 @@ public:
     // Returns the operation's report on a finished tile.
     TileReport report(int tile) { return slotFor(tile).op->report(); }
 
-    // Returns what the incomplete tiles wait for: the first tile in numbers, all of them in words. With `declared`, a
-    // tile that nobody named waits for nothing.
+    // Returns the inputs that incomplete tiles wait for: the first tile in numbers, all of them in words. With
+    // `declared`, a tile that nobody named waits for nothing.
     std::optional<ErrorInfo> missing(bool declared)
     {
         constexpr int mostTiles = 8; // in the text
@@ -332,7 +332,7 @@ private:
         return slots_[static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)])];
     }
 
-    // Of this frame. Throws what the op's newFrame() throws, the first time: then the tile is spoilt.
+    // Of this frame. The first time, throws the exceptions of the op's newFrame(): then the tile is spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
@@ -414,7 +414,7 @@ private:
         return missing.announcers.empty() ? -1 : missing.announcers.front().rank;
     }
 
-    // In words: which of the inputs are missing, and from whom; or who announced them, and which have come.
+    // In words: which inputs are missing, and from which ranks; or which ranks announced them, and which have come.
     static std::string namesOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
     {
         std::string text;

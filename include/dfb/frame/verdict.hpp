@@ -30,7 +30,7 @@
 
 namespace dfb::detail {
 
-// Makes a record of an exception. `where` fills in what the exception does not say.
+// Makes a record of an exception. `where` fills in the fields that the exception does not set.
 inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& where)
 {
     ErrorInfo info;
@@ -277,10 +277,10 @@ struct Verdict {
     }
 };
 
-// The configuration of one rank, or what is wrong with it. Combined: whether all are right and the same.
+// The configuration of one rank, or its error. Combined: whether all are right and equal.
 struct Agreement {
     bool fine = true;
-    std::string text; // of Settings; or what is wrong
+    std::string text; // of Settings; or the error
     int rank = 0;     // the lowest rank that has it; -1 if two ranks differ
 
     // Names and values, a line each.
@@ -442,8 +442,8 @@ private:
     }
 };
 
-// Finds out whether all ranks have the same configuration, and returns it, or what is wrong. Collective. If something
-// is wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
+// Finds out whether all ranks have the same configuration, and returns it, or the error. Collective. If something is
+// wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
 // heard the reason by then would report another error.
 inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
 {

@@ -80,7 +80,7 @@ public:
     bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
     bool displays() const noexcept { return isDisplay() && enabled(); }
 
-    // `compresses`: whether the codec, if there is one, is used. `background`: what the image shows beside the tiles.
+    // `compresses`: whether the codec, if there is one, is used. `background`: the image's pixels where no tile is.
     void newFrame(std::int64_t frame, bool compresses, const std::array<float, 4>& background)
     {
         frame_ = frame;
@@ -131,7 +131,7 @@ public:
         return places;
     }
 
-    // Of a message with finished tiles that a codec was to make smaller, what it had before; else 0.
+    // The bytes that a message with finished tiles had before a codec was to make it smaller; else 0.
     static std::size_t rawBytesOf(const Buffer& message)
     {
         const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
@@ -225,7 +225,7 @@ public:
         return place;
     }
 
-    // `writtenPixels`: the others, in the image, are what they were. False if it comes too late, after flush().
+    // `writtenPixels`: the other pixels of the image have not changed. False if it comes too late, after flush().
     bool commit(int tile, Place&& place, std::int64_t writtenPixels)
     {
         if (!enabled())
@@ -425,9 +425,9 @@ public:
         return -1;
     }
 
-    // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. What was
-    // background before and is of the same colour is left alone, as are tiles of an earlier frame that are
-    // `kept(tile)`. With that the image is this frame's.
+    // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. Pixels that were
+    // background before, of the same colour, are left alone, as are tiles of an earlier frame that are `kept(tile)`.
+    // With that the image is this frame's.
     template <class Kept>
     void fillBackground(const std::array<float, 4>& rgba, const Kept& kept)
     {

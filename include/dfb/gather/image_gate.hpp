@@ -1,5 +1,5 @@
 // ImageGate: lets other processes write finished tiles straight into the image of the display rank, where they see its
-// memory: as long as the frame is open there, and never into what a user may be looking at.
+// memory: while the frame is open there, and never into an image that a user may be looking at.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -72,8 +72,8 @@ private:
     ImageGate* gate_ = nullptr;
 };
 
-// Where the gate and the planes of an image lie in its rank's shared memory, as that counts places; -1: nowhere. What
-// the display rank tells those who see its memory.
+// Where the gate and the planes of an image lie in its rank's shared memory, as that counts places; -1: nowhere. The
+// display rank tells it to the ranks that see its memory.
 struct ImagePlaces {
     std::int32_t gate = -1;
     std::array<std::int32_t, channelCount> planes{};

@@ -1,4 +1,4 @@
-// Wall: what is behind a DisplayWall: parts of finished tiles go to the ranks that drive displays, and become pictures.
+// Wall: the inside of a DisplayWall: parts of finished tiles go to the ranks that drive displays, and become pictures.
 #pragma once
 
 #include <dfb/comm/mailbox.hpp>
@@ -93,7 +93,7 @@ public:
         if (all.fine)
             shownFrame_ = frame;
         mailbox_->reductions().forget(SentPixels, frame);
-        coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also what failed frames have left
+        coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also parts of failed frames
         sent_.erase(sent_.begin(), sent_.upper_bound(frame));
         allSent_.erase(allSent_.begin(), allSent_.upper_bound(frame));
         last_ = frame;
@@ -159,14 +159,14 @@ private:
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(PartHeader);
 
-    // So many frames the others may be ahead of this rank: of those in flight, and of some that have failed. What says
-    // it is of a later one is not believed, as each takes the memory of its pictures.
+    // The others may be so many frames ahead of this rank: those in flight, and some that have failed. A message of a
+    // later frame is not believed, as each frame takes the memory of its pictures.
     static constexpr std::int64_t framesAhead = 16;
 
     // In front of an Agreement's text that is not about time.
     static constexpr std::string_view malformed = "malformed: ";
     static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
-    // At the end of what a display misses.
+    // Ends the text on the parts that a display misses.
     static constexpr std::string_view unsent = " that no rank has sent";
 
     enum Scope : std::uint32_t { SentPixels = Mailbox::ownScope + 1 }; // of reductions
@@ -260,11 +260,12 @@ private:
 
     void undecodable(int source, const ErrorInfo& error) override
     {
-        mailbox_->keepDamage(source, error); // it may have been a part of what finish() waits for
+        mailbox_->keepDamage(source, error); // finish() may be waiting for it
         refuse(source, error, 0);
     }
 
-    // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: what the message says.
+    // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: the one that the message
+    // names.
     void refuse(int source, const ErrorInfo& error, std::int64_t frame)
     {
         {
@@ -415,7 +416,7 @@ private:
         mailbox_->receiveReduction(source, header, message);
     }
 
-    // Under mutex_: what has not come to a display of this rank, and whether nothing more will.
+    // Under mutex_: the parts that have not come to a display of this rank, and whether no more will.
     std::int64_t pixelsLeft(std::int64_t frame, int display) { return picturesOf(frame)->at(display).pixelsLeft; }
     bool hasAllSent(std::int64_t frame, int display)
     {

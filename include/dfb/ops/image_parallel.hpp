@@ -8,7 +8,7 @@
 namespace dfb {
 
 // Expects one input of generation 0 without children per pass. The tile is laid over the background, passes are
-// averaged. Of the other channels only what the image has travels.
+// averaged. Of the other channels only those that the image has travel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicImageParallel : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:

@@ -1,5 +1,5 @@
-// Progressive: accumulates what another operation composites over the passes of many frames, and says how far the
-// mean may be off (section 4.1.1 of the paper).
+// Progressive: accumulates the pixels of another operation over the passes of many frames, and says how far the mean
+// may be off (section 4.1.1 of the paper).
 #pragma once
 
 #include <dfb/ops/sort_last.hpp>

@@ -22,7 +22,7 @@ namespace dfb {
 
 namespace detail {
 
-// Sums over passes of composited pixels, and what is the mean of them.
+// Sums over passes of composited pixels, and their mean.
 class PixelSums {
 public:
     // `wanted`: of the auxiliary channels.
@@ -135,7 +135,7 @@ public:
             fragments_.push_back(std::move(fragment));
     }
 
-    // Forgets what is behind a generation.
+    // Forgets the inputs behind a generation.
     void removeBehind(int generation);
 
     // Called with (y, pass, row).
@@ -216,7 +216,7 @@ protected:
 // Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
 // announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
 // n passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
-// order is undefined. Of `Channels` beside colour, depth and farChannel what the image does not have does not travel.
+// order is undefined. Of `Channels` beside colour, depth and farChannel only those travel that the image has.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: AlphaBlend sorts by depth");
@@ -392,13 +392,13 @@ DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
     return scratch;
 }
 
-// One pass, and no more than colour and depth: what no input covers is not composited.
+// One pass, and no more than colour and depth: pixels without an input are not composited.
 DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
 {
     Scratch& scratch = start();
     CompositeRow& row = scratch.row;
     row.wantsGaps = false;
-    row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are what comes out
+    row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are the output
     std::array<std::byte, 16> background;
     if (out.format() != OutputFormat::None)
         convertPixels(info_.background.data(), 1, out.format(), background.data());

@@ -134,7 +134,7 @@ private:
 // the world.
 class ThinLensCamera {
 public:
-    // Looks along `view`, of any length. Throws InvalidArgument for what is no camera.
+    // Looks along `view`, of any length. Throws InvalidArgument if no camera can be so.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
         : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
@@ -170,10 +170,10 @@ private:
 };
 
 // Two eyes side by side: the left half of the image is the left one's, the right half the right one's. They are
-// `separation` apart, and what is at `convergence` along the view is at the same place in both halves.
+// `separation` apart. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
-    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument for what is no camera.
+    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument if no camera can be so.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
         : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
           separation_(static_cast<double>(separation)), convergence_(static_cast<double>(convergence))
@@ -273,8 +273,8 @@ private:
 // Motion blur of a camera that turns around an axis while the shutter is open: by `degrees` from sample time 0 to 1.
 class OrbitBlurCamera {
 public:
-    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument for what is no
-    // camera, an axis of length 0, or more than a full turn.
+    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument if no camera
+    // can be so, for an axis of length 0, and for more than a full turn.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
         : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), center_(detail::pointOf(center)),

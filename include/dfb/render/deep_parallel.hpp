@@ -165,7 +165,7 @@ template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
-// As DataParallelLoop, with bricks that may overlap: their bounds enclose what they have.
+// As DataParallelLoop, with bricks that may overlap: their bounds enclose their data.
 template <class FrameBuffer>
 class DeepParallelLoop {
 public:
@@ -177,7 +177,7 @@ public:
             detail::failArgument("a pixel has 1 to 65535 segments");
     }
 
-    // Does what DataParallelLoop::start() does, but renderBrick(brick, deep) adds the segments of the pixels of
+    // As DataParallelLoop::start(), but renderBrick(brick, deep) adds the segments of the pixels of
     // deep.header().region to the empty DeepTile. FrameReport::mergeErrorBound says how far a pixel may be off because
     // segments were merged. The first segments of a brick's pixels announce the others as children, so pixels with one
     // segment cost nothing extra.

@@ -102,8 +102,8 @@ private:
 // ImageParallelLoop (Listing 2 of the paper): all ranks have the scene, each tile and pass is rendered by one of
 // them.
 //
-// Which rank renders what (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs many
-// samples is rendered by many ranks; the image does not depend on who renders what.
+// Which rank renders which tile (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs
+// many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
 enum class WorkDistribution : std::uint8_t {
     Owned,      // a rank renders the tiles that it owns: no input travels
     Linear,     // equal contiguous shares in the order of tiles
@@ -197,7 +197,7 @@ public:
 private:
     FrameBuffer& fb_;
     WorkDistribution distribution_ = WorkDistribution::Owned;
-    std::vector<int> tiles_; // with WorkDistribution::Owned: what this rank renders
+    std::vector<int> tiles_; // with WorkDistribution::Owned: those that this rank renders
     detail::PassJobs jobs_;
 };
 

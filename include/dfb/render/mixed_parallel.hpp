@@ -77,7 +77,7 @@ public:
             for (int pass = 0; pass < passes[p]; ++pass)
                 jobs.push_back({pairCosts[p] / passes[p], p, pass, 0});
         }
-        // The costliest first, each to whoever has least (Graham 1969).
+        // The costliest first, each to the rank that has least (Graham 1969).
         std::sort(jobs.begin(), jobs.end(), [](const Job& a, const Job& b) {
             return a.cost != b.cost ? a.cost > b.cost : std::tie(a.pair, a.pass) < std::tie(b.pair, b.pass);
         });
@@ -91,7 +91,7 @@ public:
             job.rank = least(job);
             loadOf(job.rank) += job.cost;
         }
-        // Not every rank can have every job: what has become too much in one place moves on, from rank to rank.
+        // Not every rank can have every job: from a rank that has too much, jobs move on from rank to rank.
         for (int sweep = 0, moved = 1; sweep < 32 && moved > 0; ++sweep) {
             moved = 0;
             for (Job& job : jobs) {
@@ -260,8 +260,8 @@ struct OrderedWork : MixedWork {
         return static_cast<int>(job.pair) - firstPair[static_cast<std::size_t>(pairs[job.pair].tile)];
     }
 
-    // Begins with the tiles of which this rank has the front, so that others hear soon what is hidden. Not for images
-    // that hide nothing: their tiles would be complete later.
+    // Begins with the tiles of which this rank has the front, so that others hear soon which inputs are hidden. Not for
+    // images that hide nothing: their tiles would be complete later.
     void renderFrontsFirst()
     {
         std::stable_partition(jobs.begin(), jobs.end(), [this](const MixedJob& job) { return generationOf(job) == 0; });
@@ -336,7 +336,7 @@ public:
     {
     }
 
-    // Does what DataParallelLoop::start() does. renderBrick(brick, tile) may return its cost, a number in any unit.
+    // As DataParallelLoop::start(). renderBrick(brick, tile) may return its cost, a number in any unit.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
                                                     FrameConfig params = {},
@@ -391,8 +391,8 @@ private:
 
 // The mixed-parallel loop for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing
 // and wait for no manifest. Tiles that an opaque one hides are not sent, and not rendered by ranks that hear of it in
-// time. What an opaque tile hid in the last frame waits until that one is rendered again. Use it only if one order is
-// right for all rays of a frame: not with an extended lens or several eyes.
+// time. Inputs that an opaque tile hid in the last frame wait until that tile is rendered again. Use it only if one
+// order is right for all rays of a frame: not with an extended lens or several eyes.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:
@@ -401,8 +401,8 @@ public:
     {
     }
 
-    // Does what MixedParallelLoop::start() does. `order`: the bricks front to back, by their place in world.bricks(),
-    // as visibilityOrder() returns them.
+    // As MixedParallelLoop::start(). `order`: the bricks front to back, by their place in world.bricks(), as
+    // visibilityOrder() returns them.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                                     const RenderBrick& renderBrick, FrameConfig params = {},
@@ -455,7 +455,7 @@ private:
             });
     }
 
-    // Renders what other ranks may hide, each as soon as they have said that they do not.
+    // Renders the inputs that other ranks may hide, each as soon as those ranks have said that they do not.
     template <class RenderBrick>
     void renderUndecided(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick)
     {

@@ -32,18 +32,18 @@ struct SamplingConfig {
     double maxError = 0;
     int firstSamples = 8;  // of each tile, before its error is believed; at least 2
     int maxSamples = 1024; // of each tile, in all
-    int frameSamples = 64; // the most that a tile gets in one frame; what waits for compositing grows with it
+    int frameSamples = 64; // the most that a tile gets in one frame; memory grows with it
 };
 
-// Used alike on all ranks: what it decides is a function of the frames' reports, which are the same everywhere; a rank
-// that decides otherwise is found by the frame's verdict. The operation is a Progressive one:
+// Use it alike on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere. The
+// verdict of the frame finds a rank that decides otherwise. The operation is a Progressive one:
 //
 //   dfb::ImageParallelLoop loop(fb);
 //   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
 //   while (!sampler.done())
 //       sampler.update(loop.render(renderTile, sampler.next()));
 //
-// A frame that throws FrameError must be followed by reset(): what was accumulated is lost.
+// Call reset() after a frame that throws FrameError: the accumulated samples are lost.
 class AdaptiveSampler {
 public:
     // Throws InvalidArgument for a configuration that cannot be.
@@ -143,7 +143,7 @@ private:
     }
 
     // How many samples the tile needs in all, as far as can be told: the error falls with the root of their number. At
-    // most twice what it has, since an error from few samples is itself uncertain.
+    // most twice the number it has, since an error from few samples is itself uncertain.
     int wanted(std::size_t t) const
     {
         if (taken_[t] < config_.firstSamples)

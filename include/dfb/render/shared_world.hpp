@@ -23,8 +23,8 @@ struct SharedBrick {
     std::vector<int> ranks;
 };
 
-// The bricks of all ranks, and who holds them; equal on all ranks. Takes memory and time in proportion to the number of
-// all bricks.
+// The bricks of all ranks, and which ranks hold them; equal on all ranks. Takes memory and time in proportion to the
+// number of all bricks.
 class SharedWorld {
 public:
     // Gathers the bricks of all ranks. Bricks with the same id are one. Collective, outside frames. Waits for all

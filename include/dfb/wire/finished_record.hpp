@@ -1,8 +1,8 @@
 // FinishedRecord: a finished tile in a message to the display rank, without the pixels that are all alike, as those of
 // the background are.
 //
-// After the header come one pixel, which fills what has no other, unless all travel (Dense), and a body as in
-// sparse_planes.hpp: Empty, Sparse or Dense. A record has a multiple of 16 bytes.
+// After the header come one pixel, which fills the places of pixels that do not travel (none in Dense), and a body as
+// in sparse_planes.hpp: Empty, Sparse or Dense. A record has a multiple of 16 bytes.
 #pragma once
 
 #include <dfb/image.hpp>
@@ -56,7 +56,7 @@ public:
         FinishedPlanes from_;
         std::size_t filler_ = 0; // place of the pixel
         std::size_t bytes_ = 0;
-        ActiveSpans active_; // what is not like it
+        ActiveSpans active_; // the pixels unlike it
         std::vector<std::byte> body_;
     };
 
@@ -91,7 +91,7 @@ public:
     // Writes plan.bytes() bytes.
     void write(Plan& plan, std::byte* out) const
     {
-        std::memset(out + plan.bytes() - 16, 0, 16); // what fills it up
+        std::memset(out + plan.bytes() - 16, 0, 16); // padding
         const Header& h = plan.header_;
         std::memcpy(out, &h, sizeof h);
         out += sizeof h;

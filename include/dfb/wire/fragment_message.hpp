@@ -54,8 +54,9 @@ inline std::size_t largestFragment(int width, int height, ChannelMask channels)
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * perPixel;
 }
 
-// Copies what is premultiplied by alpha, 3 floats a pixel, and makes it so by the alpha that the owner gets: else what
-// is divided by that in the end would not be a mean. `encoded`: the colours `rgba`, as they travel.
+// Copies values premultiplied by alpha, 3 floats a pixel, and premultiplies them by the alpha that the owner gets
+// instead. The owner divides by that alpha in the end; with another one the result would not be a mean. `encoded`: the
+// colours `rgba`, as they travel.
 inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const float* rgba, const std::byte* encoded,
                               const float* in, std::size_t pixels, float* out)
 {
@@ -281,7 +282,7 @@ inline bool saysInPlace(const Buffer& message)
                   == FragmentEncoding::InPlace;
 }
 
-// Of a fragment message that encodeFragment() has made, what it had without a codec.
+// The bytes that a fragment message of encodeFragment() would have without a codec.
 inline std::size_t rawFragmentBytes(const Buffer& message)
 {
     return fragmentPrefix + loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader)).rawPayloadBytes;

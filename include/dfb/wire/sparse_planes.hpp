@@ -1,5 +1,5 @@
-// Sparse planes: which pixels of a region are active, as spans, and what these have, as planes. All pixels travel so,
-// those of inputs and those of finished tiles; what differs is which are active, and the bytes that they have.
+// Sparse planes: which pixels of a region are active, as spans, and their values, as planes. All pixels travel so,
+// those of inputs and those of finished tiles. The two differ in which pixels are active, and in the bytes a pixel has.
 //
 // A SparseShape is in the header of the message, the body goes on with
 //   Sparse:    planes | spans | uint16 span counts of the rows [rowBegin, rowEnd)
@@ -266,8 +266,8 @@ inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& sha
 }
 
 // The active pixels of an input. One per thread, to be used again and again. A pixel of colour 0 and alpha 0
-// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does. By depth, what has one
-// below +infinity does, and nothing else.
+// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does. By depth, a pixel
+// contributes if its depth is below +infinity, and only then.
 class ActivePixels : public ActiveSpans {
 public:
     // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to

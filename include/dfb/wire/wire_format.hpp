@@ -34,7 +34,7 @@ inline std::uint32_t bitsOf(float value) noexcept
     return bits;
 }
 
-// `condition` ? a : b. With masks, as compilers do not vectorize a choice of what is made of floats.
+// `condition` ? a : b. With masks, as compilers do not vectorize a choice between values made of floats.
 inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) noexcept
 {
     const std::uint32_t mask = 0u - static_cast<std::uint32_t>(condition);
@@ -57,7 +57,7 @@ inline std::uint32_t nearestInteger(float value) noexcept
     return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
 }
 
-// How a scaled channel of a colour travels. What is above `most` is none of a pixel in range.
+// How a scaled channel of a colour travels. No pixel in range has a value above `most`.
 struct HalfCode {
     using Word = std::uint16_t;
     static constexpr Word most = 0x7800; // 2^15, to which alpha 1 is scaled, and beyond which no colour is
@@ -80,7 +80,7 @@ struct WireScales {
     float color, alpha, leastAlpha = 0;
 };
 
-// Rows in plain C++. What bytes are made of or make goes through `words`: bytes could alias anything.
+// Rows in plain C++. Values converted from or to bytes go through `words`: bytes could alias anything.
 constexpr int wireBlock = 256;
 
 template <class Code>
@@ -243,7 +243,7 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 // Which channels are rounded: colour and alpha, and the bound is for these. All others travel as they are. Depth,
 // positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0
 // counts for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with
-// their rounded alphas, so that the mean is off by what the weights are off.
+// their rounded alphas, so that the mean is off by as much as the weights.
 //
 // The bound. A pixel is C = sum_j T_j c_j, with T_j the product of 1 - a_i over the layers i in front of j, the last
 // layer being the background. Rounded, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones one
@@ -252,7 +252,7 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 //
 //     |error| <= sum_j T'_j (|d_j| + |e_j| B),    B >= |B_j|
 //
-// If colours are within [0, M a] and a in [0, 1], what is behind is a mean of colours up to M and of the background:
+// If colours are within [0, M a] and a in [0, 1], the pixel behind is a mean of colours up to M and of the background:
 // B = max(M, background). Alpha itself is the same sum with 1 in place of M.
 //   Unorm of n bits: |d| <= M h, |e| <= h, h = 1 / (2 (2^n - 1)): each of the n layers adds up to h (M + B).
 //   Float16:         |d| <= u c, |e| <= u a, u = 2^-11, and sum_j T'_j a'_j <= 1: u / (1 - u) (M + B), however many
@@ -264,23 +264,23 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 namespace dfb {
 
 enum class WireFormat : std::uint8_t {
-    Float32, // what the renderer wrote
-    Float16, // IEEE binary16 of what is scaled into its range
+    Float32, // as the renderer wrote it
+    Float16, // IEEE binary16, scaled into its range
     Unorm16, // of a range that is the same on all ranks
     Unorm8,
-    Bytes // what a renderer of 8-bit colours wrote, see TileView::color8; not to be asked for
+    Bytes // 8-bit colours as the renderer wrote them, see TileView::color8; not to be asked for
 };
 
 // An error of the float image's colour and alpha, before they are converted to the output format, that may be made: the
-// greatest absolute difference of one of the four to what it would be with Float32.
+// greatest absolute difference of one of the four to its value with Float32.
 struct ErrorBudget {
     double error = 0;
     float maxColor = 1; // see Precision
 };
 
 // Within half a level: an image of 8 bits a channel may be off by half a level before it is rounded, so no level is off
-// by more than one. What travels to ranks whose memory this one does not share takes the cheapest format that is sure
-// to keep that; all else, and an image of floats, is exact. So the image may depend on which ranks share a node.
+// by more than one. Inputs for ranks whose memory this one does not share travel in the cheapest format that is sure to
+// keep that. All else, and an image of floats, is exact. So the image may depend on which ranks share a node.
 struct HalfLevel {
     float maxColor = 1; // see Precision
 };
@@ -395,7 +395,7 @@ private:
 // range, over a background of at most `background` in a channel. See the top of this file.
 inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxColor, double background)
 {
-    const double reach = maxColor + std::max(maxColor, background); // M + B; of alpha |1 - A|, A being what is behind
+    const double reach = maxColor + std::max(maxColor, background); // M + B; of alpha |1 - A|, A of those behind
     const double most = (1 + 0x1p-20) * std::max({reach, 1.0, background});
     const double conversion = 0x1p-21, n = static_cast<double>(layers);
     switch (format) {

@@ -1,5 +1,5 @@
-// WireLosses: how far the pixels of a tile may be off because inputs travelled rounded, or because what is behind them
-// was left out: the bound of wire_format.hpp for what has really come.
+// WireLosses: how far the pixels of a tile may be off because inputs travelled rounded, or because layers behind them
+// were left out: the bound of wire_format.hpp for the inputs that have really come.
 #pragma once
 
 #include <dfb/fragment.hpp>
@@ -32,7 +32,7 @@ public:
         if (fragment.empty())
             return;
         const WireFormat format = fragment.colorFormat();
-        double beyond = 0; // what this fragment may have that is not in range
+        double beyond = 0; // the most that a value of this fragment is out of range
         if ((format == WireFormat::Float32 || format == WireFormat::Bytes)
             && !coder.inRange(fragment.color(), static_cast<int>(fragment.storedPixels())))
             beyond = largestOf(fragment);
@@ -66,7 +66,7 @@ private:
         double beyond = 0;
     };
 
-    // Infinity if it cannot be said how much of what is behind comes through.
+    // Infinity if it is not known how much of the layers behind comes through.
     static double largestOf(const Fragment& fragment)
     {
         const float* rgba = fragment.color();
