@@ -25,6 +25,7 @@ namespace example {
 
 enum class Mode { Data, Image, Mixed };
 enum class Blending { Sort, Order, Nearest };
+enum class CutBy { Auto, Volume, Content };
 enum class Balance { Cost, RoundRobin };
 enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
 enum class Compression { None, Snappy, Auto };
@@ -39,6 +40,7 @@ struct Options {
     int bricks = 0;    // 0: one per rank
     int replicate = 2; // ranks that hold each brick, in mixed mode
     Blending blend = Blending::Sort;
+    CutBy cut = CutBy::Auto;
     Balance balance = Balance::Cost;
     Distribution distribution = Distribution::Owned; // in image mode
     int interleave = 1;                              // cells of a brick
@@ -263,6 +265,12 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option("--replicate", options.replicate, "Ranks that hold each brick, with --mode mixed; default 2")
         ->check(detail::number(1, most))
         ->option_text("K")
+        ->group(how);
+    words("--cut", options.cut, {"auto", "volume", "content"},
+          "How space is cut into bricks: volume: all are equally large; content: all take about as long to render, as "
+          "far as a coarse look shows, so that some ranks read and hold more than others; auto: by content, but for "
+          "surfaces without --ao or --shadows, where it is no better, and for synthetic, which has a grid of its own; "
+          "default auto")
         ->group(how);
     words("--balance", options.balance, {"cost", "round-robin"},
           "How the ranks that hold a brick share its tiles: by what they cost in the last frame, or in turn; "
@@ -532,6 +540,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.mode == Mode::Image, "--blend", "does not go with --mode image");
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
             refuse(options.blend != Blending::Sort, other, "does not go with --blend order or nearest");
+        refuse(options.mode == Mode::Image, "--cut", "does not go with --mode image: it has no bricks");
         refuse(options.blend == Blending::Order && options.view.kind != CameraKind::Perspective, "--camera",
                "does not go with --blend order: one order is not right for all its rays");
         refuse(options.mode != Mode::Mixed, "--replicate", "needs --mode mixed");

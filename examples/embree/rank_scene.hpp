@@ -1,6 +1,7 @@
 // RankScene: what one rank holds of the scene that the command line asks for.
 #pragma once
 
+#include "content_cut.hpp"
 #include "generated.hpp"
 #include "options.hpp"
 #include "renderer.hpp"
@@ -60,6 +61,14 @@ inline bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int c
     return (rank - first + rankCount) % rankCount < copies;
 }
 
+// Of surfaces without secondary rays, a brick's work is what its box covers of the image, so that equal boxes are best.
+inline bool cutsByContent(const Options& options, const Scene& scene)
+{
+    if (options.cut != CutBy::Auto)
+        return options.cut == CutBy::Content;
+    return scene.grid[0] == 0 && (!scene.volumes.empty() || options.ao > 0 || options.shadows);
+}
+
 // Collective: each rank reads what it needs, and all come to the same cells. Throws std::runtime_error, on some ranks
 // or all.
 inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
@@ -77,7 +86,13 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const float ghosts = ghostReach(result.info, settings);
     std::vector<Box> cells{scene.bounds};
     if (!isImage)
-        cells = cutScene(scene, brickCount * options.interleave);
+        cells = cutsByContent(options, scene)
+                    ? loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
+                          return loaders.rank() > 0
+                                     ? std::vector<Box>()
+                                     : ContentCut(scene, result.info, settings).cells(brickCount * options.interleave);
+                      })
+                    : cutScene(scene, brickCount * options.interleave);
     const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
     for (int brick = 0; brick < brickCount; ++brick) {
         Box bounds;

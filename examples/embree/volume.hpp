@@ -11,6 +11,7 @@
 #pragma once
 
 #include "loaders.hpp"
+#include "shading.hpp"
 #include "vec.hpp"
 
 #include <algorithm>
@@ -38,6 +39,9 @@ namespace example {
 
 using Index3 = std::array<int, 3>;
 
+// Of the blocks that a ray steps over at once where nothing in them can be seen, in voxels.
+inline constexpr int skipWidth = 8;
+
 enum class VoxelType { UInt8, UInt16, Float32 };
 
 inline std::size_t voxelBytes(VoxelType type)
@@ -55,10 +59,15 @@ struct VolumeInfo {
 // Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
 using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* out)>;
 
-// Where something stands out from the background, as far as a lattice of about 64^3 voxels shows it: to point a camera.
+// Where there is something to see, as far as some rows of the volume show it, on a lattice of about 64^3 voxels.
 struct VisibleVoxels {
-    std::vector<Vec3> points; // the ends of rows, in voxels
-    int slack = 0;            // how many voxels beyond these the lattice leaves out
+    // To point a camera: the ends of rows that stand out from the background, in voxels.
+    std::vector<Vec3> points;
+    int slack = 0; // how many voxels beyond these the lattice leaves out
+
+    // To reckon what it costs: blocks of `width` voxels, x fastest, each 1 if something in it has an opacity, else 0.
+    Index3 width{}, blocks{};
+    std::vector<std::uint8_t> isSeen;
 };
 
 struct VolumeSource {
@@ -281,6 +290,13 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
     };
     VisibleVoxels visible;
     visible.slack = std::max({stride(0), stride(1), stride(2)}) - 1;
+    for (std::size_t axis = 0; axis < 3; ++axis) {
+        visible.width[axis] = std::max(skipWidth, stride(axis)); // a row or more in each
+        visible.blocks[axis] = 1 + (info.dims[axis] - 1) / visible.width[axis];
+    }
+    const TransferFunction transferFunction(1);
+    const float scale = 1 / (info.maximum - info.minimum);
+    std::vector<std::uint8_t> seenInRows; // for each block along a row
     visible.points = loaders.gatherOf<Vec3>([&] {
         const RowReader read = source.open();
         std::vector<Vec3> points;
@@ -297,9 +313,34 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
             for (const int x : {first, last})
                 if (x >= 0)
                     points.push_back({static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)});
+            for (int x = 0; x < info.dims[0]; x += visible.width[0]) {
+                float least = value(x), greatest = least;
+                for (int k = x + 1; k <= std::min(x + visible.width[0], info.dims[0] - 1); ++k) {
+                    least = std::min(least, value(k));
+                    greatest = std::max(greatest, value(k));
+                }
+                seenInRows.push_back(
+                    !transferFunction.isTransparent((least - info.minimum) * scale, (greatest - info.minimum) * scale));
+            }
         }
         return points;
     });
+    seenInRows = loaders.gatherOf<std::uint8_t>([&] { return seenInRows; });
+    const auto size = [&](std::size_t axis) { return static_cast<std::size_t>(visible.blocks[axis]); };
+    visible.isSeen.resize(size(0) * size(1) * size(2));
+    // A row speaks for what lies between it and the one before.
+    const auto blocksOf = [&](std::size_t axis, std::uint64_t number) {
+        const int last = static_cast<int>(number) * stride(axis), first = std::max(0, last - stride(axis));
+        return std::pair(static_cast<std::size_t>(first / visible.width[axis]),
+                         static_cast<std::size_t>(last / visible.width[axis]));
+    };
+    for (std::size_t i = 0; i < seenInRows.size(); ++i) {
+        const auto [y0, y1] = blocksOf(1, i / size(0) % rows(1));
+        const auto [z0, z1] = blocksOf(2, i / size(0) / rows(1));
+        for (std::size_t z = z0; z <= z1; ++z)
+            for (std::size_t y = y0; y <= y1; ++y)
+                visible.isSeen[(z * size(1) + y) * size(0) + i % size(0)] |= seenInRows[i];
+    }
     return visible;
 }
 

@@ -90,6 +90,7 @@ public:
 
 private:
     static constexpr int cellShift = 3, cellWidth = 1 << cellShift; // of the skip grid, in voxels
+    static_assert(cellWidth == skipWidth);
 
     float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
     int largestIndex() const { return std::max({info().dims[0], info().dims[1], info().dims[2]}) - 1; }

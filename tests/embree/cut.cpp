@@ -2,6 +2,7 @@
 // where the cuts were, nor who rendered what.
 #include "support.hpp"
 
+#include <content_cut.hpp>
 #include <generated.hpp>
 #include <output.hpp>
 #include <renderer.hpp>
@@ -93,7 +94,13 @@ struct Run {
     dfb::OwnerMap ownerMap = dfb::latticeOwner;
     std::function<int(int brick, int bricks, int ranks)> rankOf = example::rankOfBrick;
     bool ghosts = true;
+    bool byContent = false;
 };
+
+std::vector<Box> cellsOf(const Scene& scene, const example::RenderSettings& settings, int count)
+{
+    return example::ContentCut(scene, example::SceneInfo(scene), settings).cells(count);
+}
 
 dfb::FrameBufferConfig configOf(const example::RenderSettings& settings, const Run& run)
 {
@@ -132,7 +139,8 @@ Picture render(const Scene& scene, const example::RenderSettings& settings, cons
             return;
         }
         dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport> fb(communicator, config);
-        const std::vector<Box> cells = cutScene(scene, run.bricks);
+        const std::vector<Box> cells =
+            run.byContent ? cellsOf(scene, settings, run.bricks) : cutScene(scene, run.bricks);
         dfb::World world;
         std::vector<std::unique_ptr<example::Renderer>> renderers(cells.size());
         for (std::uint32_t id = 0; id < cells.size(); ++id) {
@@ -327,6 +335,96 @@ TEST_CASE("Cells of a scene are of one size, also where their number is odd", "[
     for (const int count : {3, 5, 7, 11, 100})
         for (const Box& cell : cutScene(scene, count))
             CHECK(std::fabs(volume(cell) * count / volume(scene.bounds) - 1) < 1e-3);
+}
+
+TEST_CASE("Cells that are cut by content tile the bounds, too", "[cut]")
+{
+    Scene nothing;
+    nothing.add(example::detail::generatedVolume({8, 8, 8}, [](int, int, int) { return 0.0f; }), true);
+    const Scene scenes[] = {example::demoScene(1),
+                            example::syntheticScene(3, 1),
+                            wallScene(),
+                            nothing,
+                            boxScene({0, 0, 0}, {0, 0, 0}),
+                            boxScene({-5, 2, 1000}, {1, 2.5f, 1000.25f}),
+                            boxScene({0.1f, -1e6f, 0}, {0.7f, 1e6f, 1e-3f})};
+    for (const Scene& scene : scenes)
+        for (const int count : {1, 2, 3, 7, 8, 17, 64}) {
+            INFO(count << " cells");
+            example::RenderSettings settings = settingsOf(96, 64);
+            settings.frames = count; // of which not all are looked at
+            settings.view.distance = count == 7 ? 0.0f : 2.0f;
+            const std::vector<Box> cells = cellsOf(scene, settings, count);
+            REQUIRE(cells.size() == static_cast<std::size_t>(count));
+            checkTiling(cells, scene.bounds);
+        }
+}
+
+TEST_CASE("Bricks that are cut by content take equally long", "[cut]")
+{
+    // Most of it is empty, as in a scan: a ball in a corner, and a thin plate.
+    Scene scan;
+    scan.add(example::detail::generatedVolume({128, 96, 80},
+                                              [](int x, int y, int z) {
+                                                  const int dx = x - 35, dy = y - 30, dz = z - 40;
+                                                  return dx * dx + dy * dy + dz * dz < 25 * 25 || y / 4 == 19 ? 0.5f
+                                                                                                              : 0;
+                                              }),
+             true);
+    const auto busiest = [](const Scene& scene, const example::RenderSettings& settings,
+                            const std::vector<Box>& cells) {
+        const example::SceneInfo info(scene);
+        std::vector<double> most(static_cast<std::size_t>(settings.frames)), all = most;
+        for (const Box& cell : cells) {
+            const example::Renderer renderer(loadBrick(scene, 0, cell, ghostReach(info, settings)), info, settings);
+            auto tile = std::make_unique<dfb::Tile<dfb::colorChannel | dfb::depthChannel, 128>>();
+            tile->region = {0, 0, settings.width, settings.height};
+            for (std::size_t frame = 0; frame < all.size(); ++frame) {
+                const double cost = static_cast<double>(renderer.renderTile(*tile, static_cast<int>(frame)));
+                most[frame] = std::max(most[frame], cost);
+                all[frame] += cost / static_cast<double>(cells.size());
+            }
+        }
+        double worst = 0; // times the mean
+        for (std::size_t frame = 0; frame < all.size(); ++frame)
+            worst = std::max(worst, most[frame] / all[frame]);
+        return worst;
+    };
+    const Scene demo = example::demoScene(1);
+    for (const Scene* scene : {&std::as_const(scan), &demo})
+        for (const float elevation : {20.0f, -60.0f})
+            for (const int frames : {1, 3}) {
+                INFO((scene == &demo ? "demo" : "scan") << ", elevation " << elevation << ", " << frames << " frames");
+                example::RenderSettings settings = settingsOf(128, 128);
+                settings.frames = frames;
+                settings.view.elevation = elevation;
+                CHECK(busiest(*scene, settings, cellsOf(*scene, settings, 8)) < 1.25);
+                CHECK(busiest(*scene, settings, cutScene(*scene, 8)) > 1.3);
+            }
+    // Surfaces whose hits send out rays.
+    Scene knot;
+    knot.add(example::detail::torusKnot(400, 12), true);
+    example::RenderSettings settings = settingsOf(128, 128);
+    settings.aoRays = 16;
+    settings.opacity = 1;
+    CHECK(busiest(knot, settings, cellsOf(knot, settings, 8)) < 0.8 * busiest(knot, settings, cutScene(knot, 8)));
+}
+
+TEST_CASE("Cutting by content leaves no seam", "[cut]")
+{
+    for (const Scene& scene : {example::demoScene(1), example::syntheticScene(4, 1)}) {
+        const Picture whole = render(scene, settingsOf(96, 64), {1, 1});
+        for (const int bricks : {2, 5, 8}) {
+            INFO(bricks << " bricks");
+            Run run{1, bricks};
+            run.byContent = true;
+            const Picture one = render(scene, settingsOf(96, 64), run);
+            checkNoSeams(one, whole);
+            CHECK(one.depth == whole.depth);
+            run.ranks = 3;
+            checkSame(render(scene, settingsOf(96, 64), run), one);
+        }
+    }
 }
 
 TEST_CASE("A generated volume has a brick of 64 voxels a side for each cell", "[cut]")

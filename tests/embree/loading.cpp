@@ -33,6 +33,9 @@ std::string describe(const VolumeSource& source)
                        + std::to_string(source.visible.value().slack);
     for (const Vec3& p : source.visible->points)
         text += ", " + std::to_string(p.x) + ' ' + std::to_string(p.y) + ' ' + std::to_string(p.z);
+    text += "; ";
+    for (const std::uint8_t seen : source.visible->isSeen)
+        text += seen != 0 ? '#' : '.';
     if (source.range)
         text += "; " + std::to_string((*source.range)[0]) + " to " + std::to_string((*source.range)[1]);
     return text;

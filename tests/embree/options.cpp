@@ -63,6 +63,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.peerTimeout == 300);
     CHECK(o.xyzFrame == 0);
     CHECK(o.deep == 0);
+    CHECK(o.cut == CutBy::Auto);
     CHECK_FALSE(o.view.distance);
     CHECK(o.ownerMap == OwnerMap::Lattice);
     CHECK(o.width == 1024);
@@ -160,6 +161,8 @@ TEST_CASE("Every option arrives", "[options]")
     CHECK(o.alpha == "a.pfm");
     CHECK(o.depth == "d.pfm");
     CHECK(o.stats == "s.json");
+    CHECK(options({"synthetic", "--cut", "volume"}).cut == CutBy::Volume);
+    CHECK(options({"synthetic", "--cut", "content"}).cut == CutBy::Content);
     CHECK(options({"synthetic", "--owner-map", "linear"}).ownerMap == OwnerMap::Linear);
     CHECK(options({"synthetic", "--mode", "data", "--output", "dir.d/o.pfm"}).output == "dir.d/o.pfm");
 }
@@ -230,6 +233,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
                                                                   {"--replicate", "2"},
                                                                   {"--balance", "cost"},
                                                                   {"--blend", "sort"},
+                                                                  {"--cut", "content"},
                                                                   {"--bricks", "2"},
                                                                   {"--ranks", "2"},
                                                                   {"--threads", "2"},

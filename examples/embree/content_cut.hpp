@@ -1,0 +1,344 @@
+// ContentCut: bricks that take equally long to render, as an example of a cost function. A scene that is cut by volume
+// gives some ranks more to do than others, as most of its space may be empty, and what is near covers more pixels.
+//
+// The cost of a place is what the rays of a frame do there: samples in blocks of a volume where there is something to
+// see, and hits of surfaces with the rays that these send out. It is reckoned on a coarse grid, from what all ranks
+// know of the scene anyway, for several frames of the run.
+#pragma once
+
+#include "renderer.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <cstddef>
+#include <limits>
+#include <numeric>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+class ContentCut {
+public:
+    ContentCut(const Scene& scene, const SceneInfo& info, const RenderSettings& settings) : bounds_(scene.bounds)
+    {
+        const double extent = static_cast<double>(bounds_.largestExtent());
+        for (int axis = 0; axis < 3; ++axis) {
+            const double length = static_cast<double>(component(bounds_.extent(), axis));
+            size_[static_cast<std::size_t>(axis)] =
+                std::max<std::size_t>(1, static_cast<std::size_t>(std::lround(finest * length / extent)));
+        }
+        std::vector<double> content(size_[0] * size_[1] * size_[2]);
+        for (const VolumeObject& volume : scene.volumes)
+            addVolume(content, volume, 1 / static_cast<double>(info.step));
+        const double perHit = 1 + settings.aoRays + settings.shadows;
+        for (const MeshObject& object : scene.meshes)
+            for (const Triangle& triangle : object.mesh.triangles) {
+                const Vec3 &a = object.mesh.positions[triangle[0]], &b = object.mesh.positions[triangle[1]],
+                           &c = object.mesh.positions[triangle[2]];
+                Box box;
+                for (const Vec3& p : {a, b, c})
+                    box.grow(p);
+                // Half of a side, as seen from all sides on average.
+                add(content, box, 0.25 * perHit * static_cast<double>(length(cross(b - a, c - a))));
+            }
+        for (const SphereObject& object : scene.spheres)
+            for (const Sphere& sphere : object.spheres) {
+                Box box;
+                box.grow(sphere.center, sphere.radius);
+                const double radius = static_cast<double>(sphere.radius);
+                add(content, box, 2 * perHit * 3.14159265358979323846 * radius * radius); // a ray hits it twice
+            }
+        const int views = std::min(settings.frames, mostViews);
+        for (int view = 0; view < views; ++view)
+            addView(content, frameCamera(info, settings, view * settings.frames / views).pinhole(), settings);
+    }
+
+    // The cells of `count` bricks, which tile the scene's bounds: halves of equal cost, cut along the axis that leaves
+    // the least to the busiest rank, over and over.
+    std::vector<Box> cells(int count) const
+    {
+        std::vector<Box> all;
+        Grid whole;
+        for (std::size_t axis = 0; axis < 3; ++axis)
+            whole.hi[axis] = static_cast<double>(size_[axis]);
+        bisect(whole, bounds_, count, all);
+        return all;
+    }
+
+private:
+    static constexpr int finest = 64;   // cells of the grid along the longest axis
+    static constexpr int mostViews = 8; // frames of the run that are looked at
+    // Of all costs, what is shared out by room: a brick takes memory also where it looks empty, and the look was
+    // coarse.
+    static constexpr double roomPart = 0.1;
+
+    static constexpr int mostAhead = 8;         // bricks that are cut in all ways before one is chosen
+    static constexpr double thinnest = 1.0 / 16; // of a box's longest side, a side that may be cut
+
+    // A box in cells of the grid, or parts of them.
+    struct Grid {
+        std::array<double, 3> lo{}, hi{};
+    };
+
+    std::size_t indexOf(std::size_t x, std::size_t y, std::size_t z) const { return (z * size_[1] + y) * size_[0] + x; }
+
+    // Where a coordinate of the world is on the grid.
+    double onGrid(float world, int axis) const
+    {
+        const double lo = static_cast<double>(component(bounds_.lo, axis)),
+                     extent = static_cast<double>(component(bounds_.extent(), axis));
+        const double cells = static_cast<double>(size_[static_cast<std::size_t>(axis)]);
+        return std::clamp((static_cast<double>(world) - lo) / extent * cells, 0.0, cells);
+    }
+
+    // Spreads an amount over a box.
+    void add(std::vector<double>& content, const Box& box, double amount) const
+    {
+        std::array<std::size_t, 3> first{}, last{};
+        std::array<std::array<double, 2>, 3> ends{};
+        for (int axis = 0; axis < 3; ++axis) {
+            const std::size_t a = static_cast<std::size_t>(axis);
+            ends[a] = {onGrid(component(box.lo, axis), axis), onGrid(component(box.hi, axis), axis)};
+            first[a] = std::min(static_cast<std::size_t>(ends[a][0]), size_[a] - 1);
+            last[a] = std::min(static_cast<std::size_t>(ends[a][1]), size_[a] - 1);
+        }
+        const auto part = [&](std::size_t axis, std::size_t i) { // of the box, along an axis
+            const auto [lo, hi] = ends[axis];
+            if (!(hi > lo))
+                return 1.0;
+            const double at = static_cast<double>(i);
+            return std::max(0.0, std::min(hi, at + 1) - std::max(lo, at)) / (hi - lo);
+        };
+        for (std::size_t z = first[2]; z <= last[2]; ++z)
+            for (std::size_t y = first[1]; y <= last[1]; ++y)
+                for (std::size_t x = first[0]; x <= last[0]; ++x)
+                    content[indexOf(x, y, z)] += amount * part(0, x) * part(1, y) * part(2, z);
+    }
+
+    void addVolume(std::vector<double>& content, const VolumeObject& object, double samplesPerLength) const
+    {
+        const VisibleVoxels visible =
+            object.source.visible ? *object.source.visible : visibleVoxels(object.source); // generated: no file
+        std::size_t i = 0;
+        for (int z = 0; z < visible.blocks[2]; ++z)
+            for (int y = 0; y < visible.blocks[1]; ++y)
+                for (int x = 0; x < visible.blocks[0]; ++x) {
+                    if (visible.isSeen[i++] == 0)
+                        continue;
+                    Box block;
+                    const Index3 at{x, y, z};
+                    for (const int upper : {0, 1}) {
+                        Vec3 p;
+                        for (int axis = 0; axis < 3; ++axis) {
+                            const std::size_t a = static_cast<std::size_t>(axis);
+                            component(p, axis) = static_cast<float>(
+                                std::min((at[a] + upper) * visible.width[a], object.source.info.dims[a] - 1));
+                        }
+                        block.grow(object.placement.toWorld(p));
+                    }
+                    const Vec3 e = block.extent();
+                    add(content, block,
+                        samplesPerLength * static_cast<double>(e.x) * static_cast<double>(e.y)
+                            * static_cast<double>(e.z));
+                }
+    }
+
+    // Adds the sums of what the content costs when it is seen by this camera: rays lie the closer, the nearer they are
+    // to the eye, and there are none outside of the image. A dome has them all around.
+    void addView(const std::vector<double>& content, const dfb::PerspectiveCamera& camera,
+                 const RenderSettings& settings)
+    {
+        const Vec3 eye = camera.eye(), forward = camera.forward(), up = camera.up(), right = camera.right();
+        const double tangent = std::tan(0.5 * static_cast<double>(settings.view.fieldOfView) * detail::degree);
+        const double aspect = static_cast<double>(settings.width) / settings.height;
+        Vec3 cell;
+        for (int axis = 0; axis < 3; ++axis)
+            component(cell, axis) =
+                component(bounds_.extent(), axis) / static_cast<float>(size_[static_cast<std::size_t>(axis)]);
+        const double radius = 0.5 * static_cast<double>(length(cell));
+        const bool isDome = settings.view.kind == CameraKind::Dome;
+        std::vector<double> sums((size_[0] + 1) * (size_[1] + 1) * (size_[2] + 1));
+        for (std::size_t z = 0; z < size_[2]; ++z)
+            for (std::size_t y = 0; y < size_[1]; ++y)
+                for (std::size_t x = 0; x < size_[0]; ++x) {
+                    const Vec3 p =
+                        bounds_.lo
+                        + Vec3{(static_cast<float>(x) + 0.5f) * cell.x, (static_cast<float>(y) + 0.5f) * cell.y,
+                               (static_cast<float>(z) + 0.5f) * cell.z}
+                        - eye;
+                    const double far = std::max(static_cast<double>(length(p)), radius),
+                                 ahead = static_cast<double>(dot(p, forward));
+                    double rays = 1 / (far * far);
+                    if (!isDome) {
+                        const double high = std::max(ahead, radius) * tangent + radius,
+                                     wide = std::max(ahead, radius) * tangent * aspect + radius;
+                        const bool isInside = ahead > -radius && std::fabs(static_cast<double>(dot(p, up))) < high
+                                              && std::fabs(static_cast<double>(dot(p, right))) < wide;
+                        const double cosine = std::max(ahead, radius) / far;
+                        rays = isInside ? rays / (cosine * cosine * cosine) : 0;
+                    }
+                    sums[sumIndex(x + 1, y + 1, z + 1)] = content[indexOf(x, y, z)] * rays;
+                }
+        const double all = std::accumulate(sums.begin(), sums.end(), 0.0), cells = static_cast<double>(content.size());
+        for (std::size_t z = 1; z <= size_[2]; ++z)
+            for (std::size_t y = 1; y <= size_[1]; ++y)
+                for (std::size_t x = 1; x <= size_[0]; ++x) {
+                    double& s = sums[sumIndex(x, y, z)];
+                    s = (all > 0 ? s / all : 0) + roomPart / cells;
+                }
+        for (std::size_t axis = 0; axis < 3; ++axis)
+            for (std::size_t z = 1; z <= size_[2]; ++z)
+                for (std::size_t y = 1; y <= size_[1]; ++y)
+                    for (std::size_t x = 1; x <= size_[0]; ++x)
+                        sums[sumIndex(x, y, z)] += sums[sumIndex(x - (axis == 0), y - (axis == 1), z - (axis == 2))];
+        views_.push_back(std::move(sums));
+    }
+
+    std::size_t sumIndex(std::size_t x, std::size_t y, std::size_t z) const
+    {
+        return (z * (size_[1] + 1) + y) * (size_[0] + 1) + x;
+    }
+
+    // What lies before a point of the grid in all three axes.
+    double sumBefore(const std::vector<double>& sums, const std::array<double, 3>& at) const
+    {
+        std::array<std::size_t, 3> cell{};
+        std::array<double, 3> part{};
+        for (std::size_t axis = 0; axis < 3; ++axis) {
+            cell[axis] = std::min(static_cast<std::size_t>(at[axis]), size_[axis] - 1);
+            part[axis] = at[axis] - static_cast<double>(cell[axis]);
+        }
+        double all = 0;
+        for (std::size_t corner = 0; corner < 8; ++corner) {
+            const std::size_t x = corner & 1, y = corner >> 1 & 1, z = corner >> 2;
+            const double weight =
+                (x != 0 ? part[0] : 1 - part[0]) * (y != 0 ? part[1] : 1 - part[1]) * (z != 0 ? part[2] : 1 - part[2]);
+            all += weight * sums[sumIndex(cell[0] + x, cell[1] + y, cell[2] + z)];
+        }
+        return all;
+    }
+
+    // The part of a frame's cost that is in a box.
+    double costOf(const std::vector<double>& sums, const Grid& box) const
+    {
+        double all = 0;
+        for (std::size_t corner = 0; corner < 8; ++corner) {
+            std::array<double, 3> at{};
+            double sign = 1;
+            for (std::size_t axis = 0; axis < 3; ++axis) {
+                const bool isLower = (corner >> axis & 1) != 0;
+                at[axis] = isLower ? box.lo[axis] : box.hi[axis];
+                sign = isLower ? -sign : sign;
+            }
+            all += sign * sumBefore(sums, at);
+        }
+        return std::max(0.0, all);
+    }
+
+    struct Cut {
+        int axis = 0;
+        double at = 0;
+    };
+
+    // The parts of a box that is cut, for `lower` and `upper` bricks: what a brick of the costlier half has in the
+    // worst view.
+    double worstOf(const Grid& box, const Cut& cut, int lower, int upper) const
+    {
+        const auto [a, b] = halves(box, cut);
+        double worst = 0;
+        for (const auto& sums : views_)
+            worst = std::max({worst, costOf(sums, a) / lower, costOf(sums, b) / upper});
+        return worst;
+    }
+
+    static std::pair<Grid, Grid> halves(const Grid& box, const Cut& cut)
+    {
+        Grid a = box, b = box;
+        a.hi[static_cast<std::size_t>(cut.axis)] = b.lo[static_cast<std::size_t>(cut.axis)] = cut.at;
+        return {a, b};
+    }
+
+    // In the world.
+    double lengthOf(const Grid& box, int axis) const
+    {
+        const std::size_t i = static_cast<std::size_t>(axis);
+        return (box.hi[i] - box.lo[i]) / static_cast<double>(size_[i])
+               * static_cast<double>(component(bounds_.extent(), axis));
+    }
+
+    // The best place along an axis.
+    Cut balanced(const Grid& box, int axis, int lower, int upper) const
+    {
+        const std::size_t i = static_cast<std::size_t>(axis);
+        double first = box.lo[i], last = box.hi[i];
+        const double extent = last - first;
+        first += extent / 64;
+        last -= extent / 64;
+        for (int step = 0; step < 20; ++step) {
+            const double middle = 0.5 * (first + last);
+            const auto [a, b] = halves(box, {axis, middle});
+            double below = 0, above = 0;
+            for (const auto& sums : views_) {
+                below = std::max(below, costOf(sums, a) / lower);
+                above = std::max(above, costOf(sums, b) / upper);
+            }
+            (below < above ? first : last) = middle;
+        }
+        return {axis, 0.5 * (first + last)};
+    }
+
+    // The best cut, and what the costliest of the bricks has: exactly down to single bricks for few of them, else as if
+    // the halves could be cut evenly.
+    std::pair<Cut, double> best(const Grid& box, int count) const
+    {
+        if (count == 1) {
+            double worst = 0;
+            for (const auto& sums : views_)
+                worst = std::max(worst, costOf(sums, box));
+            return {{}, worst};
+        }
+        const int lower = count / 2, upper = count - lower;
+        std::pair<Cut, double> found{{}, std::numeric_limits<double>::infinity()};
+        for (int axis = 0; axis < 3; ++axis) {
+            if (lengthOf(box, axis) < thinnest * std::max({lengthOf(box, 0), lengthOf(box, 1), lengthOf(box, 2)}))
+                continue;
+            const Cut cut = balanced(box, axis, lower, upper);
+            double worst = 0;
+            if (count <= mostAhead) {
+                const auto [a, b] = halves(box, cut);
+                worst = std::max(best(a, lower).second, best(b, upper).second);
+            } else {
+                worst = worstOf(box, cut, lower, upper);
+            }
+            if (worst < found.second)
+                found = {cut, worst};
+        }
+        return found;
+    }
+
+    void bisect(const Grid& grid, const Box& box, int count, std::vector<Box>& cells) const
+    {
+        if (count == 1) {
+            cells.push_back(box);
+            return;
+        }
+        const Cut cut = best(grid, count).first;
+        const auto [a, b] = halves(grid, cut);
+        const std::size_t i = static_cast<std::size_t>(cut.axis);
+        const double part = (cut.at - grid.lo[i]) / (grid.hi[i] - grid.lo[i]);
+        const double lo = static_cast<double>(component(box.lo, cut.axis)),
+                     hi = static_cast<double>(component(box.hi, cut.axis));
+        Box lower = box, upper = box;
+        component(lower.hi, cut.axis) = component(upper.lo, cut.axis) = static_cast<float>(lo + part * (hi - lo));
+        bisect(a, lower, count / 2, cells);
+        bisect(b, upper, count - count / 2, cells);
+    }
+
+    Box bounds_;
+    std::array<std::size_t, 3> size_{};
+    std::vector<std::vector<double>> views_; // for each: sums of the parts of its cost before each corner of the grid
+};
+
+} // namespace example
