@@ -436,13 +436,13 @@ private:
         std::optional<Clock::time_point> deadline;
         if (damage)
             deadline = Clock::now() + (isFirst ? soon : late);
-        while (!ready()) {
+        do { // also if the parts of all were here: with Progress::Caller wait() sends the result on
             if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {
                 giveUp(damage->first, damage->second);
             } else if (!damage && (damage = takeDamage())) {
                 deadline = Clock::now() + soon;
             }
-        }
+        } while (!ready());
         if (damage && !wasBefore)
             keepDamage(damage->first, damage->second);
     }

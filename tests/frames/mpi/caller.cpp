@@ -21,10 +21,10 @@ using Op = dfb::BasicOrderedBlend<64>;
 using Fb = dfb::DistributedFrameBuffer<Op>;
 
 // The program's own barrier. False if it takes more than 20 seconds; then messages are moved until it is over.
-bool passesBarrier(Fb& fb)
+bool passesBarrier(Fb& fb, MPI_Comm comm = MPI_COMM_WORLD)
 {
     MPI_Request request = MPI_REQUEST_NULL;
-    MPI_Ibarrier(MPI_COMM_WORLD, &request);
+    MPI_Ibarrier(comm, &request);
     const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
     bool inTime = true;
     for (int done = 0; MPI_Test(&request, &done, MPI_STATUS_IGNORE), !done;) {
@@ -87,6 +87,33 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
         CHECK(failure.empty() == !cancelled);
         CHECK(passesBarrier(fb));
     }
+}
+
+TEST_CASE("Who comes last to a reduction has sent its result on when it leaves", "[mpi]")
+{
+    const int rank = rankIn(MPI_COMM_WORLD);
+    MPI_Comm pair = MPI_COMM_NULL; // in which rank 0 waits for one message alone
+    MPI_Comm_split(MPI_COMM_WORLD, rank < 2 ? 0 : MPI_UNDEFINED, rank, &pair);
+    if (pair == MPI_COMM_NULL)
+        return;
+    {
+        dfb::FrameBufferConfig config;
+        config.image.width = config.image.height = 64;
+        config.executor = std::make_shared<dfb::CallerExecutor>();
+        dfb::NetworkConfig options;
+        options.progress = dfb::Progress::Caller;
+        Fb fb(pair, config, options);
+        for (int round = 0; round < 3; ++round) {
+            while (fb.poll()) {
+            }
+            REQUIRE(passesBarrier(fb, pair));
+            while (rank == 0 && fb.size() > 1 && !fb.poll()) // until the other rank's part is here
+                std::this_thread::sleep_for(std::chrono::microseconds(200));
+            CHECK(fb.allReduce({rank + 1}, dfb::Reduce::Sum).front() == fb.size() * (fb.size() + 1) / 2);
+            CHECK(passesBarrier(fb, pair));
+        }
+    }
+    MPI_Comm_free(&pair);
 }
 
 } // namespace caller_cases
