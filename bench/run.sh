@@ -75,6 +75,8 @@ done
 for ranks in 2 4 8; do
     mpiexec -n "$ranks" "$bench"/bench_overlap --size 256x256,512x512,1024x1024 --views "$views" \
         --commit "$commit" --json "$results/overlap.json" --table "$results/overlap.md"
+    mpiexec -n "$ranks" "$bench"/bench_overlap --size 512x512 --views "$views" --in-a-row 7 \
+        --commit "$commit" --json "$results/overlap.json"
 done
 
 for figure in 6 7 8 9 10; do

@@ -3,7 +3,9 @@
 // rendering without any compositing, which both are compared with: on cores that are all busy what is done while others
 // render only moves the end of rendering.
 //   mpirun -n 4 bench_overlap [--size 512x512,...] [--views 12] [--json FILE] [--table FILE] [--commit ID] [--only
-//   TEXT]
+//   TEXT] [--in-a-row TIMES]
+// --in-a-row: how many frames a second come out where all views follow each other without a pause, with 1, 2 and 3 of
+// dfb's frames open at once, so many times in turns.
 #include "marched_bricks.hpp"
 
 #include <array>
@@ -24,6 +26,7 @@ using bench::MarchedSystem;
 struct Options {
     std::vector<std::array<int, 2>> sizes{{512, 512}};
     int views = 12;
+    int inARow = 0; // times that all views are rendered in a row; 0: single frames
     std::string json, table, commit, only;
 };
 
@@ -77,6 +80,79 @@ public:
         for (const MarchedSystem& s : systems)
             traffic.push_back(s.traffic ? s.traffic() : std::array<double, 2>{});
         report(systems, traffic, width, height, largest);
+    }
+
+    // All views in a row.
+    void runInARow(int width, int height)
+    {
+        dfb::FrameBufferConfig config;
+        config.image.width = width;
+        config.image.height = height;
+        config.executor = std::make_shared<dfb::CallerExecutor>();
+        std::vector<std::unique_ptr<bench::MarchedBricks>> all;
+        std::vector<MarchedSystem> systems;
+        for (const int frames : {1, 2, 3}) {
+            config.framesInFlight = frames;
+            all.push_back(std::make_unique<bench::MarchedBricks>(comm_, config, o_.views, false));
+            systems.push_back(all.back()->inFlight("dfb, " + std::to_string(frames) + " in flight"));
+        }
+        const std::vector<bench::MarchedView>& views = all.front()->views();
+        const auto eachView = [&views](const MarchedSystem& one) {
+            return MarchedSystem{one.name,
+                                 [one, &views](const bench::MarchedView&) {
+                                     double rendered = 0;
+                                     for (const bench::MarchedView& view : views)
+                                         rendered = one.frame(view);
+                                     return rendered;
+                                 },
+                                 one.image};
+        };
+        systems.push_back(eachView(all.front()->alone()));
+#ifdef DFB_BENCH_HAS_ICET
+        for (const bench::IceTStrategy& strategy : bench::icetStrategies()) {
+            const std::string name = strategy.name;
+            if (name == "direct" || name == "sequential, binary swap" || name == "sequential, tree")
+                systems.push_back(eachView(all.front()->icet(strategy)));
+        }
+#endif
+        bench::FrameTimer timer(comm_);
+        for (int turn = 0; turn <= o_.inARow; ++turn)
+            for (std::size_t i = 0; i < systems.size(); ++i) {
+                MarchedSystem& s = systems[(i + static_cast<std::size_t>(turn)) % systems.size()];
+                const bench::Times t = timer.time([&] { return s.frame(views.front()); }, s.image != nullptr);
+                if (turn > 0)
+                    s.times.push_back(t);
+            }
+        if (rank_ != 0)
+            return;
+        bench::Table table({"", "frames a second", "ms a frame", "CPU, all ranks [ms a frame]"});
+        std::vector<bench::Result> results;
+        for (const MarchedSystem& s : systems) {
+            std::vector<double> perSecond, ms, cpu;
+            for (const bench::Times& t : s.times) {
+                perSecond.push_back(1e3 * o_.views / t.image);
+                ms.push_back(t.image / o_.views);
+                cpu.push_back(t.cpu / o_.views);
+            }
+            bench::Result r;
+            r.bench = "bench_overlap";
+            r.system = s.name.substr(0, s.name.find_first_of(":,"));
+            r.config = s.name + ", in a row";
+            r.scene = "64^3 bricks, " + std::to_string(o_.views) + " views";
+            r.ranks = size_;
+            r.width = width;
+            r.height = height;
+            r.commit = o_.commit;
+            r.ms = bench::figureOf(ms);
+            r.cpuMs = bench::figureOf(cpu);
+            results.push_back(r);
+            table.add({s.name, bench::text(bench::figureOf(perSecond)), bench::text(r.ms), bench::text(r.cpuMs)});
+        }
+        const std::string title = std::to_string(width) + 'x' + std::to_string(height) + ", " + std::to_string(size_)
+                                  + " ranks, " + std::to_string(o_.views) + " views in a row";
+        table.print(title);
+        if (!o_.json.empty())
+            bench::appendJson(o_.json, results);
     }
 
 private:
@@ -175,9 +251,10 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_overlap [--size WxH,...] [--views N] [--json FILE] [--table FILE] "
-        "[--commit ID] [--only TEXT]",
+        "[--commit ID] [--only TEXT] [--in-a-row TIMES]",
         {{"--size", bench::readSizes(o.sizes)},
          {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},
+         {"--in-a-row", [&o](const std::string& value) { return (o.inARow = std::atoi(value.c_str())) > 0; }},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
          {"--commit", bench::readText(o.commit)},
@@ -193,6 +270,6 @@ int main(int argc, char** argv)
     bench::withMpi(argc, argv, [&](MPI_Comm comm) {
         Bench bench(comm, options);
         for (const auto& [width, height] : options.sizes)
-            bench.run(width, height);
+            options.inARow > 0 ? bench.runInARow(width, height) : bench.run(width, height);
     });
 }

@@ -13,6 +13,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <functional>
 #include <limits>
 #include <memory>
@@ -139,9 +140,9 @@ public:
     // Collective. The communicator remains the caller's; `config` has size and executor, and what else dfb should do.
     // `hasThreads`: see makeConnection().
     MarchedBricks(MPI_Comm comm, dfb::FrameBufferConfig config, int viewCount, bool hasThreads = true)
-        : comm_(comm), connection_(makeConnection(comm, hasThreads)), config_(std::move(config)), width_(config_.image.width),
-          height_(config_.image.height), rank_(rankIn(comm)), grid_(sizeOf(comm)), marcher_(boxOf(rank_)),
-          world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
+        : comm_(comm), connection_(makeConnection(comm, hasThreads)), config_(std::move(config)),
+          width_(config_.image.width), height_(config_.image.height), rank_(rankIn(comm)), grid_(sizeOf(comm)),
+          marcher_(boxOf(rank_)), world_({{static_cast<std::uint32_t>(rank_), boxOf(rank_)}}),
           image_(4 * static_cast<std::size_t>(width_) * static_cast<std::size_t>(height_), 0.0f)
     {
         config_.image.format = dfb::OutputFormat::RGBA32F;
@@ -177,6 +178,28 @@ public:
                 },
                 [this] { return ordered_->isDisplayRank() ? ordered_->image().rgba32f() : nullptr; },
                 trafficOf(report)};
+    }
+
+    // All views one after the other, as one frame: up to config.framesInFlight are open at once, so that a rank that
+    // has rendered its part of one begins the next. Of the view that it is given nothing is used.
+    MarchedSystem inFlight(const std::string& name)
+    {
+        return {name,
+                [this](const MarchedView&) {
+                    std::deque<Ordered::Frame> open;
+                    for (const MarchedView& view : views_) {
+                        if (static_cast<int>(open.size()) == config_.framesInFlight) {
+                            open.front().end();
+                            open.pop_front();
+                        }
+                        open.push_back(orderedLoop_->start(view.camera, view.order, renderer(view)));
+                    }
+                    const double rendered = now();
+                    for (auto& frame : open)
+                        frame.end();
+                    return rendered;
+                },
+                [this] { return ordered_->isDisplayRank() ? ordered_->image().rgba32f() : nullptr; }};
     }
 
     // dfb as in the paper: what comes is sorted. Collective.
