@@ -1,8 +1,9 @@
 #!/bin/sh
-# sh cmake/install_packages.sh [clang|bench|docs]
+# sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "docs" what the site needs: on Debian and
-# Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site and the examples of other
+# people's programs need: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when
+# nothing is missing.
 set -eu
 with=${1:-}
 
@@ -26,13 +27,14 @@ tools() {
     if [ "$with" = clang ] && ! echo 'int main() {}' | clang++ -fsanitize=thread -x c++ - -o /dev/null 2>/dev/null; then
         echo clang libclang-rt-dev
     fi
-    if [ "$with" = docs ] && ! have doxygen; then
+    if [ "$with" = tests ] && ! have doxygen; then
         echo doxygen doxygen-awesome-css
     fi
 }
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
+[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev"
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {
