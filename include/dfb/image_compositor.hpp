@@ -118,6 +118,10 @@ public:
     // the image is wrong, end() throws on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
+    // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
+    // on all ranks, this one among them. The next picture can be made. Waits for nobody. Throws InvalidArgument if a
+    // picture is open.
+    void startFailed(const std::exception_ptr& why, const FrameConfig& frame = {});
 
     // Whether end() would return without waiting; see DistributedFrameBuffer::Frame::isDone(). False without start().
     bool isDone()
@@ -152,6 +156,7 @@ public:
 private:
     std::unique_ptr<detail::Operations> makeOperations() const;
     void makeEngine(const FrameBufferConfig& config);
+    void begin(const FrameConfig& frame);
     void send(const InputImage& image, int place, bool usesDepth);
 
     std::shared_ptr<Connection> connection_;
@@ -322,7 +327,7 @@ DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
     makeEngine(config);
 }
 
-DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place, const FrameConfig& frame)
+DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
 {
     if (isOpen_)
         detail::failArgument("start() while a picture is open: end() it first");
@@ -334,6 +339,17 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
         declared.maxLayers = size();
     engine_->begin(declared);
     isOpen_ = true;
+}
+
+DFB_COMPILED_ONCE void ImageCompositor::startFailed(const std::exception_ptr& why, const FrameConfig& frame)
+{
+    begin(frame);
+    engine_->abort(why, -1);
+}
+
+DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place, const FrameConfig& frame)
+{
+    begin(frame);
     try {
         send(image, place, blend_ != ImageBlend::InOrder || config().image.depth);
     } catch (...) {

@@ -8,7 +8,9 @@
 #include <array>
 #include <cmath>
 #include <cstring>
+#include <exception>
 #include <limits>
+#include <stdexcept>
 #include <tuple>
 #include <type_traits>
 #include <utility>
@@ -322,6 +324,17 @@ struct Failures {
         dfb::InputImage both = good;
         both.rgba32f = depths.data();
         expectError(both, "two images", "of 8 bits and of floats");
+
+        const std::string failed = scene::outcomeOf([&] {
+            if (compositor.rank() < compositor.size() - 1)
+                compositor.start(good);
+            else
+                compositor.startFailed(std::make_exception_ptr(std::runtime_error("no mesh")));
+            compositor.end();
+        });
+        result.expect(failed.find("FrameError") != std::string::npos && failed.find("no mesh") != std::string::npos,
+                      "startFailed(): " + failed);
+        expectGood(imageWidth, imageHeight, "startFailed()");
 
         for (const auto& [width, height] : {std::make_pair(64, 31), std::make_pair(300, 200)}) {
             compositor.resize(width, height);
