@@ -22,3 +22,6 @@ if(DFB_DEVELOP_HEADER_ONLY)
 else()
   target_link_libraries(dfb_developer INTERFACE dfb_developer_flags dfb::compiled dfb::testing)
 endif()
+
+# Where bench/get_icet.sh puts IceT, for the adapter in its place, for its test and for benchmarks.
+set(DFB_ICET_DIR ${PROJECT_SOURCE_DIR}/build/peers/icet CACHE PATH "IceT: where include/IceT.h and lib are")

@@ -1,0 +1,132 @@
+// The context of an IceT client: its settings, its connection to the other ranks, and its frame.
+#pragma once
+
+#include "image.hpp"
+#include "viewport.hpp"
+
+#include <IceT.h>
+#include <dfb/dfb.hpp>
+#include <mpi.h>
+
+#include <array>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <vector>
+
+namespace dfb_icet {
+
+struct Tile {
+    Viewport viewport;
+    int displayRank = 0;
+};
+
+// What a client sets and icetCopyState() copies.
+struct Settings {
+    Settings();
+
+    bool isEnabled(IceTEnum option) const { return enabled[option - ICET_STATE_ENABLE_START]; }
+    Viewport wall() const; // all tiles
+    int tileOf(int displayRank) const;
+
+    IceTBitField diagnostics = ICET_DIAG_ALL_NODES | ICET_DIAG_WARNINGS;
+    IceTEnum colorFormat = ICET_IMAGE_COLOR_RGBA_UBYTE, depthFormat = ICET_IMAGE_DEPTH_FLOAT;
+    IceTEnum mode = ICET_COMPOSITE_MODE_Z_BUFFER;
+    IceTEnum strategy = static_cast<IceTEnum>(-1), singleImageStrategy = ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC;
+    std::vector<Tile> tiles;
+    int physicalWidth = 0, physicalHeight = 0;
+    std::vector<std::array<double, 3>> vertices; // around this rank's geometry; none: it may be anywhere
+    IceTDrawCallbackType draw = nullptr;
+    std::array<bool, ICET_STATE_ENABLE_END - ICET_STATE_ENABLE_START> enabled{};
+};
+
+// A frame: what it was called with, and what came out.
+struct Frame {
+    std::int64_t count = 0; // of this context
+    bool isPreRendered = false;
+    std::array<double, 16> projection{}, modelview{}; // column by column
+    std::array<float, 4> background{};
+    Viewport contained;                // the part of the wall that this rank has pixels in
+    double nearest = 1, farthest = -1; // of the vertices, as normalised depth
+    std::vector<int> tiles;            // that `contained` touches
+    double renderSeconds = 0, totalSeconds = 0;
+    std::int64_t bytesSent = 0;                    // by all ranks
+    std::int64_t tilesTouched = 0, tilesTotal = 0; // of the library's small ones
+};
+
+// The pictures of a context's tiles. Those that frames need again are kept.
+class Pictures {
+public:
+    struct Key {
+        int tile = 0, width = 0, height = 0, displayRank = 0;
+        dfb::OutputFormat format = dfb::OutputFormat::RGBA8;
+        dfb::ImageBlend blend = dfb::ImageBlend::Nearest;
+        bool depth = false;
+    };
+
+    // Drops what has not been used for long. Collective; to be called with the number of the context's next frame, as
+    // is the next, in the same order on all ranks.
+    void newFrame(std::int64_t frame);
+    dfb::ImageCompositor& find(const Key& key, const IceTContextStruct& context);
+
+private:
+    struct Entry {
+        Key key;
+        std::int64_t lastUse = 0;
+        std::unique_ptr<dfb::ImageCompositor> compositor;
+    };
+    std::vector<Entry> entries_;
+    std::int64_t frame_ = 0;
+};
+
+// What a client gives with a frame. Null matrices: none.
+struct View {
+    const IceTDouble *projection, *modelview;
+    const IceTFloat* background;
+};
+
+// Where this rank's pixels come from: the part of the wall outside of which there are none, if it is known, and the
+// input of each tile. An exception fails the frame on all ranks.
+struct Source {
+    bool isPreRendered = false;
+    const Viewport* limits = nullptr;
+    std::function<dfb::InputImage(int tile)> input;
+};
+
+// Makes a frame and returns the picture of this rank's tile, if it displays one. Collective.
+IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& source);
+
+// Finds Frame::contained and Frame::tiles: where the vertices are on the wall, and within `limits`, if given.
+void findContained(IceTContextStruct& context, const Viewport* limits);
+
+// The pixels of an image that shows the part `memory` of the wall, of which `part` is valid, as input of a tile.
+dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Viewport& memory, const Viewport& part,
+                        const Viewport& tile);
+
+double secondsNow();
+// Set by DFB_ICET_STATS and DFB_ICET_TIMEOUT, which is in seconds; 0: no limit.
+bool wantsStatistics();
+std::chrono::milliseconds timeLimit();
+
+} // namespace dfb_icet
+
+struct IceTContextStruct {
+    // Collective over `communicator`.
+    explicit IceTContextStruct(MPI_Comm communicator);
+    ~IceTContextStruct();
+
+    int rank() const noexcept { return connection->rank(); }
+    int size() const noexcept { return connection->size(); }
+
+    MPI_Comm comm = MPI_COMM_NULL; // for icetDataReplicationGroupColor()
+    std::shared_ptr<dfb::Connection> connection;
+    std::shared_ptr<dfb::Executor> executor; // of all pictures
+    dfb_icet::Settings settings;
+    std::vector<int> order;    // of the ranks, front to back
+    std::vector<int> replicas; // the ranks that have this rank's data, with this rank
+    bool hasGl = false, isDrawing = false;
+    dfb_icet::Frame frame;
+    dfb_icet::Pictures pictures;
+    dfb_icet::Image rendered, result; // of the draw callback, and of the last frame
+    std::vector<float> withAlpha;     // an RGB image as the library wants it
+};

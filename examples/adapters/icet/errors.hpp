@@ -1,0 +1,52 @@
+// Errors as IceT reports them: printed as icetDiagnostics() says, and kept for icetGetError().
+#pragma once
+
+#include <IceT.h>
+
+#include <exception>
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+struct IceTContextStruct;
+
+namespace dfb_icet {
+
+// An error that a client gets. `type` is what icetGetError() returns.
+class Error : public std::runtime_error {
+public:
+    Error(IceTEnum errorType, const std::string& text) : std::runtime_error(text), type(errorType) {}
+    IceTEnum type;
+};
+
+// Each reports one, by the diagnostics of the current context; without a context it prints all but debug messages.
+void raiseError(const char* function, const std::exception& error);
+void raiseWarning(const char* function, IceTEnum type, const std::string& text);
+void sayDebug(const std::string& text);
+
+// The context that calls work on. Throws Error if there is none.
+IceTContextStruct& currentContext();
+
+// Returns what body() does. No exception leaves an IceT function: it becomes an IceT error, and `fallback` is returned.
+template <class Body, class Result = decltype(std::declval<Body>()())>
+Result guarded(const char* function, Body&& body, Result fallback)
+{
+    try {
+        return body();
+    } catch (const std::exception& e) {
+        raiseError(function, e);
+    } catch (...) {
+        raiseError(function, Error(ICET_INVALID_OPERATION, "an exception of an unknown type"));
+    }
+    return fallback;
+}
+
+// Calls body(context) with the current context in this way.
+template <class Body>
+void inContext(const char* function, Body&& body)
+{
+    guarded(
+        function, [&] { return body(currentContext()), 0; }, 0);
+}
+
+} // namespace dfb_icet

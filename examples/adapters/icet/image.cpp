@@ -1,0 +1,217 @@
+#include "image.hpp"
+
+#include "errors.hpp"
+
+#include <algorithm>
+#include <cstring>
+
+namespace dfb_icet {
+
+std::size_t colorBytes(IceTEnum format)
+{
+    switch (format) {
+    case ICET_IMAGE_COLOR_NONE: return 0;
+    case ICET_IMAGE_COLOR_RGBA_UBYTE: return 4;
+    case ICET_IMAGE_COLOR_RGBA_FLOAT: return 4 * sizeof(float);
+#if defined(ICET_IMAGE_COLOR_RGB_FLOAT)
+    case ICET_IMAGE_COLOR_RGB_FLOAT: return 3 * sizeof(float);
+#endif
+    default: throw Error(ICET_INVALID_ENUM, "a color format that is not known");
+    }
+}
+
+std::size_t depthBytes(IceTEnum format)
+{
+    switch (format) {
+    case ICET_IMAGE_DEPTH_NONE: return 0;
+    case ICET_IMAGE_DEPTH_FLOAT: return sizeof(float);
+    default: throw Error(ICET_INVALID_ENUM, "a depth format that is not known");
+    }
+}
+
+std::byte* Image::ownColor(std::size_t bytes)
+{
+    owned.resize(bytes);
+    color = owned.data();
+    return owned.data();
+}
+
+void* Image::writableColor()
+{
+    const void* from = color;
+    if (from && from != shared.data() && from != owned.data()) {
+        const std::size_t bytes = pixelCount() * colorBytes(colorFormat);
+        std::memcpy(ownColor(bytes), from, bytes);
+    }
+    return const_cast<void*>(color);
+}
+
+const float* addAlpha(const float* rgb, const dfb::Region& part, int width, int height, std::vector<float>& memory)
+{
+    memory.resize(4 * static_cast<std::size_t>(width) * static_cast<std::size_t>(height));
+    for (int y = part.y0; y < part.y1; ++y)
+        for (int x = part.x0; x < part.x1; ++x) {
+            const std::size_t at =
+                static_cast<std::size_t>(y) * static_cast<std::size_t>(width) + static_cast<std::size_t>(x);
+            std::copy_n(rgb + 3 * at, 3, memory.data() + 4 * at);
+            memory[4 * at + 3] = 1;
+        }
+    return memory.data();
+}
+
+void dropAlpha(const float* rgba, std::size_t pixels, float* out)
+{
+    for (std::size_t i = 0; i < pixels; ++i)
+        std::copy_n(rgba + 4 * i, 3, out + 3 * i);
+}
+
+namespace {
+
+Image* imageOf(IceTImage image) { return static_cast<Image*>(image.opaque_internals); }
+
+bool isFloat(IceTEnum format)
+{
+#if defined(ICET_IMAGE_COLOR_RGB_FLOAT)
+    if (format == ICET_IMAGE_COLOR_RGB_FLOAT)
+        return true;
+#endif
+    return format == ICET_IMAGE_COLOR_RGBA_FLOAT;
+}
+
+Image& withColor(IceTImage image, bool isRight, const char* type)
+{
+    if (!isRight)
+        throw Error(ICET_INVALID_OPERATION, std::string("the image's colors are not of type ") + type);
+    return *imageOf(image);
+}
+Image& withBytes(IceTImage image)
+{
+    return withColor(image, icetImageGetColorFormat(image) == ICET_IMAGE_COLOR_RGBA_UBYTE, "ubyte");
+}
+Image& withFloats(IceTImage image) { return withColor(image, isFloat(icetImageGetColorFormat(image)), "float"); }
+
+Image& withDepth(IceTImage image)
+{
+    if (icetImageGetDepthFormat(image) != ICET_IMAGE_DEPTH_FLOAT)
+        throw Error(ICET_INVALID_OPERATION, "the image has no depth");
+    return *imageOf(image);
+}
+
+// As IceT does it: to the level below.
+IceTUByte levelOf(float value) { return static_cast<IceTUByte>(255 * std::clamp(value, 0.0f, 1.0f)); }
+
+void copyBytes(const IceTImage image, IceTUByte* out, IceTEnum format)
+{
+    if (format != ICET_IMAGE_COLOR_RGBA_UBYTE)
+        throw Error(ICET_INVALID_ENUM, "the color format is not of type ubyte");
+    if (icetImageGetColorFormat(image) != ICET_IMAGE_COLOR_RGBA_FLOAT) {
+        const Image& from = withBytes(image);
+        std::memcpy(out, from.color, 4 * from.pixelCount());
+        return;
+    }
+    const Image& from = withFloats(image);
+    const auto* values = static_cast<const float*>(from.color);
+    std::transform(values, values + 4 * from.pixelCount(), out, levelOf);
+}
+
+void copyFloats(const IceTImage image, IceTFloat* out, IceTEnum format)
+{
+    const IceTEnum own = icetImageGetColorFormat(image);
+    if (!isFloat(format))
+        throw Error(ICET_INVALID_ENUM, "the color format is not of type float");
+    if (own == format) {
+        const Image& from = withFloats(image);
+        std::memcpy(out, from.color, colorBytes(own) * from.pixelCount());
+        return;
+    }
+    const Image& from = withBytes(image);
+    const std::size_t channels = colorBytes(format) / sizeof(float);
+    const auto* levels = static_cast<const IceTUByte*>(from.color);
+    for (std::size_t i = 0; i < from.pixelCount(); ++i)
+        for (std::size_t c = 0; c < channels; ++c)
+            out[channels * i + c] = static_cast<float>(levels[4 * i + c]) / 255.0f;
+}
+
+} // namespace
+
+extern "C" {
+
+IceTImage icetImageNull() { return {nullptr}; }
+IceTBoolean icetImageIsNull(const IceTImage image) { return imageOf(image) ? ICET_FALSE : ICET_TRUE; }
+
+IceTEnum icetImageGetColorFormat(const IceTImage image)
+{
+    return imageOf(image) ? imageOf(image)->colorFormat : ICET_IMAGE_COLOR_NONE;
+}
+IceTEnum icetImageGetDepthFormat(const IceTImage image)
+{
+    return imageOf(image) ? imageOf(image)->depthFormat : ICET_IMAGE_DEPTH_NONE;
+}
+IceTSizeType icetImageGetWidth(const IceTImage image) { return imageOf(image) ? imageOf(image)->width : 0; }
+IceTSizeType icetImageGetHeight(const IceTImage image) { return imageOf(image) ? imageOf(image)->height : 0; }
+IceTSizeType icetImageGetNumPixels(const IceTImage image)
+{
+    return icetImageGetWidth(image) * icetImageGetHeight(image);
+}
+
+IceTUByte* icetImageGetColorub(IceTImage image)
+{
+    const auto find = [&] { return static_cast<IceTUByte*>(withBytes(image).writableColor()); };
+    return guarded("icetImageGetColorub", find, static_cast<IceTUByte*>(nullptr));
+}
+IceTUInt* icetImageGetColorui(IceTImage image)
+{
+    const auto find = [&] { return static_cast<IceTUInt*>(withBytes(image).writableColor()); };
+    return guarded("icetImageGetColorui", find, static_cast<IceTUInt*>(nullptr));
+}
+IceTFloat* icetImageGetColorf(IceTImage image)
+{
+    const auto find = [&] { return static_cast<IceTFloat*>(withFloats(image).writableColor()); };
+    return guarded("icetImageGetColorf", find, static_cast<IceTFloat*>(nullptr));
+}
+IceTFloat* icetImageGetDepthf(IceTImage image)
+{
+    const auto find = [&] { return const_cast<IceTFloat*>(withDepth(image).depth); };
+    return guarded("icetImageGetDepthf", find, static_cast<IceTFloat*>(nullptr));
+}
+
+const IceTUByte* icetImageGetColorcub(const IceTImage image)
+{
+    const auto find = [&] { return static_cast<const IceTUByte*>(withBytes(image).color); };
+    return guarded("icetImageGetColorcub", find, static_cast<const IceTUByte*>(nullptr));
+}
+const IceTFloat* icetImageGetColorcf(const IceTImage image)
+{
+    const auto find = [&] { return static_cast<const IceTFloat*>(withFloats(image).color); };
+    return guarded("icetImageGetColorcf", find, static_cast<const IceTFloat*>(nullptr));
+}
+const IceTFloat* icetImageGetDepthcf(const IceTImage image)
+{
+    const auto find = [&] { return withDepth(image).depth; };
+    return guarded("icetImageGetDepthcf", find, static_cast<const IceTFloat*>(nullptr));
+}
+
+void icetImageCopyColorub(const IceTImage image, IceTUByte* out, IceTEnum format)
+{
+    guarded(
+        "icetImageCopyColorub", [&] { return copyBytes(image, out, format), 0; }, 0);
+}
+void icetImageCopyColorf(const IceTImage image, IceTFloat* out, IceTEnum format)
+{
+    guarded(
+        "icetImageCopyColorf", [&] { return copyFloats(image, out, format), 0; }, 0);
+}
+void icetImageCopyDepthf(const IceTImage image, IceTFloat* out, IceTEnum format)
+{
+    const auto copy = [&] {
+        if (format != ICET_IMAGE_DEPTH_FLOAT)
+            throw Error(ICET_INVALID_ENUM, "the depth format is not of type float");
+        const Image& from = withDepth(image);
+        std::memcpy(out, from.depth, sizeof(float) * from.pixelCount());
+        return 0;
+    };
+    guarded("icetImageCopyDepthf", copy, 0);
+}
+}
+
+} // namespace dfb_icet
