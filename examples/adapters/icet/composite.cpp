@@ -272,6 +272,8 @@ IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& 
 {
     const Drawing drawing(context.isDrawing);
     const double before = secondsNow();
+    if (!context.connection)
+        throw Error(ICET_INVALID_OPERATION, "MPI has been finalised");
     Frame& frame = context.frame;
     ++frame.count;
     frame.isPreRendered = source.isPreRendered;

@@ -4,6 +4,7 @@
 #include "errors.hpp"
 
 #include <algorithm>
+#include <chrono>
 #include <cstdlib>
 #include <numeric>
 
@@ -15,17 +16,58 @@ namespace {
 
 IceTContext current = nullptr;
 
-// How often each rank, by its place, has which colour. Waits without keeping the core of a rank that has to come yet.
+// The colour of each rank. Waits without keeping the core from a rank that has to come yet.
 std::vector<int> gatherColors(const IceTContextStruct& context, int color)
 {
-    std::vector<int> all(static_cast<std::size_t>(context.size()));
+    struct Gather {
+        int own;
+        std::vector<int> all;
+    };
+    auto gather = std::make_unique<Gather>(Gather{color, std::vector<int>(static_cast<std::size_t>(context.size()))});
     MPI_Request request = MPI_REQUEST_NULL;
-    MPI_Iallgather(&color, 1, MPI_INT, all.data(), 1, MPI_INT, context.comm, &request);
+    MPI_Iallgather(&gather->own, 1, MPI_INT, gather->all.data(), 1, MPI_INT, context.comm, &request);
     const double limit = secondsNow() + std::chrono::duration<double>(timeLimit()).count();
     for (int isDone = 0; MPI_Test(&request, &isDone, MPI_STATUS_IGNORE), !isDone; sched_yield())
-        if (timeLimit().count() > 0 && secondsNow() > limit)
-            throw Error(ICET_INVALID_OPERATION, "some rank does not call it");
-    return all;
+        if (timeLimit().count() > 0 && secondsNow() > limit) {
+            gather.release(); // MPI may still write there
+            throw Error(ICET_INVALID_OPERATION, "not all ranks call it");
+        }
+    return gather->all;
+}
+
+// Contexts that are there, in the order in which they were made, which is the same on all ranks.
+std::vector<IceTContext> contexts;
+
+// MPI_Finalize() begins with this. A client may forget its contexts, and they may have threads that call MPI.
+int closeAll(MPI_Comm, int, void*, void*)
+{
+    for (const IceTContext context : contexts)
+        guarded(
+            "MPI_Finalize", [&] { return context->close(), 0; }, 0);
+    return MPI_SUCCESS;
+}
+
+void closeBeforeMpiEnds(IceTContext context)
+{
+    static bool isAsked = false;
+    contexts.push_back(context);
+    if (isAsked)
+        return;
+    int key = MPI_KEYVAL_INVALID;
+    MPI_Comm_create_keyval(MPI_COMM_NULL_COPY_FN, closeAll, &key, nullptr);
+    MPI_Comm_set_attr(MPI_COMM_SELF, key, nullptr);
+    MPI_Comm_free_keyval(&key);
+    isAsked = true;
+}
+
+void forget(IceTContext context) { contexts.erase(std::find(contexts.begin(), contexts.end(), context)); }
+
+// A rank that has one processor composites where it waits, and makes no threads.
+std::shared_ptr<dfb::Executor> makeExecutor(const dfb::Connection& connection)
+{
+    if (connection.config().progress == dfb::Progress::Caller && connection.threadShare() == 1)
+        return std::make_shared<dfb::CallerExecutor>();
+    return std::make_shared<dfb::ThreadExecutor>(connection.threadShare());
 }
 
 } // namespace
@@ -52,7 +94,10 @@ int Settings::tileOf(int displayRank) const
     return place == tiles.end() ? -1 : static_cast<int>(place - tiles.begin());
 }
 
-double secondsNow() { return MPI_Wtime(); }
+double secondsNow()
+{
+    return std::chrono::duration<double>(std::chrono::steady_clock::now().time_since_epoch()).count();
+}
 
 bool wantsStatistics()
 {
@@ -115,19 +160,29 @@ extern "C" IceTBoolean icetGLIsInitialized() { return current && current->hasGl 
 
 } // namespace dfb_icet
 
-IceTContextStruct::IceTContextStruct(MPI_Comm communicator) : connection(dfb::connect(communicator))
+IceTContextStruct::IceTContextStruct(MPI_Comm communicator)
+    : connection(dfb::connect(communicator)), executor(dfb_icet::makeExecutor(*connection)), ownRank(connection->rank())
 {
     MPI_Comm_dup(communicator, &comm);
-    executor = std::make_shared<dfb::ThreadExecutor>(connection->threadShare());
-    order.resize(static_cast<std::size_t>(size()));
+    order.resize(static_cast<std::size_t>(connection->size()));
     std::iota(order.begin(), order.end(), 0);
-    replicas = {rank()};
+    replicas = {ownRank};
+    dfb_icet::closeBeforeMpiEnds(this);
 }
 
 IceTContextStruct::~IceTContextStruct()
 {
-    int isFinalised = 0;
-    MPI_Finalized(&isFinalised);
-    if (!isFinalised)
-        MPI_Comm_free(&comm);
+    close();
+    dfb_icet::forget(this);
+}
+
+void IceTContextStruct::close()
+{
+    if (!connection)
+        return;
+    rendered = {};
+    result = {};
+    pictures.clear();
+    connection.reset();
+    MPI_Comm_free(&comm);
 }

@@ -9,6 +9,7 @@
 #include <mpi.h>
 
 #include <array>
+#include <chrono>
 #include <cstdint>
 #include <functional>
 #include <memory>
@@ -68,6 +69,7 @@ public:
     // is the next, in the same order on all ranks.
     void newFrame(std::int64_t frame);
     dfb::ImageCompositor& find(const Key& key, const IceTContextStruct& context);
+    void clear() { entries_.clear(); }
 
 private:
     struct Entry {
@@ -111,16 +113,19 @@ std::chrono::milliseconds timeLimit();
 } // namespace dfb_icet
 
 struct IceTContextStruct {
-    // Collective over `communicator`.
+    // Collective over `communicator`, as are the next two.
     explicit IceTContextStruct(MPI_Comm communicator);
     ~IceTContextStruct();
+    // Leaves MPI, which is about to end. Frames are errors then.
+    void close();
 
-    int rank() const noexcept { return connection->rank(); }
-    int size() const noexcept { return connection->size(); }
+    int rank() const noexcept { return ownRank; }
+    int size() const noexcept { return static_cast<int>(order.size()); }
 
-    MPI_Comm comm = MPI_COMM_NULL; // for icetDataReplicationGroupColor()
-    std::shared_ptr<dfb::Connection> connection;
-    std::shared_ptr<dfb::Executor> executor; // of all pictures
+    MPI_Comm comm = MPI_COMM_NULL;               // for icetDataReplicationGroupColor()
+    std::shared_ptr<dfb::Connection> connection; // null after close()
+    std::shared_ptr<dfb::Executor> executor;     // of all pictures
+    int ownRank = 0;
     dfb_icet::Settings settings;
     std::vector<int> order;    // of the ranks, front to back
     std::vector<int> replicas; // the ranks that have this rank's data, with this rank

@@ -1,0 +1,325 @@
+// A client that links libdfb_icet in place of IceT, and what it is told when something is wrong:
+//   mpirun -n 3 test_icet_client errors      calls that are wrong, on one rank or on all
+//   mpirun -n 3 test_icet_client moves       tiles that change their size and rank, frame by frame
+//   mpirun -n 2 test_icet_client differs     ranks that have set different tiles
+//   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1)
+//   mpirun -n 2 test_icet_client finalised   a context that outlives MPI
+// With "multiple" as the second word at MPI_THREAD_MULTIPLE, else at MPI_THREAD_SINGLE. Returns 0 if all is well.
+#include <IceT.h>
+#include <mpi.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdint>
+#include <cstdio>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+extern "C" {
+IceTCommunicator icetCreateMPICommunicator(MPI_Comm comm);
+void icetDestroyMPICommunicator(IceTCommunicator communicator);
+void icetGLInitialize();
+IceTBoolean icetGLIsInitialized();
+}
+
+namespace {
+
+int rank = 0, ranks = 1, failures = 0;
+
+void expect(bool isFine, const std::string& what)
+{
+    if (isFine)
+        return;
+    ++failures;
+    std::fprintf(stderr, "icet client, rank %d of %d: %s\n", rank, ranks, what.c_str());
+}
+
+void expectError(IceTEnum type, const std::string& what)
+{
+    const IceTEnum error = icetGetError();
+    expect(error == type, what + ": error " + std::to_string(error) + " instead of " + std::to_string(type));
+}
+
+constexpr IceTDouble identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+constexpr IceTFloat black[4] = {0, 0, 0, 0};
+
+IceTContext makeContext()
+{
+    IceTCommunicator communicator = icetCreateMPICommunicator(MPI_COMM_WORLD);
+    expect(communicator->Comm_rank(communicator) == rank && communicator->Comm_size(communicator) == ranks,
+           "the communicator is another");
+    IceTContext context = icetCreateContext(communicator);
+    icetDestroyMPICommunicator(communicator);
+    icetDiagnostics(ICET_DIAG_OFF);
+    icetStrategy(ICET_STRATEGY_REDUCE);
+    return context;
+}
+
+// Each rank has a column of its colour, the nearer the higher its number.
+struct Picture {
+    Picture(int pictureWidth, int pictureHeight) : width(pictureWidth), height(pictureHeight)
+    {
+        for (int i = 0; i < width * height; ++i) {
+            const bool isThere = i % width >= rank;
+            colors.push_back(isThere ? 0xff000000u + static_cast<std::uint32_t>(rank) : 0);
+            depths.push_back(isThere ? 0.5f - 0.1f * static_cast<float>(rank) : 1.0f);
+        }
+    }
+
+    IceTImage composite() const
+    {
+        return icetCompositeImage(colors.data(), depths.data(), nullptr, identity, identity, black);
+    }
+    void check(IceTImage image, int display, const std::string& what) const
+    {
+        expectError(ICET_NO_ERROR, what);
+        expect(icetImageIsNull(image) == (rank != display), what + ": an image on a wrong rank");
+        if (icetImageIsNull(image))
+            return;
+        expect(icetImageGetWidth(image) == width && icetImageGetHeight(image) == height, what + ": the size");
+        const auto* words = reinterpret_cast<const std::uint32_t*>(icetImageGetColorcub(image));
+        for (int i = 0; i < width * height; ++i)
+            if (words[i] != 0xff000000u + static_cast<std::uint32_t>(std::min(i % width, ranks - 1))) {
+                expect(false, what + ": pixel " + std::to_string(i));
+                return;
+            }
+    }
+
+    int width, height;
+    std::vector<std::uint32_t> colors;
+    std::vector<float> depths;
+};
+
+void expectGoodFrame(const std::string& what)
+{
+    const Picture picture(40, 30);
+    picture.check(picture.composite(), 0, "a frame after " + what);
+}
+
+// ---- what is tried
+
+void tryWithoutContext()
+{
+    expect(icetGetContext() == nullptr, "there is a context");
+    expect(icetAddTile(0, 0, 4, 4, 0) == -1, "a tile without a context");
+    expectError(ICET_INVALID_OPERATION, "a tile without a context");
+    IceTCommunicatorStruct own{};
+    own.Duplicate = [](IceTCommunicator self) { return self; };
+    expect(icetCreateContext(&own) == nullptr, "a context of a client's own communicator");
+    expectError(ICET_INVALID_OPERATION, "a client's own communicator");
+    expect(icetCreateContext(nullptr) == nullptr, "a context of no communicator");
+    expectError(ICET_INVALID_VALUE, "no communicator");
+}
+
+void trySettings()
+{
+    expect(!icetGLIsInitialized(), "GL before icetGLInitialize()");
+    icetGLInitialize();
+    expect(icetGLIsInitialized(), "no GL after icetGLInitialize()");
+    expect(icetAddTile(0, 0, 0, 4, 0) == -1, "a tile without pixels");
+    expectError(ICET_INVALID_VALUE, "a tile without pixels");
+    expect(icetAddTile(0, 0, 4, 4, ranks) == -1, "a tile of a rank that is not there");
+    expectError(ICET_INVALID_VALUE, "a tile of a rank that is not there");
+    expect(icetAddTile(0, 0, 40, 30, 0) == 0, "the first tile");
+    expect(icetAddTile(4, 0, 4, 4, 0) == -1, "a second tile of a rank");
+    expectError(ICET_INVALID_VALUE, "a second tile of a rank");
+    icetPhysicalRenderSize(3, 3);
+    expectError(ICET_INVALID_VALUE, "a render size below that of a tile");
+    icetPhysicalRenderSize(40, 30);
+    for (const auto& [set, value] : std::vector<std::pair<void (*)(IceTEnum), IceTEnum>>{{icetStrategy, 7},
+                                                                                         {icetSingleImageStrategy, 7},
+                                                                                         {icetCompositeMode, 7},
+                                                                                         {icetSetColorFormat, 7},
+                                                                                         {icetSetDepthFormat, 7}}) {
+        set(value);
+        expectError(ICET_INVALID_ENUM, "an unknown value");
+    }
+    icetEnable(7);
+    expectError(ICET_INVALID_VALUE, "an unknown option");
+    icetDisable(7);
+    expectError(ICET_INVALID_VALUE, "an unknown option");
+    IceTInt value = 0;
+    icetGetIntegerv(0x7f, &value);
+    expectError(ICET_INVALID_ENUM, "an unknown state");
+    const std::vector<IceTInt> zeros(static_cast<std::size_t>(ranks), 0);
+    icetCompositeOrder(zeros.data());
+    expectError(ranks == 1 ? ICET_NO_ERROR : ICET_INVALID_VALUE, "an order that has a rank twice");
+    icetBoundingVertices(3, ICET_POINTER, 0, 1, &value);
+    expectError(ICET_INVALID_ENUM, "vertices of an unknown type");
+    icetEnable(7);
+    icetPhysicalRenderSize(3, 3);
+    expectError(ICET_INVALID_VALUE, "the error before a warning");
+    expectError(ICET_NO_ERROR, "an error that was read");
+    icetPhysicalRenderSize(40, 30);
+    icetGetError();
+}
+
+void expectFailure(IceTImage image, const std::string& what)
+{
+    expect(icetImageIsNull(image), what + ": an image");
+    expect(icetGetError() != ICET_NO_ERROR, what + ": no error");
+    expectGoodFrame(what);
+}
+
+bool throwsNow = false, recursNow = false;
+
+void draw(const IceTDouble*, const IceTDouble*, const IceTFloat*, const IceTInt*, IceTImage image)
+{
+    if (throwsNow)
+        throw std::runtime_error("no mesh here");
+    if (recursNow) {
+        expect(icetImageIsNull(icetDrawFrame(identity, identity, black)), "a frame within a frame");
+        expectError(ICET_INVALID_OPERATION, "a frame within a frame");
+        icetSetColorFormat(ICET_IMAGE_COLOR_RGBA_FLOAT);
+        expectError(ICET_INVALID_OPERATION, "a format within a frame");
+    }
+    const Picture picture(40, 30);
+    std::copy(picture.colors.begin(), picture.colors.end(), icetImageGetColorui(image));
+    std::copy(picture.depths.begin(), picture.depths.end(), icetImageGetDepthf(image));
+}
+
+void tryFrames()
+{
+    const Picture picture(40, 30);
+    const bool isLast = rank == ranks - 1;
+    expectGoodFrame("nothing");
+    icetSetDepthFormat(ICET_IMAGE_DEPTH_NONE);
+    IceTImage image = picture.composite();
+    icetSetDepthFormat(ICET_IMAGE_DEPTH_FLOAT);
+    expectFailure(image, "nearest without depth");
+    expectFailure(icetCompositeImage(picture.colors.data(), isLast ? nullptr : picture.depths.data(), nullptr, identity,
+                                     identity, black),
+                  "no depths on one rank");
+    expectFailure(icetCompositeImage(isLast ? nullptr : picture.colors.data(), picture.depths.data(), nullptr, identity,
+                                     identity, black),
+                  "no colors on one rank");
+    icetDrawCallback(isLast ? nullptr : draw);
+    expectFailure(icetDrawFrame(identity, identity, black), "nothing to draw on one rank");
+    icetDrawCallback(draw);
+    throwsNow = isLast;
+    expectFailure(icetDrawFrame(identity, identity, black), "an exception on one rank");
+    throwsNow = false;
+    recursNow = true;
+    picture.check(icetDrawFrame(identity, identity, black), 0, "calls that fail in the draw callback");
+    recursNow = false;
+    image = icetDrawFrame(identity, identity, black);
+    if (rank == 0) {
+        expect(!icetImageGetColorf(image), "bytes as floats");
+        expectError(ICET_INVALID_OPERATION, "bytes as floats");
+        expect(!icetImageGetDepthf(image), "depth of a picture without");
+        expectError(ICET_INVALID_OPERATION, "depth of a picture without");
+        icetImageCopyColorub(image, nullptr, ICET_IMAGE_COLOR_RGBA_FLOAT);
+        expectError(ICET_INVALID_ENUM, "a copy in a format of another type");
+    } else {
+        expect(icetImageGetWidth(image) == 0 && icetImageGetColorFormat(image) == ICET_IMAGE_COLOR_NONE, "no image");
+        expect(!icetImageGetColorui(image), "colors of no image");
+        expectError(ICET_INVALID_OPERATION, "colors of no image");
+    }
+    icetCompositeMode(ICET_COMPOSITE_MODE_BLEND);
+    image = picture.composite();
+    expectError(ICET_INVALID_VALUE, "depth where colors are blended"); // a warning
+    expect(icetImageIsNull(image) == (rank != 0), "a blended picture");
+    icetCompositeMode(ICET_COMPOSITE_MODE_Z_BUFFER);
+    icetResetTiles();
+    expect(icetImageIsNull(picture.composite()), "a picture without tiles");
+    expectError(ICET_NO_ERROR, "a picture without tiles");
+}
+
+void tryErrors()
+{
+    tryWithoutContext();
+    IceTContext context = makeContext();
+    trySettings();
+    tryFrames();
+    IceTContext other = makeContext();
+    icetCopyState(other, context);
+    IceTInt strategy = 0;
+    icetGetIntegerv(ICET_STRATEGY, &strategy);
+    expect(strategy == static_cast<IceTInt>(ICET_STRATEGY_REDUCE), "a copied state");
+    icetDestroyContext(context);
+    expect(icetGetContext() == other, "another context than the destroyed one is not current any more");
+    icetDestroyContext(other);
+    expect(icetGetContext() == nullptr, "a destroyed context is current");
+}
+
+void tryMoves()
+{
+    IceTContext context = makeContext();
+    for (int frame = 0; frame < 60; ++frame) {
+        const int width = 20 + frame % 17 * 11, height = 30 + frame % 5, display = frame % ranks;
+        icetResetTiles();
+        icetAddTile(0, 0, width, height, display);
+        const Picture picture(width, height);
+        picture.check(picture.composite(), display, "frame " + std::to_string(frame));
+    }
+    icetDestroyContext(context);
+}
+
+void tryDifferences()
+{
+    IceTContext context = makeContext();
+    icetAddTile(0, 0, 40, 30 + rank, 0);
+    const Picture picture(40, 30 + rank);
+    expect(icetImageIsNull(picture.composite()), "a picture of different tiles");
+    expectError(ICET_INVALID_VALUE, "different tiles");
+    icetResetTiles();
+    icetAddTile(0, 0, 40, 30, 0);
+    expectGoodFrame("different tiles");
+    icetDestroyContext(context);
+}
+
+void tryAbsence()
+{
+    IceTContext context = makeContext();
+    icetAddTile(0, 0, 40, 30, 0);
+    expectGoodFrame("nothing");
+    if (rank < ranks - 1) {
+        const auto before = std::chrono::steady_clock::now();
+        expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without one rank");
+        expectError(ICET_INVALID_OPERATION, "a rank that does not call");
+        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(15), "it takes long");
+    }
+    icetDestroyContext(context);
+}
+
+void tryFinalised()
+{
+    IceTContext context = makeContext();
+    icetAddTile(0, 0, 40, 30, 0);
+    makeContext(); // and forgotten
+    icetSetContext(context);
+    expectGoodFrame("nothing");
+    MPI_Finalize();
+    expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without MPI");
+    expectError(ICET_INVALID_OPERATION, "a picture without MPI");
+    icetDestroyContext(context);
+    expect(icetGetContext() == nullptr, "a destroyed context is current");
+}
+
+} // namespace
+
+int main(int count, char** words)
+{
+    const std::string what = count > 1 ? words[1] : "";
+    const bool isMultiple = count > 2 && words[2] == std::string("multiple");
+    int level = 0;
+    MPI_Init_thread(&count, &words, isMultiple ? MPI_THREAD_MULTIPLE : MPI_THREAD_SINGLE, &level);
+    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+    MPI_Comm_size(MPI_COMM_WORLD, &ranks);
+    if (what == "errors")
+        tryErrors();
+    else if (what == "moves")
+        tryMoves();
+    else if (what == "differs")
+        tryDifferences();
+    else if (what == "absent")
+        tryAbsence();
+    else if (what == "finalised")
+        tryFinalised();
+    else
+        expect(false, "what is to be tried?");
+    if (what != "finalised")
+        MPI_Finalize();
+    return failures == 0 ? 0 : 1;
+}

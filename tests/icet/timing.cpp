@@ -1,0 +1,192 @@
+// How long icetCompositeImage takes, of IceT by each of its strategies and of libdfb_icet, frame by frame in turn:
+//   mpirun -n 4 test_icet_timing IceTCore.so libdfb_icet.so [--frames N] [--size PIXELS]
+// Prints the median over the frames of the time from a barrier until the last rank returns.
+//   dense:  each rank has pixels everywhere
+//   bricks: each rank has pixels in a rectangle of its own, of 1/ranks of the picture and half as much around it
+#include "setup.hpp"
+
+#include "icet.hpp"
+
+#include <mpi.h>
+
+#include <cstdio>
+#include <cstdlib>
+#include <string>
+
+namespace icet_test {
+namespace {
+
+// ---- the images
+
+struct Images {
+    std::vector<std::uint8_t> bytes;
+    std::vector<float> floats, depth;
+    IceTInt valid[4] = {0, 0, 0, 0};
+};
+
+// A smooth layer, a third opaque: what a rendered image looks like to a compositor.
+Images makeImages(int size, int rank, int ranks, bool isBricks)
+{
+    Images images;
+    int columns = 1;
+    while ((columns + 1) * (columns + 1) <= ranks)
+        ++columns;
+    const int rows = (ranks + columns - 1) / columns;
+    const int width = isBricks ? size / columns : size, height = isBricks ? size / rows : size;
+    const int x0 = isBricks ? std::max(0, rank % columns * width - width / 8) : 0;
+    const int y0 = isBricks ? std::max(0, rank / columns * height - height / 8) : 0;
+    const int x1 = std::min(size, x0 + width * 5 / 4), y1 = std::min(size, y0 + height * 5 / 4);
+    const auto count = static_cast<std::size_t>(size) * static_cast<std::size_t>(size);
+    images.bytes.resize(4 * count);
+    images.depth.assign(count, 1.0f);
+    for (int y = y0; y < y1; ++y)
+        for (int x = x0; x < x1; ++x) {
+            const std::size_t at =
+                static_cast<std::size_t>(y) * static_cast<std::size_t>(size) + static_cast<std::size_t>(x);
+            const int alpha = (x / 32 + y / 32 + rank) % 3 == 0 ? 255 : 40 + (x + y) % 120;
+            images.bytes[4 * at + 3] = static_cast<std::uint8_t>(alpha);
+            for (std::size_t c = 0; c < 3; ++c)
+                images.bytes[4 * at + c] =
+                    static_cast<std::uint8_t>(alpha * ((x + 50 * static_cast<int>(c)) % 256) / 255);
+            images.depth[at] = static_cast<float>((7 * x + 3 * y + 400 * rank) % 1000) / 1000;
+        }
+    images.floats.resize(4 * count);
+    for (std::size_t i = 0; i < 4 * count; ++i)
+        images.floats[i] = static_cast<float>(images.bytes[i]) / 255;
+    images.valid[0] = x0, images.valid[1] = y0, images.valid[2] = x1 - x0, images.valid[3] = y1 - y0;
+    return images;
+}
+
+// ---- what is timed
+
+enum class Way { BlendBytes, BlendFloats, NearestBytes };
+
+struct Strategy {
+    const char* name;
+    IceTEnum strategy, single;
+};
+const Strategy strategies[] = {
+    {"sequential, automatic", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
+    {"sequential, binary swap", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_BSWAP},
+    {"sequential, tree", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_TREE},
+    {"sequential, radix-k", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_RADIXK},
+    {"reduce", ICET_STRATEGY_REDUCE, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
+    {"direct", ICET_STRATEGY_DIRECT, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
+};
+
+struct Client {
+    const Api* api;
+    IceTContext context;
+    Strategy strategy;
+    std::vector<double> seconds;
+
+    double median() const
+    {
+        std::vector<double> sorted = seconds;
+        std::sort(sorted.begin(), sorted.end());
+        return 1e3 * sorted[sorted.size() / 2];
+    }
+};
+
+void barrier()
+{
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Ibarrier(MPI_COMM_WORLD, &request);
+    bench::complete(request, bench::Waiting::Yield);
+}
+
+void set(const Client& client, Way way, int size)
+{
+    const Api& api = *client.api;
+    api.icetSetContext(client.context);
+    api.icetDiagnostics(ICET_DIAG_ERRORS | ICET_DIAG_ALL_NODES);
+    api.icetResetTiles();
+    api.icetAddTile(0, 0, size, size, 0);
+    const bool blends = way != Way::NearestBytes;
+    api.icetSetColorFormat(way == Way::BlendFloats ? ICET_IMAGE_COLOR_RGBA_FLOAT : ICET_IMAGE_COLOR_RGBA_UBYTE);
+    api.icetSetDepthFormat(blends ? ICET_IMAGE_DEPTH_NONE : ICET_IMAGE_DEPTH_FLOAT);
+    api.icetCompositeMode(blends ? ICET_COMPOSITE_MODE_BLEND : ICET_COMPOSITE_MODE_Z_BUFFER);
+    api.icetEnable(ICET_ORDERED_COMPOSITE);
+    api.icetStrategy(client.strategy.strategy);
+    api.icetSingleImageStrategy(client.strategy.single);
+}
+
+// The longest time of a rank.
+double timeFrame(const Client& client, Way way, const Images& images)
+{
+    constexpr IceTDouble identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
+    constexpr IceTFloat background[4] = {0, 0, 0, 0};
+    const void* color = way == Way::BlendFloats ? static_cast<const void*>(images.floats.data()) : images.bytes.data();
+    client.api->icetSetContext(client.context);
+    barrier();
+    const double before = MPI_Wtime();
+    client.api->icetCompositeImage(color, way == Way::NearestBytes ? images.depth.data() : nullptr, images.valid,
+                                   identity, identity, background);
+    double seconds = MPI_Wtime() - before, longest = 0;
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Iallreduce(&seconds, &longest, 1, MPI_DOUBLE, MPI_MAX, MPI_COMM_WORLD, &request);
+    bench::complete(request, bench::Waiting::Yield);
+    return longest;
+}
+
+int run(int count, char** words)
+{
+    if (count < 3)
+        throw std::runtime_error("usage: test_icet_timing ICET DFB_ICET [--frames N] [--size PIXELS]");
+    int frames = 40, size = 1024, rank = 0, ranks = 1;
+    for (int i = 3; i + 1 < count; i += 2)
+        (words[i] == std::string("--size") ? size : frames) = std::atoi(words[i + 1]);
+    MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+    MPI_Comm_size(MPI_COMM_WORLD, &ranks);
+    const Api icet("IceT", words[1]), dfb("dfb_icet", words[2]);
+    bench::IceTTraffic traffic;
+    bench::IceTMpi mpi(MPI_COMM_WORLD, bench::Waiting::Yield, traffic);
+    IceTCommunicator (*create)(MPI_Comm) = nullptr;
+    dfb.find(create, "icetCreateMPICommunicator");
+    std::vector<Client> clients;
+    for (const Strategy& strategy : strategies)
+        clients.push_back({&icet, icet.icetCreateContext(&mpi), strategy, {}});
+    clients.push_back({&dfb, dfb.icetCreateContext(create(MPI_COMM_WORLD)), strategies[0], {}});
+    const Client& ours = clients.back();
+    for (const bool isBricks : {false, true}) {
+        const Images images = makeImages(size, rank, ranks, isBricks);
+        for (const auto& [way, name] :
+             {std::make_pair(Way::BlendBytes, "blend, 8 bit"), std::make_pair(Way::BlendFloats, "blend, float"),
+              std::make_pair(Way::NearestBytes, "nearest, 8 bit")}) {
+            for (Client& client : clients) {
+                set(client, way, size);
+                client.seconds.clear();
+            }
+            for (int frame = -2; frame < frames; ++frame) // the first two make memory
+                for (Client& client : clients)
+                    if (const double seconds = timeFrame(client, way, images); frame >= 0)
+                        client.seconds.push_back(seconds);
+            const auto best =
+                std::min_element(clients.begin(), clients.end() - 1,
+                                 [](const Client& a, const Client& b) { return a.median() < b.median(); });
+            if (rank == 0)
+                std::printf("%d ranks, %s, %s: IceT %.2f ms (%s), dfb %.2f ms, %.2f of it\n", ranks,
+                            isBricks ? "bricks" : "dense", name, best->median(), best->strategy.name, ours.median(),
+                            ours.median() / best->median());
+        }
+    }
+    for (Client& client : clients)
+        client.api->icetDestroyContext(client.context);
+    return 0;
+}
+
+} // namespace
+} // namespace icet_test
+
+int main(int count, char** words)
+{
+    MPI_Init(&count, &words);
+    try {
+        icet_test::run(count, words);
+    } catch (const std::exception& e) {
+        std::fprintf(stderr, "%s\n", e.what());
+        MPI_Abort(MPI_COMM_WORLD, 2);
+    }
+    MPI_Finalize();
+    return 0;
+}
