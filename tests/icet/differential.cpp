@@ -337,6 +337,8 @@ void change(Setup& setup, Random& random, int ranks)
 {
     if (setup.tiles.empty() || chance(random, 0.4))
         setup.tiles = drawTiles(random, ranks);
+    else if (chance(random, 0.2))
+        drawDisplays(random, ranks, setup.tiles);
     if (chance(random, 0.4))
         setup.kind = static_cast<Kind>(pick(random, 0, 5));
     if (setup.groups.empty() || chance(random, 0.3)) {

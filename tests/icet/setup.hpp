@@ -62,19 +62,27 @@ struct Setup {
     bool replicates() const { return std::set<int>(groups.begin(), groups.end()).size() < groups.size(); }
 };
 
-// Tiles side by side, apart or over each other; at most one a rank.
-inline std::vector<Tile> drawTiles(Random& random, int ranks)
+// Gives each tile a rank of its own.
+inline void drawDisplays(Random& random, int ranks, std::vector<Tile>& tiles)
 {
     std::vector<int> displays(static_cast<std::size_t>(ranks));
     std::iota(displays.begin(), displays.end(), 0);
     std::shuffle(displays.begin(), displays.end(), random);
-    const int count = chance(random, 0.5) ? 1 : pick(random, 1, std::min(ranks, 4));
-    const int most = chance(random, 0.2) ? 200 : 70;
+    for (std::size_t i = 0; i < tiles.size(); ++i)
+        tiles[i].displayRank = displays[i];
+}
+
+// Tiles side by side, apart or over each other; at most one a rank.
+inline std::vector<Tile> drawTiles(Random& random, int ranks)
+{
+    const int count = chance(random, 0.4) ? 1 : pick(random, 1, std::min(ranks, 4));
+    const int most = chance(random, 0.2) ? 200 : 70, farthest = chance(random, 0.5) ? 120 : 40;
     std::vector<Tile> tiles;
     for (int i = 0; i < count; ++i)
-        tiles.push_back({{i == 0 ? 0 : pick(random, 0, 120), i == 0 ? 0 : pick(random, 0, 120), pick(random, 1, most),
-                          pick(random, 1, most)},
-                         displays[static_cast<std::size_t>(i)]});
+        tiles.push_back({{i == 0 ? 0 : pick(random, 0, farthest), i == 0 ? 0 : pick(random, 0, farthest),
+                          pick(random, 1, most), pick(random, 1, most)},
+                         0});
+    drawDisplays(random, ranks, tiles);
     return tiles;
 }
 
