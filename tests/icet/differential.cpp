@@ -1,6 +1,7 @@
 // Holds libdfb_icet against IceT and against an exact reference. Both are loaded and get the same calls at random:
-//   mpirun -n 3 test_icet_differential IceTCore.so libdfb_icet.so [--cases N] [--seed S] [--only CASE]
-// A case is a frame in one of three contexts, which keep what they were told. Returns 0 if all is well.
+//   mpirun -n 3 test_icet_differential IceTCore.so libdfb_icet.so [--cases N] [--seed S] [--only CASE] [--multiple]
+// A case is a frame in one of three contexts, which keep what they were told. --multiple: at MPI_THREAD_MULTIPLE, else
+// at MPI_THREAD_SINGLE. Returns 0 if all is well.
 //   nearest: colours and depths equal the reference bit for bit, and IceT's. Of equal depths the lowest rank's colour
 //            wins; IceT's winner depends on its strategy, so it is not asked there.
 //   blended: bytes are within half a level of the reference, floats within their rounding. IceT's are off by up to a
@@ -669,9 +670,13 @@ int run(int count, char** words)
         throw std::runtime_error("usage: test_icet_differential ICET DFB_ICET [--cases N] [--seed S] [--only CASE]");
     std::uint64_t seed = 1;
     int cases = 300, only = -1;
-    for (int i = 3; i + 1 < count; i += 2) {
+    for (int i = 3; i < count; i += 2) {
         const std::string word = words[i];
-        if (word == "--cases")
+        if (word == "--multiple")
+            --i;
+        else if (i + 1 == count)
+            throw std::runtime_error(word + " needs a number");
+        else if (word == "--cases")
             cases = std::atoi(words[i + 1]);
         else if (word == "--seed")
             seed = std::strtoull(words[i + 1], nullptr, 10);
@@ -702,7 +707,9 @@ int run(int count, char** words)
 
 int main(int count, char** words)
 {
-    MPI_Init(&count, &words);
+    const bool isMultiple = std::find(words, words + count, std::string("--multiple")) != words + count;
+    int level = 0;
+    MPI_Init_thread(&count, &words, isMultiple ? MPI_THREAD_MULTIPLE : MPI_THREAD_SINGLE, &level);
     int status = 1;
     try {
         status = icet_test::run(count, words);

@@ -85,25 +85,42 @@ void useMatrices(IceTContextStruct& context, const View& view)
 }
 
 // Copies colours, with `background` where there is nothing.
-void fillBackground(const void* colors, const float* depth, std::size_t pixels, std::size_t pixelBytes,
-                    const void* background, std::byte* out)
+template <class Pixel>
+void fillBackground(const dfb::Image& picture, const Pixel& background, std::byte* out)
 {
-    const auto* from = static_cast<const std::byte*>(colors);
-    for (std::size_t i = 0; i < pixels; ++i)
-        std::memcpy(out + i * pixelBytes, depth[i] == nothing ? background : from + i * pixelBytes, pixelBytes);
+    const float* depth = picture.depth();
+    const std::byte* colors = picture.bytes();
+    for (std::size_t i = 0; i < picture.pixelCount(); ++i, out += sizeof background, colors += sizeof background)
+        std::memcpy(out, depth[i] == nothing ? static_cast<const void*>(background.data()) : colors, sizeof background);
 }
 
 void fillBackground(Image& to, const dfb::Image& picture, const std::array<float, 4>& color)
 {
+    std::byte* out = to.ownColor(picture.pixelCount() * dfb::bytesPerPixel(picture.format()));
     if (picture.format() == dfb::OutputFormat::RGBA32F) {
-        fillBackground(picture.bytes(), picture.depth(), to.pixelCount(), 16, color.data(),
-                       to.ownColor(16 * to.pixelCount()));
+        fillBackground(picture, color, out);
         return;
     }
-    std::uint8_t levels[4];
-    std::transform(color.begin(), color.end(), levels,
+    std::array<std::uint8_t, 4> levels{};
+    std::transform(color.begin(), color.end(), levels.begin(),
                    [](float value) { return static_cast<std::uint8_t>(std::lround(255 * value)); });
-    fillBackground(picture.bytes(), picture.depth(), to.pixelCount(), 4, levels, to.ownColor(4 * to.pixelCount()));
+    fillBackground(picture, levels, out);
+}
+
+// The colours of a picture as the client wants them; the picture's own, if those are the same.
+void takeColor(Image& to, const dfb::Image& picture, const IceTContextStruct& context, const Plan& plan)
+{
+    to.color = picture.bytes();
+    if (plan.fillsBackground)
+        fillBackground(to, picture, backgroundOf(context));
+    if (to.colorFormat == ICET_IMAGE_COLOR_NONE)
+        to.color = nullptr;
+    if (const std::size_t bytes = colorBytes(to.colorFormat); bytes == 3 * sizeof(float)) {
+        const auto* rgba = static_cast<const float*>(to.color);
+        if (to.color != to.owned.data())
+            to.ownColor(bytes * to.pixelCount());
+        dropAlpha(rgba, to.pixelCount(), reinterpret_cast<float*>(to.owned.data()));
+    }
 }
 
 // Makes a picture the result of this context, with IceT's depth of nothing, which is 1.
@@ -114,23 +131,14 @@ IceTImage present(IceTContextStruct& context, const dfb::Image& picture, const P
     to.depthFormat = plan.givesDepth ? ICET_IMAGE_DEPTH_FLOAT : ICET_IMAGE_DEPTH_NONE;
     to.width = picture.width();
     to.height = picture.height();
-    to.color = picture.bytes();
-    if (plan.fillsBackground)
-        fillBackground(to, picture, backgroundOf(context));
-    if (to.colorFormat == ICET_IMAGE_COLOR_NONE)
-        to.color = nullptr;
-    else if (const std::size_t bytes = colorBytes(to.colorFormat); bytes == 3 * sizeof(float)) {
-        const std::vector<std::byte> withAlpha(static_cast<const std::byte*>(to.color),
-                                               static_cast<const std::byte*>(to.color) + 16 * to.pixelCount());
-        dropAlpha(reinterpret_cast<const float*>(withAlpha.data()), to.pixelCount(),
-                  reinterpret_cast<float*>(to.ownColor(bytes * to.pixelCount())));
-    }
+    takeColor(to, picture, context, plan);
+    to.depth = nullptr;
     if (plan.givesDepth) {
         to.ownedDepth.resize(to.pixelCount());
         std::transform(picture.depth(), picture.depth() + to.pixelCount(), to.ownedDepth.begin(),
                        [](float depth) { return depth == nothing ? 1.0f : depth; });
+        to.depth = to.ownedDepth.data();
     }
-    to.depth = plan.givesDepth ? to.ownedDepth.data() : nullptr;
     return {&to};
 }
 

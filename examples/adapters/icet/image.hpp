@@ -36,6 +36,7 @@ struct Image {
 
 // Returns the part of an image of RGB floats as RGBA with alpha 1, in `memory`, which gets the size of the image.
 const float* addAlpha(const float* rgb, const dfb::Region& part, int width, int height, std::vector<float>& memory);
+// `out` may be where `rgba` is.
 void dropAlpha(const float* rgba, std::size_t pixels, float* out);
 
 } // namespace dfb_icet
