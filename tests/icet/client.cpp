@@ -241,6 +241,12 @@ void tryErrors()
     expect(icetGetContext() == other, "another context than the destroyed one is not current any more");
     icetDestroyContext(other);
     expect(icetGetContext() == nullptr, "a destroyed context is current");
+    for (void (*call)(IceTContext) : {icetSetContext, icetDestroyContext}) {
+        call(context);
+        expectError(ICET_INVALID_VALUE, "a context that was destroyed");
+    }
+    icetCopyState(context, other);
+    expectError(ICET_INVALID_VALUE, "contexts that were destroyed");
 }
 
 void tryMoves()

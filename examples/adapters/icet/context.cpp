@@ -38,6 +38,12 @@ std::vector<int> gatherColors(const IceTContextStruct& context, int color)
 // Contexts that are there, in the order in which they were made, which is the same on all ranks.
 std::vector<IceTContext> contexts;
 
+void requireThere(IceTContext context)
+{
+    if (std::find(contexts.begin(), contexts.end(), context) == contexts.end())
+        throw Error(ICET_INVALID_VALUE, "there is no such context");
+}
+
 // MPI_Finalize() begins with this. A client may forget its contexts, and they may have threads that call MPI.
 int closeAll(MPI_Comm, int, void*, void*)
 {
@@ -122,22 +128,38 @@ extern "C" IceTContext icetCreateContext(IceTCommunicator communicator)
 
 extern "C" void icetDestroyContext(IceTContext context)
 {
-    if (context == current)
-        current = nullptr;
-    guarded(
-        "icetDestroyContext", [&] { return delete context, 0; }, 0);
+    const auto destroy = [&] {
+        requireThere(context);
+        if (context == current)
+            current = nullptr;
+        delete context;
+        return 0;
+    };
+    guarded("icetDestroyContext", destroy, 0);
 }
 
 extern "C" IceTContext icetGetContext() { return current; }
 
-extern "C" void icetSetContext(IceTContext context) { current = context; }
+extern "C" void icetSetContext(IceTContext context)
+{
+    const auto set = [&] {
+        if (context)
+            requireThere(context);
+        current = context;
+        return 0;
+    };
+    guarded("icetSetContext", set, 0);
+}
 
 extern "C" void icetCopyState(IceTContext to, const IceTContext from)
 {
-    if (to && from)
+    const auto copy = [&] {
+        requireThere(to);
+        requireThere(from);
         to->settings = from->settings;
-    else
-        raiseError("icetCopyState", Error(ICET_INVALID_VALUE, "there is no such context"));
+        return 0;
+    };
+    guarded("icetCopyState", copy, 0);
 }
 
 extern "C" void icetDataReplicationGroupColor(IceTInt color)
