@@ -412,11 +412,41 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     detail::sortAndBlendFrom(row, x, count, layers, order);
 }
 
+namespace detail {
+
+// Does what keepNearest() does, for layers of colour and depth alone.
+inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
+{
+    const auto first = static_cast<std::size_t>(x);
+    for (int i = 0; i < count; ++i) {
+        const float* color = layers.front().color;
+        float depth = layers.front().depth[i];
+        for (std::size_t k = 1; k < layers.size(); ++k) {
+            const bool isNearer = layers[k].depth[i] < depth;
+            color = isNearer ? layers[k].color : color;
+            depth = isNearer ? layers[k].depth[i] : depth;
+        }
+        const std::size_t at = first + static_cast<std::size_t>(i);
+        for (std::size_t c = 0; c < 4; ++c)
+            row.rgba[4 * at + c] = 0.0 + static_cast<double>(color[4 * static_cast<std::size_t>(i) + c]); // -0 is 0
+        row.transmittance[at] = 1.0 - row.rgba[4 * at + 3];
+        if (row.wantsDepth)
+            row.depth[at] = depth;
+    }
+}
+
+} // namespace detail
+
 // Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
 // [x, x + count): for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids: something is
 // there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
+    const auto isPlain = [](const Layer& layer) { return layer.depth && !layer.aux; };
+    if (row.rgbaLow.empty() && std::all_of(layers.begin(), layers.end(), isPlain)) {
+        detail::keepNearestPlain(row, x, count, layers);
+        return;
+    }
     row.clear(x, count);
     for (int i = 0; i < count; ++i) {
         const Layer* nearest = nullptr;
