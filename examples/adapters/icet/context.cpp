@@ -44,7 +44,7 @@ void requireThere(IceTContext context)
         throw Error(ICET_INVALID_VALUE, "there is no such context");
 }
 
-// MPI_Finalize() begins with this. A client may forget its contexts, and they may have threads that call MPI.
+// MPI_Finalize() begins with this: a client may forget its contexts, and they have messages under way.
 int closeAll(MPI_Comm, int, void*, void*)
 {
     for (const IceTContext context : contexts)
@@ -68,10 +68,19 @@ void closeBeforeMpiEnds(IceTContext context)
 
 void forget(IceTContext context) { contexts.erase(std::find(contexts.begin(), contexts.end(), context)); }
 
+// Only the client's own thread calls MPI, at every thread level: all ranks composite at the same time anyway, and a
+// client may forget its contexts. MPICH does not lock any more when MPI_Finalize() has begun.
+std::shared_ptr<dfb::Connection> connectRanks(MPI_Comm communicator)
+{
+    dfb::NetworkConfig network;
+    network.progress = dfb::Progress::Caller;
+    return dfb::connect(communicator, network);
+}
+
 // A rank that has one processor composites where it waits, and makes no threads.
 std::shared_ptr<dfb::Executor> makeExecutor(const dfb::Connection& connection)
 {
-    if (connection.config().progress == dfb::Progress::Caller && connection.threadShare() == 1)
+    if (connection.threadShare() == 1)
         return std::make_shared<dfb::CallerExecutor>();
     return std::make_shared<dfb::ThreadExecutor>(connection.threadShare());
 }
@@ -183,7 +192,8 @@ extern "C" IceTBoolean icetGLIsInitialized() { return current && current->hasGl 
 } // namespace dfb_icet
 
 IceTContextStruct::IceTContextStruct(MPI_Comm communicator)
-    : connection(dfb::connect(communicator)), executor(dfb_icet::makeExecutor(*connection)), ownRank(connection->rank())
+    : connection(dfb_icet::connectRanks(communicator)), executor(dfb_icet::makeExecutor(*connection)),
+      ownRank(connection->rank())
 {
     MPI_Comm_dup(communicator, &comm);
     order.resize(static_cast<std::size_t>(connection->size()));
