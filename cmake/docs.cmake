@@ -11,10 +11,11 @@ if(NOT DFB_SITE_STYLE)
   set(DFB_SITE_STYLE "")
 endif()
 
-# A page for each example
-file(GLOB examples RELATIVE ${PROJECT_SOURCE_DIR}/examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp)
+# A page for each example that is one file, or the main file of its folder
+file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp)
 set(pages "")
 foreach(example IN LISTS examples)
+  get_filename_component(example ${example} NAME)
   string(APPEND pages "/** @example ${example} */\n")
 endforeach()
 file(WRITE ${DFB_SITE}/examples.dox "${pages}")
