@@ -12,7 +12,8 @@ if(NOT DFB_SITE_STYLE)
 endif()
 
 # A page for each example that is one file, or the main file of its folder
-file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp)
+file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp
+  ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp)
 set(pages "")
 foreach(example IN LISTS examples)
   get_filename_component(example ${example} NAME)
