@@ -201,7 +201,7 @@ private:
         return (z * (size_[1] + 1) + y) * (size_[0] + 1) + x;
     }
 
-    // What lies before a point of the grid in all three axes.
+    // The sum of all cells that lie before a point of the grid in all three axes.
     double sumBefore(const std::vector<double>& sums, const std::array<double, 3>& at) const
     {
         std::array<std::size_t, 3> cell{};

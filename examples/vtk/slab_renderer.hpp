@@ -1,4 +1,4 @@
-// What VTK does in this example: it reads a slab of a data set, and renders it in a window of its own.
+// Data and Renderer: VTK reads a slab of a data set, and renders it in a window of its own.
 #pragma once
 
 #include <dfb/dfb.hpp>

@@ -22,7 +22,7 @@ namespace {
 
 using example::width, example::height;
 
-// What dfb::SharedWorld needs of a framebuffer.
+// The ranks, as dfb::SharedWorld asks a framebuffer for them.
 struct Ranks {
     MPI_Comm communicator;
     int count, number;

@@ -84,7 +84,7 @@ struct Pixels {
     std::vector<float> floats, depth;
 };
 
-// What the draw callback knows, and what it was asked for.
+// The draw callback's knowledge of the frame, and the calls it got.
 struct Drawing {
     const Api* api = nullptr;
     const Setup* setup = nullptr;
@@ -539,7 +539,7 @@ private:
         expect(dfb_.icetGetError() == ICET_NO_ERROR, "a query fails");
     }
 
-    // What the client was called back for.
+    // The calls that the client got.
     void compareCalls(const Setup& setup, const View& view, const Outcome& ours, const Outcome& theirs)
     {
         expect(ours.error == ICET_NO_ERROR, "there is an error");

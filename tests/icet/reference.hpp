@@ -8,7 +8,7 @@
 
 namespace icet_test {
 
-// What a rank puts on the wall: its picture, within a part of it.
+// The pixels that a rank puts on the wall: its picture, within a part of it.
 struct Layer {
     Picture picture;
     Rect part;

@@ -1,4 +1,4 @@
-// What a client sets, at random, and the images that its ranks have.
+// Settings of a client, at random, and the images that its ranks have.
 #pragma once
 
 #include "api.hpp"
@@ -86,7 +86,7 @@ inline std::vector<Tile> drawTiles(Random& random, int ranks)
     return tiles;
 }
 
-// What one rank has where: a colour, a depth below 1 where there is anything, all from hashes of the place.
+// The image of one rank: a colour, and a depth below 1 where there is anything, all from hashes of the place.
 class Picture {
 public:
     Picture(std::uint64_t seed, Kind kind) : seed_(seed), kind_(kind)

@@ -1,5 +1,5 @@
-# Sourced by scripts of tests: a Debian system in a folder, for programs whose packages
-# bring an MPI that would take the place of this machine's. The caller sets script (its name), source (the working tree),
+# Sourced by scripts of tests: a Debian system in a folder, for programs whose packages bring an MPI that would take the
+# place of this machine's. The caller sets script (its name), source (the working tree),
 # root (where the system is) and output (where results go).
 # shellcheck shell=sh disable=SC2034,SC2154
 

@@ -50,7 +50,7 @@ struct Box {
     }
 };
 
-// What is nearer than the near plane is not seen. Where an edge between two vertices goes through the plane is.
+// Points nearer than the near plane are not seen. The point where an edge goes through that plane is.
 Box project(const std::vector<Vector>& clip, const Viewport& wall)
 {
     const auto before = [](const Vector& v) { return v[2] + v[3]; }; // the near plane: 0 there
@@ -89,7 +89,7 @@ Viewport strip(const Viewport& all, std::size_t index, std::size_t count)
     return {all.x + edge(index), all.y, edge(index + 1) - edge(index), all.height};
 }
 
-// Which of the ranks renders which of the tiles, by rank: who displays one takes it, the others take turns. -1: none.
+// The tile that each rank renders, by rank: a rank that displays one takes it, the others take turns. -1: none.
 std::vector<int> tilesOfReplicas(const std::vector<int>& ranks, std::vector<int> tiles, const Settings& settings)
 {
     std::vector<int> taken(ranks.size(), -1);

@@ -1,4 +1,4 @@
-// What IceTMPI.h and IceTGL.h declare of the functions here, and the communicator of MPI in one of IceT.
+// The functions here that IceTMPI.h and IceTGL.h declare, and the communicator of MPI in one of IceT.
 #pragma once
 
 #include <IceT.h>

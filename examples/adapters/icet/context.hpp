@@ -22,7 +22,7 @@ struct Tile {
     int displayRank = 0;
 };
 
-// What a client sets and icetCopyState() copies.
+// Settings of a client, which icetCopyState() copies.
 struct Settings {
     Settings();
 
@@ -81,7 +81,7 @@ private:
     std::int64_t frame_ = 0;
 };
 
-// What a client gives with a frame. Null matrices: none.
+// Matrices and background that a client gives with a frame. Null matrices: none.
 struct View {
     const IceTDouble *projection, *modelview;
     const IceTFloat* background;

@@ -15,7 +15,7 @@ namespace dfb::detail {
 // One per rank: the words that it has heard. Any thread may call the members, but newFrame().
 class HiddenTiles {
 public:
-    // What an input does to those behind it.
+    // The effect of an input on those behind it.
     enum class Word : std::int32_t {
         Hides,
         MayHide, // it did so in the last frame; Hides or Shows follows
