@@ -74,7 +74,7 @@ private:
     // coarse.
     static constexpr double roomPart = 0.1;
 
-    static constexpr int mostAhead = 8;         // bricks that are cut in all ways before one is chosen
+    static constexpr int mostAhead = 8;          // bricks that are cut in all ways before one is chosen
     static constexpr double thinnest = 1.0 / 16; // of a box's longest side, a side that may be cut
 
     // A box in cells of the grid, or parts of them.
