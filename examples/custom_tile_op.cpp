@@ -2,12 +2,13 @@
 // meshes have it. Patches lie on any rank. A patch announces how many finer ones refine it, wherever those are: level l
 // is generation l of the tile's tree. The operation keeps the finest value of each pixel and drops the rest.
 //   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
+#include "write_image.hpp"
+
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
 #include <cmath>
 #include <cstring>
-#include <fstream>
 #include <iostream>
 #include <memory>
 #include <vector>
@@ -112,8 +113,7 @@ int main(int argc, char** argv)
     if (!fb.isDisplayRank())
         return 0;
 
-    std::ofstream file("custom_tile_op.ppm", std::ios::binary);
-    file << "P6 " << width << ' ' << height << " 255\n";
+    example::writePpm("custom_tile_op.ppm", fb.image());
     constexpr int finest = patchSize[levels - 1];
     std::vector<int> shown; // the level that each patch of the finest size shows
     for (int j = 0; j < height / finest; ++j)
@@ -127,7 +127,6 @@ int main(int argc, char** argv)
     for (int y = 0; y < height; ++y)
         for (int x = 0; x < width; ++x) {
             const std::uint8_t* pixel = fb.image().rgba8() + 4 * (y * width + x);
-            file.write(reinterpret_cast<const char*>(pixel), 3);
             float rgba[4];
             std::byte expected[4];
             colorOf(shown[static_cast<std::size_t>(y / finest * (width / finest) + x / finest)], x, y, rgba);

@@ -2,6 +2,8 @@
 // on a periodic grid. The grid is cut in slabs, whose number has nothing to do with that of the ranks: each rank holds
 // a run of them, or none. Every so many steps the slabs are rendered where they lie and become one picture.
 //   mpirun -n 4 in_situ        writes in_situ_0000.ppm and so on; in_situ --help has the options
+#include "write_image.hpp"
+
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
@@ -12,7 +14,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
-#include <fstream>
 #include <iostream>
 #include <map>
 #include <stdexcept>
@@ -298,16 +299,6 @@ Options parse(int argc, char** argv)
     return options;
 }
 
-bool writePicture(const std::string& name, const dfb::Image& image)
-{
-    std::ofstream file(name, std::ios::binary);
-    file << "P6 " << width << ' ' << height << " 255\n";
-    for (std::size_t i = 0; i < image.pixelCount(); ++i)
-        file.write(reinterpret_cast<const char*>(image.rgba8() + 4 * i), 3);
-    file.close();
-    return !file.fail();
-}
-
 // Returns what went wrong, on all ranks the same.
 std::string run(MPI_Comm comm, const Options& options)
 {
@@ -355,8 +346,14 @@ std::string run(MPI_Comm comm, const Options& options)
         char number[16];
         std::snprintf(number, sizeof number, "_%04d.ppm", frames++);
         name = options.out + number;
-        const bool written = !fb.isDisplayRank() || writePicture(name, fb.image());
-        if (fb.allReduce({written}, FrameBuffer::Reduce::Min)[0] == 0) // the others cannot see it
+        bool isWritten = true;
+        try {
+            if (fb.isDisplayRank())
+                example::writePpm(name, fb.image());
+        } catch (const std::runtime_error&) {
+            isWritten = false;
+        }
+        if (fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 0) // the others cannot see it
             return name + " cannot be written";
         renderingTime += MPI_Wtime() - advanced;
     }
