@@ -120,11 +120,11 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
             const std::string& done)
 {
     const auto pool = dfb::MemoryPool::create(false);
-    d::GatherSettings settings;
-    settings.format = format;
-    settings.channels = channels;
-    settings.codec = flags & HasCodec ? codec() : nullptr;
-    d::FinalGather display(pool, layout(), settings, 0, 0, {false, true}, ownerOf, [](dfb::Buffer&&) {});
+    d::GatherConfig gatherConfig;
+    gatherConfig.format = format;
+    gatherConfig.channels = channels;
+    gatherConfig.codec = flags & HasCodec ? codec() : nullptr;
+    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, {false, true}, ownerOf, [](dfb::Buffer&&) {});
     if (flags & Shared) // other ranks put tiles into it
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});
@@ -136,11 +136,11 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     if (flags & MakeHeader) {
         BatchHeader h;
         h.rawBytes = batch.size();
-        if (settings.codec) {
-            body.resize(settings.codec->bound(batch.size()));
-            body.resize(settings.codec->compress(fuzz::bytesOf(batch), batch.size(),
-                                                 reinterpret_cast<std::byte*>(body.data())));
-            h.codec = settings.codec->id();
+        if (gatherConfig.codec) {
+            body.resize(gatherConfig.codec->bound(batch.size()));
+            body.resize(gatherConfig.codec->compress(fuzz::bytesOf(batch), batch.size(),
+                                                     reinterpret_cast<std::byte*>(body.data())));
+            h.codec = gatherConfig.codec->id();
         }
         body = fuzz::Output().put(h).text(body).bytes();
     }

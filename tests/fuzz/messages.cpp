@@ -515,12 +515,12 @@ std::pair<std::string, std::string> finished(Way way)
     const auto config = configFor(way);
     const auto pool = dfb::MemoryPool::create(false);
     std::vector<std::string> bodies;
-    d::GatherSettings settings;
-    settings.format = config.image.format;
-    settings.channels = config.image.depth ? dfb::depthChannel : 0;
-    settings.codec = config.messages.codec;
+    d::GatherConfig gatherConfig;
+    gatherConfig.format = config.image.format;
+    gatherConfig.channels = config.image.depth ? dfb::depthChannel : 0;
+    gatherConfig.codec = config.messages.codec;
     const dfb::TileLayout layout(width, height, side);
-    d::FinalGather gather(pool, layout, settings, 0, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
+    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });

@@ -27,8 +27,8 @@
 
 namespace dfb::detail {
 
-// Settings of the messages to the display rank.
-struct GatherSettings {
+// Configuration of a gather: the image, and its messages to the display rank.
+struct GatherConfig {
     OutputFormat format = OutputFormat::None;
     ChannelMask channels = 0;   // beside the colour
     std::uint32_t receiver = 0; // address of the framebuffer
@@ -40,7 +40,6 @@ struct GatherSettings {
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
 class FinalGather {
 public:
-    using Settings = GatherSettings;
     using Send = std::function<void(Buffer&&)>; // to the display rank
     using OwnerOf = std::function<int(int tile)>;
 
@@ -54,17 +53,17 @@ public:
 
     // `senders`: which ranks have finished tiles for the display rank; `ownerOf(tile)`: which. `send`: to it, batches
     // and the count of tiles.
-    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, Settings settings, int displayRank,
+    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, GatherConfig config, int displayRank,
                 int rank, std::vector<bool> senders, OwnerOf ownerOf, Send send)
-        : pool_(std::move(pool)), layout_(layout), settings_(std::move(settings)), displayRank_(displayRank),
-          rank_(rank), senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
-          record_(settings_.format, settings_.channels)
+        : pool_(std::move(pool)), layout_(layout), config_(std::move(config)), displayRank_(displayRank), rank_(rank),
+          senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
+          record_(config_.format, config_.channels)
     {
         if (displays()) {
             tilesOf_ = std::vector<TilesOf>(senders_.size());
             for (int tile = 0; tile < layout_.tileCount(); ++tile)
                 ++tilesOf_[static_cast<std::size_t>(ownerOf_(tile))].owned;
-            image_ = Image(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+            image_ = Image(*pool_, layout_.width(), layout_.height(), config_.format, config_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
             for (auto& s : state_)
                 s = TileState::Undefined;
@@ -77,7 +76,7 @@ public:
     // Its pixels are those of a frame only as imageFrame() says: -1: of none.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
-    bool enabled() const noexcept { return settings_.format != OutputFormat::None; }
+    bool enabled() const noexcept { return config_.format != OutputFormat::None; }
     bool displays() const noexcept { return isDisplay() && enabled(); }
 
     // `compresses`: whether the codec, if there is one, is used. `background`: the image's pixels where no tile is.
@@ -87,7 +86,7 @@ public:
         imageFrame_ = -1;
         imageEpoch_ += std::memcmp(&background, &lastBackground_, sizeof background) != 0;
         lastBackground_ = background;
-        compresses_ = compresses && settings_.codec;
+        compresses_ = compresses && config_.codec;
         batch_.reset();
         flushed_ = false;
         sent_ = {};
@@ -176,7 +175,7 @@ public:
         if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
             return;
         // Somebody is still at it, or has died there: the memory is left to it, and the other tiles are in a copy.
-        Image copy(*pool_, layout_.width(), layout_.height(), settings_.format, settings_.channels);
+        Image copy(*pool_, layout_.width(), layout_.height(), config_.format, config_.channels);
         const Planes from = image_.planesAt(0), to = copy.planesAt(0);
         for (std::size_t c = 0; c < channelCount; ++c)
             if (to.at[c])
@@ -340,12 +339,12 @@ public:
                           static_cast<std::int64_t>(left));
         Buffer raw;
         if (h.codec != 0) {
-            if (!settings_.codec || settings_.codec->id() != h.codec)
+            if (!config_.codec || config_.codec->id() != h.codec)
                 failMalformed("compressed by a codec that this rank does not have");
             if (h.rawBytes > maxBatchBytes())
                 failMalformed("a batch of tiles is too large");
             raw = pool_->acquire(h.rawBytes);
-            if (!settings_.codec->decompress(in, left, raw.data(), h.rawBytes))
+            if (!config_.codec->decompress(in, left, raw.data(), h.rawBytes))
                 failMalformed("a batch of tiles does not decompress to its size");
             in = raw.data();
             left = h.rawBytes;
@@ -446,7 +445,7 @@ public:
             }
             const Region region = layout_.region(tile);
             const Place place = inImage(image_.planesAt(0), region);
-            FinishedTile out(region, settings_.format, place.planes, place.stride, settings_.dither);
+            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
                 row[i] = static_cast<double>(rgba[i % 4]);
@@ -544,7 +543,7 @@ private:
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
     bool isDisplay() const noexcept { return rank_ == displayRank_; }
-    bool travels(std::size_t channel) const { return hasChannel(settings_.channels | colorChannel, channel); }
+    bool travels(std::size_t channel) const { return hasChannel(config_.channels | colorChannel, channel); }
     static std::size_t pixelsIn(const Region& region)
     {
         return static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
@@ -593,8 +592,8 @@ private:
 
     void tellTile(int tile) const
     {
-        if (settings_.onTile)
-            settings_.onTile(tile, layout_.region(tile), image_);
+        if (config_.onTile)
+            config_.onTile(tile, layout_.region(tile), image_);
     }
 
     // Under mutex_.
@@ -621,13 +620,13 @@ private:
         }
         h.isTried = compresses_;
         if (compresses_) {
-            Buffer packed = pool_->acquire(prefix + settings_.codec->bound(h.rawBytes));
+            Buffer packed = pool_->acquire(prefix + config_.codec->bound(h.rawBytes));
             const std::size_t bytes =
-                settings_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
+                config_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
             if (bytes < h.rawBytes) {
                 packed.shrink(prefix + bytes);
                 message = std::move(packed);
-                h.codec = settings_.codec->id();
+                h.codec = config_.codec->id();
             }
         }
         const MessageHeader m = messageHeader(MessageKind::FinishedTiles);
@@ -640,7 +639,7 @@ private:
     {
         MessageHeader header;
         header.kind = kind;
-        header.receiver = settings_.receiver;
+        header.receiver = config_.receiver;
         header.number = frame_;
         return header;
     }
@@ -653,7 +652,7 @@ private:
 
     std::shared_ptr<MemoryPool> pool_;
     TileLayout layout_;
-    Settings settings_;
+    GatherConfig config_;
     int displayRank_, rank_;
     std::vector<bool> senders_; // of finished tiles, rank by rank
     OwnerOf ownerOf_;

@@ -349,7 +349,7 @@ public:
             detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findJobs(frame, world_, owner_);
-            // The tile, whoever renders it, is declared by the first of those that hold the brick.
+            // The first rank that holds the brick declares the tile, also if another one renders it.
             inputs_.clear();
             for (const BrickInTile& pair : work_.pairs)
                 if (const SharedBrick& b = world_.bricks()[static_cast<std::size_t>(pair.brick)];
