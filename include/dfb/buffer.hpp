@@ -16,7 +16,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // There is not enough memory. what() says how many bytes were asked for, and for which use.
 class OutOfMemory final : public std::bad_alloc {
@@ -256,4 +256,4 @@ private:
     std::uint64_t heldBytes_ = 0;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -1,11 +1,13 @@
 // Channels: the values that a pixel can have, how wide each is, and how it is blended.
 #pragma once
 
+#include <dfb/version.hpp>
+
 #include <array>
 #include <cstddef>
 #include <cstdint>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A set of channels, one bit each. Unless a tile operation says otherwise, the inputs of a pixel are blended front to
 // back, and channel by channel as said here; a mean over passes is one of the blended passes.
@@ -96,4 +98,4 @@ constexpr int wordsPerPixel(ChannelMask channels) noexcept
     return words;
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -18,7 +18,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 class DependencyTracker {
 public:
@@ -263,4 +263,4 @@ private:
     bool closed_ = false;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

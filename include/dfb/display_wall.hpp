@@ -13,7 +13,7 @@
 #include <cstdint>
 #include <memory>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 namespace detail {
 class Wall; // gather/wall.hpp
@@ -92,14 +92,14 @@ inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
 
 static_assert(is_pixel_op_v<ToWall>);
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
 #include <dfb/gather/wall.hpp>
 
 #include <utility>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 DFB_COMPILED_ONCE DisplayWall::DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout,
                                            OutputFormat format, std::shared_ptr<Executor> executor,
@@ -118,5 +118,5 @@ DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wa
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
 DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }
 
-} // namespace dfb
+DFB_NAMESPACE_END
 #endif

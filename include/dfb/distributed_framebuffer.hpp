@@ -18,7 +18,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
 // begin() and end().
@@ -416,7 +416,7 @@ private:
     Engine* lastEnded_ = nullptr;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
 #include <dfb/frame/frame_engine.hpp>

@@ -13,7 +13,8 @@
 #include <string>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 inline std::string printed(const char* format, std::va_list values)
 {
@@ -37,9 +38,10 @@ inline std::string printed(const char* format, std::va_list values)
     return text;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 enum class ErrorKind : std::uint32_t {
     InvalidArgument,  // a call with arguments that can never be right
@@ -175,9 +177,10 @@ private:
     }
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Throws InvalidArgument, with what printf() would write.
 [[noreturn, gnu::format(printf, 1, 2)]] inline void failArgument(const char* format, ...)
@@ -189,4 +192,5 @@ namespace dfb::detail {
     throw InvalidArgument(std::move(text));
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -16,7 +16,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The contract: submit() runs a task some time, on some worker, and never blocks; parallelFor() spreads a loop
 // over the workers and returns when all of it is done. Between two iterations of a loop a worker runs the tasks
@@ -242,4 +242,4 @@ private:
     }
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

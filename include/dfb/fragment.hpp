@@ -13,7 +13,7 @@
 #include <type_traits>
 #include <utility>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its
 // colour at color + 4 * k and its depth at depth + k. What did not travel is null.
@@ -235,4 +235,4 @@ void Fragment::forEachPixel(const F& f) const
     }
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

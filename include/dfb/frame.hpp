@@ -17,7 +17,7 @@
 #include <optional>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The image that the display rank gets. All ranks must give the same; the constructor checks it.
 struct ImageConfig {
@@ -191,4 +191,4 @@ struct FrameReport {
     std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's framebuffer ever held
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -1,7 +1,9 @@
 // Declarations of the main types, and the default template arguments, which are stated here and nowhere else.
 #pragma once
 
-namespace dfb {
+#include <dfb/version.hpp>
+
+DFB_NAMESPACE_BEGIN
 
 struct NoPixelOp;      // pixel_op.hpp
 class MpiTransport;    // comm/mpi_transport.hpp
@@ -13,4 +15,4 @@ class Connection;      // comm/connection.hpp
 template <class TileOp, class PixelOp = NoPixelOp, class Transport = MpiTransport>
 class DistributedFrameBuffer; // distributed_framebuffer.hpp
 
-} // namespace dfb
+DFB_NAMESPACE_END

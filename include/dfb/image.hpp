@@ -21,7 +21,7 @@
 #include <immintrin.h>
 #endif
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A half-open rectangle of pixels, [x0, x1) x [y0, y1), row 0 on top.
 struct Region {
@@ -347,4 +347,4 @@ double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int
     return farthest;
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -27,7 +27,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // How the images of the ranks become one.
 enum class ImageBlend : std::uint8_t {
@@ -167,12 +167,12 @@ private:
     std::vector<TileInput> inputs_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
 #include <dfb/frame/frame_engine.hpp>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
@@ -403,5 +403,5 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     });
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END
 #endif

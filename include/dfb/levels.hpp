@@ -16,7 +16,8 @@
 #include <immintrin.h>
 #endif
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. The product is
 // rounded to double first, which brings values that should be ties, such as a mean of 1/6, back to them.
@@ -376,4 +377,5 @@ double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
     return std::max(farthest, toLevels<IsSrgb>(rgba + 4 * done, count - done, out + 4 * done));
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

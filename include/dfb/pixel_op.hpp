@@ -22,7 +22,7 @@
 #include <type_traits>
 #include <utility>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A finished tile in float, row-major, region.width() pixels a row without padding.
 struct PixelTile {
@@ -147,4 +147,4 @@ struct PixelOpChain {
 
 static_assert(is_pixel_op_v<ToneMap> && is_pixel_op_v<PixelOpChain<ToneMap, ToneMap>>);
 
-} // namespace dfb
+DFB_NAMESPACE_END

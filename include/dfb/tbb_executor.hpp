@@ -10,7 +10,7 @@
 #include <memory>
 #include <mutex>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The arena has room for `threadCount` threads. oneTBB itself limits the workers of a process to one less than
 // its cores; the thread that calls parallelFor() takes part.
@@ -65,4 +65,4 @@ private:
     std::size_t enqueued_ = 0;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -12,7 +12,7 @@
 #include <limits>
 #include <type_traits>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Identifies an input of a tile. (tile, pass, generation, source, part) is unique in a frame.
 struct TileHeader {
@@ -299,4 +299,4 @@ struct InputPixels : TileHeader {
 
 } // namespace detail
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -15,7 +15,7 @@
 
 // TileLayout: how an image is divided into tiles; and OwnerMap: which rank owns which tile.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Tiles are numbered row by row from the top left. All members are pure and may be called from any thread.
 class TileLayout {
@@ -121,4 +121,4 @@ struct WallLayout {
     }
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -53,7 +53,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The tile and the frame that newFrame() begins.
 struct TileInfo {
@@ -446,4 +446,4 @@ constexpr bool checkTileOp()
 
 } // namespace detail
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -1,9 +1,18 @@
-// The version of dfb, and its demands on the compiler.
+// The version of dfb, the namespace of that version, and its demands on the compiler.
 #pragma once
 
 #define DFB_VERSION_MAJOR 0
 #define DFB_VERSION_MINOR 1
 #define DFB_VERSION_PATCH 0
+
+// Everything stands in an inline namespace named after the version, such as dfb::v0_1. A program writes dfb::Image. If
+// a process has two versions, as with two plugins, neither takes the functions of the other.
+#define DFB_NAMESPACE_OF_(major, minor) v##major##_##minor
+#define DFB_NAMESPACE_OF(major, minor) DFB_NAMESPACE_OF_(major, minor)
+// clang-format off
+#define DFB_NAMESPACE_BEGIN namespace dfb { inline namespace DFB_NAMESPACE_OF(DFB_VERSION_MAJOR, DFB_VERSION_MINOR) {
+#define DFB_NAMESPACE_END } }
+// clang-format on
 
 #if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error \

@@ -3,33 +3,34 @@
 cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
-set(level_0 base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp frame/hidden_tiles.hpp fwd.hpp
-            testing/reference.hpp version.hpp)
-set(level_1 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp
+set(level_0 version.hpp)
+set(level_1 base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp frame/hidden_tiles.hpp fwd.hpp
+            testing/reference.hpp)
+set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp
             error.hpp testing/error_report.hpp)
-set(level_2 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
+set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
             comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
             gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
-set(level_3 blend/compositing.hpp comm/flow_control.hpp comm/progress.hpp comm/reduction.hpp frame/open_frame.hpp
+set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/progress.hpp comm/reduction.hpp frame/open_frame.hpp
             image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp)
-set(level_4 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
-set(level_5 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
+set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
+set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
             tile_layout.hpp)
-set(level_6 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
+set(level_7 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
             wire/sparse_planes.hpp wire/wire_losses.hpp)
-set(level_7 frame/declarations.hpp frame/frame_terms.hpp ops/sort_last.hpp pixel_op.hpp render/sampling.hpp
+set(level_8 frame/declarations.hpp frame/frame_terms.hpp ops/sort_last.hpp pixel_op.hpp render/sampling.hpp
             render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
-set(level_8 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
+set(level_9 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
             render/loops.hpp testing/tile_op_test.hpp testing/verified.hpp)
-set(level_9 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/shared_world.hpp
+set(level_10 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/shared_world.hpp
             testing/adversarial.hpp)
-set(level_10 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp render/mixed_parallel.hpp)
-set(level_11 display_wall.hpp frame/outcome.hpp)
-set(level_12 frame/job_share.hpp)
-set(level_13 frame/frame_engine.hpp)
-set(level_14 distributed_framebuffer.hpp image_compositor.hpp)
-set(level_15 dfb.hpp)
-set(last_level 15)
+set(level_11 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp render/mixed_parallel.hpp)
+set(level_12 display_wall.hpp frame/outcome.hpp)
+set(level_13 frame/job_share.hpp)
+set(level_14 frame/frame_engine.hpp)
+set(level_15 distributed_framebuffer.hpp image_compositor.hpp)
+set(level_16 dfb.hpp)
+set(last_level 16)
 
 # A dependency has one door.
 set(door_of_mpi comm/mpi_transport.hpp)

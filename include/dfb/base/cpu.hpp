@@ -35,7 +35,8 @@
 #include <sched.h>
 #endif
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 inline bool cpuHasAvx2() noexcept
 {
@@ -111,11 +112,12 @@ private:
 #endif
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END
 
 // Processors: those that a thread may run on, and how many threads each of the ranks should have that share them.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A set, as plain bytes that can be sent. Those from `limit` on are left out.
 class Processors {
@@ -171,4 +173,4 @@ private:
 // How many threads each of `ranks` should have that share so many processors: an equal part, at least 1.
 inline int threadShare(int processors, int ranks) noexcept { return std::max(1, processors / std::max(1, ranks)); }
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -5,7 +5,8 @@
 
 #include <cmath>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 struct DoubleDouble {
     double high = 0, low = 0;
@@ -40,4 +41,5 @@ inline DoubleDouble operator/(const DoubleDouble& a, double b) noexcept
     return DoubleDouble::sum(q, ((a.high - p.high) - p.low + a.low) / b);
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -1,11 +1,14 @@
 // Fifo: a queue that keeps its memory, so that one that is filled and emptied again and again allocates no more.
 #pragma once
 
+#include <dfb/version.hpp>
+
 #include <cstddef>
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 template <class T>
 class Fifo {
@@ -42,4 +45,5 @@ private:
     std::size_t first_ = 0;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -2,9 +2,12 @@
 // one need be no template, of which each lambda would make another function.
 #pragma once
 
+#include <dfb/version.hpp>
+
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 template <class Signature>
 class FunctionRef;
@@ -27,4 +30,5 @@ private:
     Result (*call_)(const void*, Arguments...);
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

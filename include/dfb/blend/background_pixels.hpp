@@ -9,7 +9,8 @@
 #include <cstdint>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // One per tile; used by one thread at a time.
 class BackgroundPixels {
@@ -77,4 +78,5 @@ private:
     std::vector<std::uint64_t> bits_; // row by row, or empty: nothing is known
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

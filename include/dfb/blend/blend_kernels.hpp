@@ -16,7 +16,8 @@
 #include <immintrin.h>
 #endif
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Layers to be composited at once under a run of pixels, front to back. Few, as a processor follows few streams of
 // memory, and each is read for the whole run before the next layers are.
@@ -344,4 +345,5 @@ inline void takeNearest(float* nearest, int count, const float* color, const flo
     takeNearestPlain(nearest, count, color, depth);
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -21,7 +21,7 @@
 #include <numeric>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // An id, and the depth of the layer that it comes from; 0 where layers have none.
 struct FrontId {
@@ -462,4 +462,4 @@ inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<L
     }
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

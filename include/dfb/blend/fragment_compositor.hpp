@@ -11,7 +11,7 @@
 #include <memory>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // How the inputs of a pixel become one.
 enum class BlendRule {
@@ -225,4 +225,4 @@ private:
     std::vector<int> order_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -15,7 +15,8 @@
 #include <vector>
 #endif
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // ---- how far an order holds
 
@@ -224,4 +225,5 @@ inline void sortFour(const float* const* depths, const SortNetwork& network, Fou
     sortFourPlain(depths, network, orders);
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -15,7 +15,8 @@
 
 // SmallBytes: the bytes of a control message, of which the usual ones need no memory of their own.
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 class SmallBytes {
 public:
@@ -174,4 +175,5 @@ inline ErrorInfo getErrorInfo(ByteReader& in)
     return e;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

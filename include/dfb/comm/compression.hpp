@@ -13,7 +13,7 @@
 // Codec: the contract of a lossless compressor for message payloads. A flag in each message tells whether it
 // was used: a payload that does not get smaller travels as it is.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Stateless: all members are called from several threads at once.
 class Codec {
@@ -40,12 +40,13 @@ enum class CompressionMode : std::uint8_t {
     Auto
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 // CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
 // noise, those for another all alike.
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // A rank for which nearly nothing was gained is left alone for some frames and then tried again, more and more seldom.
 // add() may be called from any thread, the others between frames, as is isWorthwhile() during one.
@@ -201,4 +202,5 @@ private:
     std::array<std::vector<double>, 2> times_;                        // without, with
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -27,7 +27,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // How messages travel between ranks, for all framebuffers and walls of a connection. `checksums` must be the same on
 // all ranks; the first object that is made on the connection checks it.
@@ -567,4 +567,4 @@ std::shared_ptr<Connection> connect(const typename Transport::Communicator& comm
     return std::make_shared<Connection>(std::move(config), std::move(pool), std::move(link));
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

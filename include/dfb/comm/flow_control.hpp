@@ -20,7 +20,8 @@
 #include <unordered_map>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // All members may be called from any thread. The callbacks are called without a lock held.
 class FlowControl {
@@ -366,4 +367,5 @@ private:
     Callbacks callbacks_;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -10,7 +10,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Minutes, as a rank may be held for a while and then go on: stopped by a batch system, by swapping, in a debugger. How
 // long it renders does not matter, since its progress thread answers meanwhile.
@@ -107,4 +107,4 @@ private:
 
 } // namespace detail
 
-} // namespace dfb
+DFB_NAMESPACE_END

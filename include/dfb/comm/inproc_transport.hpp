@@ -20,7 +20,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
@@ -255,4 +255,4 @@ inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)
         std::rethrow_exception(first);
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -26,7 +26,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The object that the messages are for.
 class MailboxOwner {
@@ -621,4 +622,5 @@ private:
     bool isEnding_ = false;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -21,7 +21,7 @@
 // crc32c: the checksum of messages, CRC-32C (Castagnoli) as in iSCSI (RFC 3720). It finds all errors of up to three
 // bits in messages of up to 256 MiB, and all that lie within 32 bits.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 namespace detail {
 
 using Crc32cTables = std::array<std::array<std::uint32_t, 256>, 8>;
@@ -99,11 +99,12 @@ inline std::uint32_t crc32c(const std::byte* data, std::size_t byteCount, std::u
     return fastest(data, byteCount, before);
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 // MessageHeader: what every message starts with, so that it is recognised before it is used.
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 enum class MessageKind : std::uint8_t {
     ReduceUp,      // a partial result of a reduction
@@ -197,4 +198,5 @@ inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const s
     return message;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

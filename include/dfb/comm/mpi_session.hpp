@@ -18,7 +18,7 @@
 #include <thread>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 class MpiSession {
 public:
@@ -150,4 +150,4 @@ private:
     bool isGivenUp_ = false;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -43,7 +43,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
@@ -993,4 +993,4 @@ private:
 static_assert(is_transport_v<MpiTransport>);
 DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<MpiTransport>(const MPI_Comm&, NetworkConfig));
 
-} // namespace dfb
+DFB_NAMESPACE_END

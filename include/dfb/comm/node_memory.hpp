@@ -30,7 +30,8 @@
 #include <unistd.h>
 #endif
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Bell: a word in memory that the processes of a node share, with which they wake a rank that naps.
 class Bell {
@@ -283,4 +284,5 @@ private:
     std::size_t used_ = 2 * alignment, allocated_; // the first bytes are the secret and the bell; under mutex_
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

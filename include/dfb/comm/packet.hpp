@@ -11,7 +11,8 @@
 #include <memory>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 struct PacketRecord {
     enum Kind : std::uint32_t { Message, Announcement, Lent, Failure };
@@ -103,4 +104,5 @@ bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
     return true;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

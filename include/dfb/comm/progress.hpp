@@ -18,7 +18,7 @@
 #include <sys/prctl.h>
 #endif
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 class ProgressThread {
 public:
@@ -133,4 +133,4 @@ private:
     std::thread thread_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -8,13 +8,16 @@
 // that has not been asked yet from one that sent it after it had been.
 #pragma once
 
+#include <dfb/version.hpp>
+
 #include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <optional>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Messages between ranks that make the one that takes them do something.
 struct MessageCounts {
@@ -73,4 +76,5 @@ private:
     std::atomic<bool> isInRound_{false};
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

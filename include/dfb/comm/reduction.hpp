@@ -19,7 +19,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 struct ReductionKey {
     std::uint32_t scope = 0; // its purpose
@@ -233,4 +233,4 @@ private:
     std::map<std::uint32_t, std::int64_t> forgotten_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -5,7 +5,7 @@
 
 #include <snappy.h>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 class SnappyCodec final : public Codec {
 public:
@@ -26,4 +26,4 @@ public:
     }
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -69,7 +69,7 @@
 #include <type_traits>
 #include <utility>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Which thread moves messages. Ranks may differ.
 enum class Progress {
@@ -347,4 +347,4 @@ private:
 
 } // namespace detail
 
-} // namespace dfb
+DFB_NAMESPACE_END

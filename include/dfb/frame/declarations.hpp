@@ -20,7 +20,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Something that will come for a tile.
 struct ExpectedInput {
@@ -247,4 +248,5 @@ private:
     ByteWriter manifest_;                  // for one owner
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

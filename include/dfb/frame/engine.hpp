@@ -18,7 +18,8 @@
 #include <memory>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
 class Engine {
@@ -73,4 +74,5 @@ DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection>
 // Threads for those processors that this rank of the connection has for itself.
 DFB_COMPILED_ONCE std::shared_ptr<Executor> makeThreads(const Connection& connection);
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

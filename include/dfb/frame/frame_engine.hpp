@@ -28,7 +28,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The members are those of DistributedFrameBuffer and its Frame; see there.
 class FrameEngine final : public Engine, private MailboxOwner {
@@ -869,4 +870,5 @@ DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection>
 }
 #endif
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -9,7 +9,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // All members may be called from any thread.
 class FrameFigures {
@@ -64,4 +65,5 @@ private:
     std::vector<Figure> figures_, mergeErrors_; // by key, by tile
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -10,7 +10,8 @@
 #include <string>
 #include <type_traits>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // FNV-1a over 64-bit words.
 class Fingerprint {
@@ -109,4 +110,5 @@ private:
 };
 static_assert(std::has_unique_object_representations_v<FrameTerms>); // no byte of a verdict is undefined
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

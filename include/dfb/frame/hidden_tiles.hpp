@@ -2,6 +2,8 @@
 // be so.
 #pragma once
 
+#include <dfb/version.hpp>
+
 #include <algorithm>
 #include <atomic>
 #include <cstddef>
@@ -10,7 +12,8 @@
 #include <mutex>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // One per rank: the words that it has heard. Any thread may call the members, but newFrame().
 class HiddenTiles {
@@ -87,4 +90,5 @@ private:
     std::vector<std::vector<Open>> open_; // by tile; under mutex_
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

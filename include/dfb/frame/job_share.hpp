@@ -18,7 +18,8 @@
 #include <string>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // A rank's request for jobs. It also carries the number of jobs, as the rank that gets it may not know that yet.
 struct JobRequest {
@@ -184,4 +185,5 @@ private:
     JobShare share_;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

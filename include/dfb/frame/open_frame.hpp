@@ -22,7 +22,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 enum class FrameState : std::uint8_t {
     Closed,    // before begin() and after end()
@@ -306,4 +307,5 @@ private:
     std::vector<Message> early_, opened_; // for the next frame; for the one that is open
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -11,7 +11,8 @@
 #include <typeinfo>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The traits of a tile operation and a pixel operation; see tile_op.hpp and pixel_op.hpp.
 struct OperationTraits {
@@ -156,4 +157,5 @@ private:
     const PixelFrameData* offeredPixelData_ = nullptr;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -20,7 +20,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Members may be called from any thread, but for newFrame() and conclude().
 class FrameOutcome {
@@ -487,4 +488,5 @@ private:
     Clock::time_point nextLook_; // at it; of the thread that is in end()
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

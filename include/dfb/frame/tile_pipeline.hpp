@@ -25,7 +25,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 class TilePipeline {
 public:
@@ -455,4 +456,5 @@ private:
     std::vector<Promise> promises_; // of TileView::staysUntilEnd, if they are checked
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

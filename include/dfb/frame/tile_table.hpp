@@ -24,7 +24,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Throws InvalidArgument for a tile that a renderer cannot have meant for this frame.
 // `passesOf(tile)`: how many passes that tile has.
@@ -473,4 +474,5 @@ private:
     SamplePlan plan_;            // null: all tiles as info_ says
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -28,7 +28,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Makes a record of an exception. `where` fills in the fields that the exception does not set.
 inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& where)
@@ -458,4 +459,5 @@ inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
     return all;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

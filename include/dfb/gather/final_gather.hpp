@@ -25,7 +25,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Configuration of a gather: the image, and its messages to the display rank.
 struct GatherConfig {
@@ -680,4 +681,5 @@ private:
     std::atomic<int> ranksComplete_{0};         // of those that send
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

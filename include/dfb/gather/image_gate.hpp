@@ -14,7 +14,8 @@
 #include <thread>
 #include <utility>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // Lies in shared memory. A writer says that it is there and then looks whether the gate is open; who closes it closes
 // it and then looks whether anybody is there: one of them sees the other.
@@ -85,4 +86,5 @@ struct SharedImage {
     Planes planes;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

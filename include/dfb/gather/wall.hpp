@@ -25,7 +25,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The members are those of DisplayWall; see there.
 class Wall final : private MailboxOwner {
@@ -473,4 +474,5 @@ private:
     std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

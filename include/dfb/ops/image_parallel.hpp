@@ -5,7 +5,7 @@
 
 #include <utility>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Expects one input of generation 0 without children per pass. The tile is laid over the background, passes are
 // averaged. Of the other channels only those that the image has travel.
@@ -27,4 +27,4 @@ public:
 using ImageParallel = BasicImageParallel<>;
 static_assert(is_tile_op_v<ImageParallel>);
 
-} // namespace dfb
+DFB_NAMESPACE_END

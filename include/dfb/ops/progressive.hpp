@@ -16,7 +16,7 @@
 
 // Moments: mean and variance of pixels, in a form whose partial results merge in any tree.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Of samples of 4 channels: their number, their sum, and the sum over the channels of squared deviations from the mean
 // (M2), merged by the pairwise formula of Chan, Golub and LeVeque (1979). For n samples that are floats the mean is
@@ -168,4 +168,4 @@ private:
 
 static_assert(is_tile_op_v<Progressive<AlphaBlend>>);
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -18,7 +18,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
@@ -299,10 +299,11 @@ using OrderedBlend = BasicOrderedBlend<>;
 using DepthComposite = BasicDepthComposite<>;
 static_assert(is_tile_op_v<AlphaBlend> && is_tile_op_v<OrderedBlend> && is_tile_op_v<DepthComposite>);
 
-} // namespace dfb
+DFB_NAMESPACE_END
 
 #if DFB_HAS_BODIES
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 DFB_COMPILED_ONCE void FragmentStore::removeBehind(int generation)
 {
@@ -467,5 +468,6 @@ DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y
     return mean;
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END
 #endif

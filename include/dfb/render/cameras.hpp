@@ -13,7 +13,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A camera as most toolkits have it, from a view matrix and a projection matrix: perspective, off-axis or orthographic.
 //
@@ -329,4 +329,4 @@ private:
     double angle_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

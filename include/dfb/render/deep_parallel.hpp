@@ -21,7 +21,7 @@
 // DeepTile: a tile of a renderer that has several segments per pixel: what one brick contributes in one piece of a
 // ray, with a gap before the next in which other bricks may have theirs.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The composited colour between two depths of a ray.
 struct Segment {
@@ -240,4 +240,4 @@ private:
     std::vector<std::unique_ptr<DeepTile>> spare_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -17,7 +17,7 @@
 // Common parts of the rendering loops: tiles to render into, a job per tile and pass on all workers, and a frame in
 // which a renderer may throw. inPlace() is for renderers that have their pixels already.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // See inPlace().
 template <class Find>
@@ -281,4 +281,4 @@ private:
     detail::OwnBricks bricks_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

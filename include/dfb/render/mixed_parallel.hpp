@@ -28,7 +28,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper), or with `sharePasses` the
 // passes of its tiles. Tiles are mixed first: in their own order, ranks would get whole columns of some images, and
@@ -531,4 +531,4 @@ private:
     detail::OrderedWork work_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

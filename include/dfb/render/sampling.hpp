@@ -13,7 +13,7 @@
 #include <string>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // For FrameConfig::samples: only the tiles that meet `region` are rendered, with `passes` samples a pixel; the image
 // keeps the others. Throws InvalidArgument for less than 1 pass.
@@ -165,4 +165,4 @@ private:
     std::vector<TileSamples> plan_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

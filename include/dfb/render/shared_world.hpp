@@ -15,7 +15,7 @@
 #include <utility>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // The id and bounds of a brick of any rank, and the ranks that hold it, ascending.
 struct SharedBrick {
@@ -181,4 +181,4 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const MatrixCa
     return detail::frontToBack(world, {from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0});
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -20,7 +20,7 @@
 
 // Footprint: the convex part of an image that a convex thing may cover.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // In pixels; pixel (x, y) is the square from there to (x + 1, y + 1).
 struct PixelPoint {
@@ -366,4 +366,4 @@ inline std::vector<TileInput> inputsOf(const World& world, const std::vector<Bri
     return inputs;
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

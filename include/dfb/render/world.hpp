@@ -11,7 +11,7 @@
 #include <unordered_set>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 struct Vec3 {
     float x = 0, y = 0, z = 0;
@@ -106,4 +106,4 @@ private:
     std::unordered_set<std::uint32_t> ids_;
 };
 
-} // namespace dfb
+DFB_NAMESPACE_END

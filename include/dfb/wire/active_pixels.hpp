@@ -16,7 +16,7 @@
 #include <limits>
 #include <vector>
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 // A run of active pixels in a row, counted from the region's left border.
 struct Span {
@@ -439,4 +439,4 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
 
 } // namespace detail
 
-} // namespace dfb
+DFB_NAMESPACE_END

@@ -16,7 +16,8 @@
 #include <cstring>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // The planes of a finished tile or of an image: rows of `stride` pixels.
 struct FinishedPlanes {
@@ -257,4 +258,5 @@ private:
     PlaneFormat format_;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -22,7 +22,8 @@
 #include <utility>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 struct FragmentHeader {
     std::int32_t tile = 0;
@@ -470,4 +471,5 @@ Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& la
         [](std::int64_t, std::int64_t) -> const std::byte* { return nullptr; }, nullptr);
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

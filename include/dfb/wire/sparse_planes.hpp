@@ -22,7 +22,8 @@
 #include <type_traits>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
 
@@ -342,4 +343,5 @@ private:
     std::uint64_t nanDepths_ = 0;
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END

@@ -19,7 +19,8 @@
 // WireCodes: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
 // Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 inline float floatOf(std::uint32_t bits) noexcept
 {
@@ -235,7 +236,8 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
     return inRange == 0xff && arePixelsInRange(rgba + 4 * i, count - i, maxColor);
 }
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END
 
 // Wire formats: how exactly the colour of inputs travels, what that costs in accuracy, and the choice of the cheapest
 // that keeps an error budget.
@@ -261,7 +263,7 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 // B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire/wire_format.cpp
 // looks for pixels that are worse, also at the edges.
 
-namespace dfb {
+DFB_NAMESPACE_BEGIN
 
 enum class WireFormat : std::uint8_t {
     Float32, // as the renderer wrote it
@@ -438,4 +440,4 @@ inline const char* nameOf(WireFormat format) noexcept
     return "";
 }
 
-} // namespace dfb
+DFB_NAMESPACE_END

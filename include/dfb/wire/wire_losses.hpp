@@ -13,7 +13,8 @@
 #include <mutex>
 #include <vector>
 
-namespace dfb::detail {
+DFB_NAMESPACE_BEGIN
+namespace detail {
 
 // From any thread, but newFrame().
 class WireLosses {
@@ -88,4 +89,5 @@ private:
     std::vector<Tile> tiles_; // under mutex_
 };
 
-} // namespace dfb::detail
+} // namespace detail
+DFB_NAMESPACE_END
