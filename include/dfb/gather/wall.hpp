@@ -223,7 +223,8 @@ private:
             if (layout_.ranks[static_cast<std::size_t>(d)] == mailbox_->rank()) {
                 shown_.emplace(d, Image());
                 for (int i = 0; i < 2; ++i)
-                    images.emplace_back(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0);
+                    images.push_back(
+                        Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, ChannelMask{0}));
             }
     }
 
