@@ -405,14 +405,19 @@ private:
         return digits;
     }
 
-    // Types are compared by their mangled names, and shown demangled.
+    // Types are compared by their mangled names, and shown as a program writes them: demangled, without the namespace
+    // of the version.
     static std::string readable(const std::string& name, const std::string& value)
     {
         if (name != tileOperation && name != pixelOperation)
             return value;
         const std::unique_ptr<char, decltype(&std::free)> written(
             abi::__cxa_demangle(value.c_str(), nullptr, nullptr, nullptr), &std::free);
-        return written ? written.get() : value;
+        std::string text = written ? written.get() : value;
+        const std::string version = printed("v%d_%d::", DFB_VERSION_MAJOR, DFB_VERSION_MINOR);
+        for (std::size_t at; (at = text.find(version)) != std::string::npos;)
+            text.erase(at, version.size());
+        return text;
     }
 
     // Which settings differ, in words.
