@@ -484,7 +484,9 @@ private:
                             if (const auto second = secondOf(*sample, x, y))
                                 deep.add(x, y, {second->rgba, second->depth, second->depth});
                         }
-                note(deep.header());
+                dfb::TileHeader header = deep.header();
+                header.children = std::max(deep.layers() - 1, 0); // as the loop announces them
+                note(header);
             };
             return deepLoop_.start(scene::FlatCamera(), render, params, data, pixelData);
         } else {

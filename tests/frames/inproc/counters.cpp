@@ -29,15 +29,11 @@
 #endif
 #endif
 
+#if !defined(COUNTERS_WITHOUT_ALLOCATIONS)
 namespace {
 
 std::atomic<std::int64_t> allocations{0};
 std::atomic<std::size_t> largestAllocation{std::numeric_limits<std::size_t>::max()}; // a larger one fails
-
-} // namespace
-
-#if !defined(COUNTERS_WITHOUT_ALLOCATIONS)
-namespace {
 
 void* allocate(std::size_t bytes, std::size_t alignment)
 {

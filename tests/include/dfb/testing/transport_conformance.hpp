@@ -415,7 +415,8 @@ private:
             trouble = hopeless();
             return !trouble.empty() || ready();
         };
-        if (!waitUntil(over, deadline))
+        // What is missing here says more than that another rank waits for this one.
+        if (!waitUntil(over, deadline) || (!trouble.empty() && Clock::now() >= deadline))
             throw GaveUp(what());
         if (!trouble.empty())
             throw GaveUp(trouble);
