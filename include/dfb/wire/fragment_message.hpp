@@ -45,14 +45,18 @@ static_assert(sizeof(FragmentHeader) == 40 && std::is_trivially_copyable_v<Fragm
 inline constexpr std::size_t fragmentPrefix = sizeof(MessageHeader) + sizeof(FragmentHeader);
 static_assert(fragmentPrefix % 16 == 0, "pixels are read in place");
 
-// The most that a fragment message can have. No format is larger than Float32. A row's second span costs less than the
+// The most that a fragment message can have with pixels of so many bytes. A row's second span costs no more than the
 // pixel that parts it from the first.
-inline std::size_t largestFragment(int width, int height, ChannelMask channels)
+inline std::size_t mostBytes(int width, int height, std::size_t pixelBytes)
 {
     const auto rows = static_cast<std::size_t>(height), pixels = rows * static_cast<std::size_t>(width);
-    const std::size_t perPixel = sizeof(float) * static_cast<std::size_t>(wordsPerPixel(channels));
-    static_assert(sizeof(Span) <= 4 * sizeof(float));
-    return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * perPixel;
+    static_assert(sizeof(Span) <= 4);
+    return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * pixelBytes;
+}
+// In any format of colour: none is larger than Float32.
+inline std::size_t largestFragment(int width, int height, ChannelMask channels)
+{
+    return mostBytes(width, height, PlaneFormat(channels, sizeof(float)).pixelBytes());
 }
 
 // Copies values premultiplied by alpha, 3 floats a pixel, and premultiplies them by the alpha that the owner gets
@@ -135,12 +139,15 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const int width = tile.region.width(), height = tile.region.height();
     const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
     const bool isRounded = color != WireFormat::Float32 && !tile.hasBytes;
-    // Colours that travel as they are go straight to their place in the message.
-    Buffer message = pool.acquire(isRounded ? fragmentPrefix : largestFragment(width, height, channels));
+    // What travels as it is goes straight to the message, to where it belongs if all pixels are active.
+    const PlaneFormat gathered(channels, tile.hasBytes ? 1 : sizeof(float));
+    Buffer message = pool.acquire(isRounded ? fragmentPrefix : mostBytes(width, height, gathered.pixelBytes()));
+    Buffer before; // the message, if another takes its place
     wide.resize(std::max(wide.size(), isRounded ? 4 * pixelCount : 0));
     auto* colors = isRounded ? reinterpret_cast<std::byte*>(wide.data()) : message.data() + fragmentPrefix;
     const float* rgba = floatsOf(colors);
-    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), colors);
+    auto* depths = isRounded ? nullptr : floatsOf(colors + gathered.pixelBytes(Color) * pixelCount);
+    const ConstPlanes planes = active.gather(tile, channels, coder.activeByDepth(), colors, depths);
     countFaults(active, tile, channels, faults);
 
     FragmentHeader h = fragmentHeader(tile, channels);
@@ -162,6 +169,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
         Buffer smaller = pool.acquire(size);
         if (isCopied)
             std::memcpy(smaller.data() + fragmentPrefix, colors, format.pixelBytes(Color) * stored);
+        before = std::move(message);
         message = std::move(smaller);
     }
     message.shrink(size);
@@ -171,8 +179,8 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
             coder.encodeColor(h.colorFormat, rgba, static_cast<int>(stored), out);
         else if ((c == Normal || c == Albedo) && !isCopied)
             multiplyByRounded(coder, h.colorFormat, rgba, body, floatsOf(planes.at[c]), stored, floatsOf(out));
-        else if (c != Color)
-            std::memcpy(out, planes.at[c], bytes);
+        else if (c != Color && out != planes.at[c])
+            std::memmove(out, planes.at[c], bytes);
     });
     if (codec && payload > 0)
         compress(pool, *codec, h, message);

@@ -272,10 +272,11 @@ inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& sha
 class ActivePixels : public ActiveSpans {
 public:
     // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
-    // `colors`, which has room for all pixels of the tile, and the rest to memory of its own; returns where they are.
-    // Each row is copied as soon as its spans are found: rows of a large image are far apart in memory, and so are read
-    // there once.
-    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors)
+    // `colors`, which has room for all pixels of the tile, depths to `depths`, if that is not null, and the rest to
+    // memory of its own; returns where they are. Each row is copied as soon as its spans are found: rows of a large
+    // image are far apart in memory, and so are read there once.
+    ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors,
+                       float* depths = nullptr)
     {
         const ConstPlanes& planes = tile.planes();
         const auto most =
@@ -290,8 +291,10 @@ public:
         std::size_t targetCount = 1;
         for (std::size_t c = Depth; c < channelCount; ++c)
             if (hasChannel(channels, c)) {
-                planes_[c].resize(std::max(planes_[c].size(), most * static_cast<std::size_t>(channelWords[c])));
-                auto* to = reinterpret_cast<std::byte*>(planes_[c].data());
+                const bool isOwn = c != Depth || !depths;
+                planes_[c].resize(
+                    std::max(planes_[c].size(), isOwn ? most * static_cast<std::size_t>(channelWords[c]) : 0));
+                auto* to = reinterpret_cast<std::byte*>(isOwn ? planes_[c].data() : depths);
                 targets[targetCount++] = {c, to};
                 result.at[c] = to;
             }
@@ -328,6 +331,9 @@ private:
             const std::ptrdiff_t begin = y * tile.stride;
             if (y + ahead < yEnd)
                 prefetchRow(tile.colorAt(x0, y + ahead), static_cast<std::size_t>(width) * tile.pixelBytes(Color));
+            if (depths && y + ahead < yEnd)
+                prefetchRow(reinterpret_cast<const std::byte*>(depths + begin + ahead * tile.stride + x0),
+                            static_cast<std::size_t>(width) * sizeof(float));
             findRow(
                 y, x0, x0 + width,
                 [&](int x, int count) {
