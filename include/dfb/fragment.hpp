@@ -53,6 +53,7 @@ public:
         ChannelMask channels = colorChannel;
         WireFormat colorFormat = WireFormat::Float32; // that it came in
         const float* color = nullptr;
+        const std::byte* bytes = nullptr; // in place of `color`: 4 a pixel
         const float* depth = nullptr;
         detail::ConstPlanes aux;               // all but colour and depth
         Span fullRow;                          // Dense and Constant
@@ -71,13 +72,18 @@ public:
     const TileHeader& header() const noexcept { return header_; }
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
     std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: not known, 0
+    // Whether FragmentCursor::nextBytes() may be called.
+    bool keepsBytes() const noexcept { return parts_.bytes || parts_.inPlace.activity.hasBytes; }
+    // Whether a cursor makes its rows in memory of their own.
+    bool isMadeByRow() const noexcept { return parts_.bytes || parts_.encoding == FragmentEncoding::InPlace; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr || parts_.inPlace.depth != nullptr; }
     ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
     WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // that it came in
 
     // Colour of the pixels that are stored: all that are active, or with FragmentEncoding::Constant a row of equal
-    // ones. Null, and none, with FragmentEncoding::InPlace.
+    // ones. Null with FragmentEncoding::InPlace, of which none are, and for an operation that readsInPlace also where
+    // they came as bytes.
     const float* color() const noexcept { return parts_.color; }
     std::size_t storedPixels() const noexcept
     {
@@ -94,7 +100,8 @@ public:
             return false;
         const std::size_t count = storedPixels();
         std::size_t i = 0;
-        while (i < count && parts_.color[4 * i + 3] == 1.0f)
+        while (i < count
+               && (parts_.bytes ? parts_.bytes[4 * i + 3] == std::byte{255} : parts_.color[4 * i + 3] == 1.0f))
             ++i;
         return i == count;
     }
@@ -112,25 +119,33 @@ private:
     Parts parts_;
 };
 
+// Pixels of a row with 8 bits a channel, where they lie: as FragmentRow, with `bytes` in place of colours. Some may not
+// be active: those whose depth is not below the limit.
+struct ByteRow : FragmentRow {
+    const std::byte* bytes = nullptr;
+    float depthLimit = std::numeric_limits<float>::infinity();
+    Span valid; // in which all pixels of a fragment in place are
+};
+
 // Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
 class FragmentCursor {
 public:
-    // `row` is memory for a row of a fragment that is read in place; null: the cursor has its own. `countsFaults`:
+    // `row` is memory for a row of a fragment that isMadeByRow(); null: the cursor has its own. `countsFaults`:
     // whether pixels that are not as they should be are added to the frame's counts; only one walk may.
     explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
-          depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
+          bytes_(fragment.parts_.bytes), depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
           hasAux_((fragment.parts_.channels & ~(colorChannel | depthChannel)) != 0), countsFaults_(countsFaults),
           rowPixels_(row)
     {
-        if (!row && isInPlace()) {
+        if (!row && fragment.isMadeByRow()) {
             ownRow_ = std::make_unique<detail::RowPixels>();
             rowPixels_ = ownRow_.get();
         }
     }
 
-    // The active pixels of the next row of the region, starting with row 0; a row may have none. Of a fragment that is
-    // read in place they hold until the next call.
+    // The active pixels of the next row of the region, starting with row 0; a row may have none. Of a fragment that
+    // isMadeByRow() they hold until the next call.
     FragmentRow next()
     {
         FragmentRow row;
@@ -148,14 +163,38 @@ public:
         result.spanCount = 0;
         if (isInPlace())
             return readRow(row, result);
-        if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
+        if (!findRow(row, result))
             return false;
-        const bool isSparse = parts_->encoding == FragmentEncoding::Sparse;
-        result.spans = isSparse ? span_ : &parts_->fullRow;
-        result.spanCount = isSparse ? parts_->rowSpanCounts[row - parts_->rowBegin] : 1;
-        result.color = color_;
-        result.depth = depth_;
-        return result.spanCount > 0;
+        result.color = bytes_ ? decodeRow(result) : color_;
+        return true;
+    }
+    // Does so for a fragment that keepsBytes() and has a depth.
+    bool nextBytes(ByteRow& result)
+    {
+        const int row = row_++;
+        if (!isInPlace()) {
+            result.bytes = bytes_;
+            result.depthLimit = std::numeric_limits<float>::infinity();
+            return findRow(row, result);
+        }
+        const detail::PixelsInPlace& pixels = parts_->inPlace;
+        if (row < pixels.valid.y0 || row >= pixels.valid.y1)
+            return false;
+        pixels.prefetchAfter(row);
+        const std::ptrdiff_t first = row * pixels.stride + pixels.valid.x0;
+        result.valid = {static_cast<std::uint16_t>(pixels.valid.x0), static_cast<std::uint16_t>(pixels.valid.width())};
+        result.spans = &result.valid;
+        result.spanCount = 1;
+        result.bytes = pixels.color + 4 * first;
+        result.depth = pixels.depth + first;
+        result.depthLimit = pixels.activity.depthLimit;
+        return true;
+    }
+    // Adds to the frame's counts what nextBytes() does not look at.
+    void countNanDepths(std::uint64_t count)
+    {
+        if (count > 0 && countsFaults_ && parts_->faults)
+            parts_->faults->add({count, 0});
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
 
@@ -163,9 +202,7 @@ public:
     {
         if (parts_->encoding == FragmentEncoding::Constant || isInPlace())
             return;
-        std::size_t pixels = 0;
-        for (int i = 0; i < row.spanCount; ++i)
-            pixels += row.spans[i].count;
+        const std::size_t pixels = pixelsIn(row);
         if (parts_->encoding == FragmentEncoding::Sparse)
             span_ += row.spanCount;
         advance(pixels);
@@ -184,6 +221,34 @@ public:
 private:
     bool isInPlace() const noexcept { return parts_->encoding == FragmentEncoding::InPlace; }
 
+    static std::size_t pixelsIn(const FragmentRow& row)
+    {
+        std::size_t pixels = 0;
+        for (int i = 0; i < row.spanCount; ++i)
+            pixels += row.spans[i].count;
+        return pixels;
+    }
+
+    // All but the colour, of pixels that are not in place.
+    bool findRow(int row, FragmentRow& result) const
+    {
+        if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
+            return false;
+        const bool isSparse = parts_->encoding == FragmentEncoding::Sparse;
+        result.spans = isSparse ? span_ : &parts_->fullRow;
+        result.spanCount = isSparse ? parts_->rowSpanCounts[row - parts_->rowBegin] : 1;
+        result.depth = depth_;
+        return result.spanCount > 0;
+    }
+
+    const float* decodeRow(const FragmentRow& row)
+    {
+        const std::size_t pixels = pixelsIn(row);
+        rowPixels_->color.resize(std::max(rowPixels_->color.size(), 4 * pixels));
+        detail::bytesToFloats(bytes_, pixels, rowPixels_->color.data());
+        return rowPixels_->color.data();
+    }
+
     bool readRow(int y, FragmentRow& result)
     {
         detail::InputFaults faults;
@@ -199,7 +264,10 @@ private:
 
     void advance(std::size_t pixels)
     {
-        color_ += 4 * pixels;
+        if (bytes_)
+            bytes_ += 4 * pixels;
+        else
+            color_ += 4 * pixels;
         if (depth_)
             depth_ += pixels;
         if (hasAux_)
@@ -209,11 +277,12 @@ private:
     const Fragment::Parts* parts_;
     const Span* span_;
     const float* color_;
+    const std::byte* bytes_;
     const float* depth_;
     detail::ConstPlanes aux_;
     bool hasAux_, countsFaults_;
     int row_ = 0;
-    detail::RowPixels* rowPixels_; // of the row that next() gave; InPlace
+    detail::RowPixels* rowPixels_; // of the row that next() gave
     std::unique_ptr<detail::RowPixels> ownRow_;
 };
 

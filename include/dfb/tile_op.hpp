@@ -27,8 +27,9 @@
 //   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
 //                                                then expected and counted
 //   static constexpr bool readsInPlace = true;   inputs may come as views of a renderer's memory
-//                                                (FragmentEncoding::InPlace): they are read with forEachPixel() or a
-//                                                FragmentCursor, in finish(), and not through Fragment::color()
+//                                                (FragmentEncoding::InPlace) or as bytes: they are read with
+//                                                forEachPixel() or a FragmentCursor, in finish(), and not through
+//                                                Fragment::color()
 //   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
 //                                                isComplete() does not wait for them: nobody need render them
 //   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
@@ -160,6 +161,17 @@ public:
         float* out = detail::floatsOf(color);
         for (int i = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0; i < 4 * count; ++i)
             out[i] = rgba[i] + 0.0f;
+    }
+    // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
+    // each, and to these depths.
+    void setStored(int x, int y, int count, const std::byte* stored, const float* depth)
+    {
+        const std::size_t first = pixelAt(x, y), pixels = static_cast<std::size_t>(count);
+        overwrites(x, y, count);
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+            std::copy(depth, depth + count, out + first);
+        if (std::byte* color = to_.at[detail::Color])
+            std::memcpy(color + first * bytesPerPixel(format_), stored, pixels * bytesPerPixel(format_));
     }
     // Sets pixels [x, x + count) of row y to the background, which is given as it is stored: bytesPerPixel(format())
     // bytes. Depth becomes +infinity. Pixels that are known to be background already are not written.

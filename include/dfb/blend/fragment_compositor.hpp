@@ -33,10 +33,10 @@ public:
     {
         cursors_.clear();
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
-        std::size_t inPlace = 0;
+        std::size_t made = 0;
         for (; begin != end; ++begin)
-            if ((*begin)->encoding() == FragmentEncoding::InPlace)
-                cursors_.push_back(FragmentCursor(**begin, rowPixels(inPlace++), isFirst));
+            if ((*begin)->isMadeByRow())
+                cursors_.push_back(FragmentCursor(**begin, rowPixels(made++), isFirst));
             else if (!(*begin)->empty())
                 cursors_.push_back(FragmentCursor(**begin));
     }
@@ -71,6 +71,28 @@ public:
             compositeSpans(row, active_.front());
         } else {
             compositeRuns(row, wantsAux);
+        }
+    }
+
+    // Keeps the nearest pixels of the next row of all fragments, which keep their bytes and have a depth. Where there
+    // is nothing the depth is +infinity.
+    void nextRow(detail::NearestBytes& row, int width)
+    {
+        row.reset(width);
+        ByteRow r;
+        for (FragmentCursor& cursor : cursors_) {
+            if (!cursor.nextBytes(r))
+                continue;
+            detail::ByteLayer layer{r.bytes, r.depth, r.depthLimit};
+            std::uint64_t nan = 0;
+            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+                nan += detail::keepNearestBytes(row.depth.data() + span->x, row.bytes.data() + 4 * span->x, span->count,
+                                                layer);
+                layer.bytes += 4 * static_cast<std::ptrdiff_t>(span->count);
+                layer.depth += span->count;
+            }
+            cursor.countNanDepths(nan);
+            cursor.advance(r);
         }
     }
 
@@ -214,7 +236,7 @@ private:
 
     BlendRule rule_;
     std::vector<FragmentCursor> cursors_;
-    std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that are read in place
+    std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
     std::vector<std::uint64_t> isEdge_;    // bit by bit

@@ -1,5 +1,6 @@
-// The kernels of sorting layers by depth, (depth, index) ascending: how far an order holds along a row, and sorting
-// four pixels at once. Each is there in plain C++ and, for processors that have it, by hand for AVX2.
+// The kernels of sorting layers by depth, (depth, index) ascending: how far an order holds along a row, sorting four
+// pixels at once, and the nearest of pixels of 8 bits a channel. Each is there in plain C++ and, for processors that
+// have it, by hand for AVX2.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -9,10 +10,11 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <limits>
+#include <vector>
 
 #if defined(DFB_HAS_AVX2_CLONES)
 #include <immintrin.h>
-#include <vector>
 #endif
 
 DFB_NAMESPACE_BEGIN
@@ -223,6 +225,73 @@ inline void sortFour(const float* const* depths, const SortNetwork& network, Fou
     }
 #endif
     sortFourPlain(depths, network, orders);
+}
+
+// ---- the nearest
+
+// A row of pixels of which the nearest are kept: at first of depth +infinity.
+struct NearestBytes {
+    std::vector<float> depth;
+    std::vector<std::byte> bytes; // 4 a pixel
+
+    void reset(int width)
+    {
+        depth.assign(static_cast<std::size_t>(width), std::numeric_limits<float>::infinity());
+        bytes.resize(4 * depth.size());
+    }
+};
+
+// Pixels of a layer, where they lie.
+struct ByteLayer {
+    const std::byte* bytes;
+    const float* depth;
+    float depthLimit; // at this depth or beyond a pixel is empty
+};
+
+// Takes pixels [begin, end) of a layer where they are nearer, as they are; a depth of -0 becomes 0. `depth` and `bytes`
+// are of the nearest so far. Returns how many depths are NaN: these pixels are empty.
+inline std::uint64_t keepBytesPlain(float* depth, std::byte* bytes, int begin, int end, const ByteLayer& layer)
+{
+    std::uint64_t nan = 0;
+    for (int i = begin; i < end; ++i) {
+        const float its = layer.depth[i];
+        nan += its != its;
+        if (its < depth[i] && its < layer.depthLimit) {
+            depth[i] = its + 0.0f;
+            std::memcpy(bytes + 4 * i, layer.bytes + 4 * i, 4);
+        }
+    }
+    return nan;
+}
+
+#if defined(DFB_HAS_AVX2_CLONES)
+DFB_AVX2 inline std::uint64_t keepBytesAvx2(float* depth, std::byte* bytes, int count, const ByteLayer& layer)
+{
+    const __m256 limit = _mm256_set1_ps(layer.depthLimit), zero = _mm256_setzero_ps();
+    std::uint64_t nan = 0;
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        const __m256 its = _mm256_loadu_ps(layer.depth + i), nearest = _mm256_loadu_ps(depth + i);
+        const __m256 isNearer =
+            _mm256_and_ps(_mm256_cmp_ps(its, nearest, _CMP_LT_OQ), _mm256_cmp_ps(its, limit, _CMP_LT_OQ));
+        _mm256_storeu_ps(depth + i, _mm256_blendv_ps(nearest, _mm256_add_ps(its, zero), isNearer));
+        auto* to = reinterpret_cast<__m256i*>(bytes + 4 * i);
+        const __m256i from = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(layer.bytes + 4 * i));
+        _mm256_storeu_si256(to, _mm256_blendv_epi8(_mm256_loadu_si256(to), from, _mm256_castps_si256(isNearer)));
+        for (int bits = _mm256_movemask_ps(_mm256_cmp_ps(its, its, _CMP_UNORD_Q)); bits != 0; bits &= bits - 1)
+            ++nan;
+    }
+    return nan + keepBytesPlain(depth, bytes, i, count, layer);
+}
+#endif
+
+inline std::uint64_t keepNearestBytes(float* depth, std::byte* bytes, int count, const ByteLayer& layer)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        return keepBytesAvx2(depth, bytes, count, layer);
+#endif
+    return keepBytesPlain(depth, bytes, 0, count, layer);
 }
 
 } // namespace detail

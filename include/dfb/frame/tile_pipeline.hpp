@@ -44,7 +44,7 @@ public:
                config.onTile},
               config.image.displayRank, rank, sendersTo(config.image.displayRank, rankCount),
               [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
-          coder_(config.precision, traits().activeByDepth)
+          coder_(config.precision, traits().activeByDepth, traits().readsInPlace && !isLossy())
     {
     }
 

@@ -156,6 +156,7 @@ private:
         std::vector<FragmentCompositor> compositors;
         CompositeRow row;
         std::vector<std::uint8_t> isUndefined;
+        NearestBytes nearest;
     };
 
     struct Exact {
@@ -175,6 +176,7 @@ private:
 
     Scratch& start();
     void finishRuns(FinishedTile& out);
+    void finishBytes(FinishedTile& out);
     void roundExactly(FinishedTile& out, int y, double farthest);
     const std::vector<DoubleDouble>& exactRow(int y);
 
@@ -340,7 +342,11 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
     static thread_local PixelSums sums;
     const int last = info_.passes - 1;
     if (last == 0 && tracked_ == 0 && !out.isDithered()) {
-        finishRuns(out);
+        const auto isOfBytes = [](const Fragment& f) { return f.keepsBytes() && f.hasDepth(); };
+        if (rule_ == BlendRule::Nearest && std::all_of(fragments_.begin(), fragments_.end(), isOfBytes))
+            finishBytes(out);
+        else
+            finishRuns(out);
         return;
     }
     const bool direct = last == 0 && (tracked_ & imageAuxChannels) == 0;
@@ -419,6 +425,55 @@ DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
                                                         row.depth.data() + (row.wantsDepth ? run.x : 0)));
         }
         out.fillPixels(x, y, out.width() - x, background.data());
+        roundExactly(out, y, farthest);
+    }
+    fragments_.clear();
+}
+
+inline bool areOpaque(const std::byte* rgba, int count)
+{
+    std::byte all{255};
+    for (int i = 0; i < count; ++i)
+        all &= rgba[4 * i + 3];
+    return all == std::byte{255};
+}
+
+// Does so for the nearest of pixels of 8 bits a channel, which 8 bits of the image get as they are where no background
+// shows through.
+DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
+{
+    Scratch& scratch = start();
+    CompositeRow& row = scratch.row;
+    const bool isBlack = info_.background == std::array<float, 4>{};
+    std::array<std::byte, 16> background;
+    if (out.format() != OutputFormat::None)
+        convertPixels(info_.background.data(), 1, out.format(), background.data());
+    for (int y = 0; y < out.height(); ++y) {
+        scratch.compositors.front().nextRow(scratch.nearest, out.width());
+        const float* depth = scratch.nearest.depth.data();
+        int end = 0;
+        double farthest = 0;
+        for (int x0 = 0; x0 < out.width(); x0 += 64) {
+            const int some = std::min(64, out.width() - x0);
+            forEachRun(
+                depthBits(depth + x0, some, std::numeric_limits<float>::infinity()).active, [&](int at, int count) {
+                    const int x = x0 + at;
+                    const std::byte* bytes = scratch.nearest.bytes.data() + 4 * x;
+                    out.fillPixels(end, y, x - end, background.data());
+                    end = x + count;
+                    if (out.format() == OutputFormat::RGBA8 && (isBlack || areOpaque(bytes, count))) {
+                        out.setStored(x, y, count, bytes, depth + x);
+                        return;
+                    }
+                    float rgba[4 * 64];
+                    bytesToFloats(bytes, static_cast<std::size_t>(count), rgba);
+                    row.clear(x, count);
+                    over(row, x, count, Layer{rgba, nullptr, nullptr});
+                    overBackground(row, x, count, info_.background.data());
+                    farthest = std::max(farthest, out.setPixels(x, y, count, row.rgba.data() + 4 * x, depth + x));
+                });
+        }
+        out.fillPixels(end, y, out.width() - end, background.data());
         roundExactly(out, y, farthest);
     }
     fragments_.clear();

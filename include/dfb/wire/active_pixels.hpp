@@ -252,8 +252,9 @@ inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t c
     return true;
 }
 
-// Loads a row of an image into the cache. No processor knows by itself where the next row begins.
-inline void prefetchRow(const std::byte* row, std::size_t bytes)
+// Loads a row of an image into the cache. No processor knows by itself where the next row begins. Inlined always, as
+// GCC leaves out calls of functions that do nothing else.
+DFB_INLINE void prefetchRow(const std::byte* row, std::size_t bytes)
 {
 #if defined(__GNUC__)
     for (std::size_t i = 0; i < bytes; i += 64)
@@ -382,6 +383,20 @@ struct PixelsInPlace {
     // Reads row y. Adds to `faults`.
     void readRow(int y, RowPixels& row, InputFaults& faults) const;
 
+    std::ptrdiff_t colorBytes() const noexcept { return activity.hasBytes ? 4 : 4 * sizeof(float); } // of a pixel
+    // Before row y is read: loads one that follows into the cache.
+    DFB_INLINE void prefetchAfter(int y) const
+    {
+        const int width = valid.width(), ahead = y + rowsAhead(width);
+        if (ahead >= valid.y1)
+            return;
+        const std::ptrdiff_t first = ahead * stride + valid.x0;
+        prefetchRow(color + colorBytes() * first, static_cast<std::size_t>(colorBytes() * width));
+        if (depth)
+            prefetchRow(reinterpret_cast<const std::byte*>(depth + first),
+                        sizeof(float) * static_cast<std::size_t>(width));
+    }
+
     // Whether alpha is 1 in all pixels of a region of this size.
     bool isOpaque(int width, int height) const noexcept
     {
@@ -403,14 +418,9 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     if (y < valid.y0 || y >= valid.y1)
         return;
     const bool hasBytes = activity.hasBytes;
-    const std::ptrdiff_t bytes = hasBytes ? 4 : 4 * sizeof(float), begin = y * stride;
-    const int width = valid.width(), ahead = y + rowsAhead(width);
-    if (ahead < valid.y1)
-        prefetchRow(color + bytes * (ahead * stride + valid.x0), static_cast<std::size_t>(bytes * width));
-    if (depth && ahead < valid.y1)
-        prefetchRow(reinterpret_cast<const std::byte*>(depth + ahead * stride + valid.x0),
-                    sizeof(float) * static_cast<std::size_t>(width));
-    const auto most = static_cast<std::size_t>(width);
+    const std::ptrdiff_t bytes = colorBytes(), begin = y * stride;
+    prefetchAfter(y);
+    const auto most = static_cast<std::size_t>(valid.width());
     row.color.resize(std::max(row.color.size(), 4 * most));
     row.depth.resize(std::max(row.depth.size(), depth ? most : 0));
     ConstPlanes planes;
@@ -425,8 +435,7 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
         float *toColor = row.color.data() + 4 * at, *toDepth = depth ? row.depth.data() + at : nullptr;
         bool isClean = true;
         if (hasBytes)
-            cpuHasAvx2() ? decodeBytesAvx2(color + 4 * first, span.count, toColor)
-                         : decodeBytes(color + 4 * first, span.count, toColor);
+            bytesToFloats(color + 4 * first, span.count, toColor);
         else
             isClean = copyAndCheck(planes, false, Color, first, span.count, reinterpret_cast<std::byte*>(toColor));
         if (depth)

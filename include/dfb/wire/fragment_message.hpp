@@ -297,8 +297,8 @@ inline std::size_t rawFragmentBytes(const Buffer& message)
     return fragmentPrefix + loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader)).rawPayloadBytes;
 }
 
-// Brings the payload, with its colours as Float32, to where the result says, in `message`, which becomes another one if
-// it must. Throws Error (MalformedMessage).
+// Brings the payload, with its colours as Float32 unless the coder keeps them, to where the result says, in `message`,
+// which becomes another one if it must. Throws Error (MalformedMessage).
 inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const FragmentHeader& h, const Codec* codec,
                                const WireCoder& coder)
 {
@@ -322,7 +322,7 @@ inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const Fragment
         failMalformed("wrong message size", static_cast<std::int64_t>(fragmentPrefix + payload),
                       static_cast<std::int64_t>(message.size()));
     }
-    if (h.colorFormat == WireFormat::Float32)
+    if (h.colorFormat == WireFormat::Float32 || coder.keeps(h.colorFormat))
         return message.data() + offset;
 
     Buffer floats = pool.acquire(wide.bodyBytes(h.shape));
@@ -411,7 +411,8 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
     h.shape.check(header.region);
     const std::byte* in = unpack(pool, message, h, codec, coder);
     const int width = header.region.width();
-    const PlaneFormat format(h.channels, sizeof(float));
+    const bool keepsBytes = coder.keeps(h.colorFormat);
+    const PlaneFormat format(h.channels, keepsBytes ? 1 : sizeof(float));
     SparseBody body = decodeSparse(format, h.shape, width, in);
     if (const float* depth = floatsOf(body.planes.at[Depth])) {
         std::uint32_t isNan = 0;
@@ -436,7 +437,8 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
     parts.channels = h.channels;
     parts.colorFormat = h.colorFormat;
     parts.fullRow = {0, static_cast<std::uint16_t>(width)};
-    parts.color = floatsOf(body.planes.at[Color]);
+    parts.color = keepsBytes ? nullptr : floatsOf(body.planes.at[Color]);
+    parts.bytes = keepsBytes ? body.planes.at[Color] : nullptr;
     parts.depth = floatsOf(body.planes.at[Depth]);
     parts.aux = body.planes;
     parts.aux.at[Color] = parts.aux.at[Depth] = nullptr;

@@ -130,6 +130,10 @@ DFB_AVX2 inline void decodeBytesAvx2(const std::byte* in, std::size_t count, flo
 {
     decodeBytes(in, count, rgba);
 }
+inline void bytesToFloats(const std::byte* in, std::size_t count, float* rgba) noexcept
+{
+    cpuHasAvx2() ? decodeBytesAvx2(in, count, rgba) : decodeBytes(in, count, rgba);
+}
 
 // Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
 DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) noexcept
@@ -329,14 +333,16 @@ inline std::size_t bytesOf(WireFormat format) noexcept
 class WireCoder {
 public:
     WireCoder() = default;
-    // `activeByDepth`: of the tile operation.
-    explicit WireCoder(const Precision& precision, bool activeByDepth = false)
-        : activeByDepth_(activeByDepth), maxColor_(precision.maxColor),
+    // `activeByDepth`: of the tile operation. `keepsBytes`: fragments are not asked for Fragment::color().
+    explicit WireCoder(const Precision& precision, bool activeByDepth = false, bool keepsBytes = false)
+        : activeByDepth_(activeByDepth), keepsBytes_(keepsBytes), maxColor_(precision.maxColor),
           scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
     {
     }
 
     bool activeByDepth() const noexcept { return activeByDepth_; }
+    // Whether colours in this format stay so until a FragmentCursor gets to their row.
+    bool keeps(WireFormat format) const noexcept { return keepsBytes_ && format == WireFormat::Bytes; }
 
     // Whether pixels may travel in a format other than Float32.
     bool inRange(const float* rgba, int count) const noexcept
@@ -377,7 +383,7 @@ public:
         case WireFormat::Float16: return decode(HalfCode(), 1 / scale_, 0x1p-15f);
         case WireFormat::Unorm16: return decode(Unorm16Code(), maxColor_ / 65535.0f, 1 / 65535.0f);
         case WireFormat::Unorm8: return decode(Unorm8Code(), maxColor_ / 255.0f, 1 / 255.0f);
-        case WireFormat::Bytes: cpuHasAvx2() ? decodeBytesAvx2(in, count, rgba) : decodeBytes(in, count, rgba); break;
+        case WireFormat::Bytes: bytesToFloats(in, count, rgba); break;
         }
         return true;
     }
@@ -386,7 +392,7 @@ public:
     static constexpr float leastAlpha = 0x1p-100f;
 
 private:
-    bool activeByDepth_ = false;
+    bool activeByDepth_ = false, keepsBytes_ = false;
     float maxColor_ = 1;
     float scale_ = 0x1p14f; // Float16: a power of two that brings maxColor to [2^14, 2^15]
 };

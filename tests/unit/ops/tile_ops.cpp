@@ -69,6 +69,132 @@ dfb::testing::ErrorReport compare(const TileInputs<Op::tileSize>& in)
     return dfb::testing::compare<Op>(in, dfb::testing::referenceOf(in));
 }
 
+// Pixels of 8 bits a channel, and the same as floats.
+struct ByteInput {
+    std::vector<std::uint8_t> bytes = std::vector<std::uint8_t>(4 * 50 * 20);
+    std::vector<float> floats, depth = std::vector<float>(50 * 20), normal = std::vector<float>(3 * 50 * 20, 0.5f);
+    dfb::Region valid{0, 0, 50, 20};
+    float depthLimit = infinity;
+    bool isInPlace = false;
+    int pass = 0;
+
+    ByteInput(Random& random, int passes, bool mayBeInPlace)
+    {
+        const float depths[] = {1, 2, 0, -0.0f, 1, -infinity, infinity, notANumber, 0.5f, 3};
+        const std::uint64_t kind = random() % 4; // in short runs, in long ones, everywhere, the same everywhere
+        std::uint32_t pixel = 0;
+        std::size_t which = 0;
+        for (std::size_t i = 0; i < depth.size(); ++i) {
+            if (i == 0 || (kind != 3 && random() % (kind == 0 ? 2 : 40) == 0)) {
+                pixel = static_cast<std::uint32_t>(random()) | (random() % 2 ? 0xff000000u : 0);
+                which = random() % (kind < 2 ? 10 : 6);
+            }
+            std::memcpy(&bytes[4 * i], &pixel, 4);
+            depth[i] = depths[which];
+        }
+        for (const std::uint8_t byte : bytes)
+            floats.push_back(static_cast<float>(byte) / 255.0f);
+        if (random() % 2) {
+            valid.x0 = static_cast<int>(random() % 20), valid.x1 = 21 + static_cast<int>(random() % 30);
+            valid.y0 = static_cast<int>(random() % 10), valid.y1 = 11 + static_cast<int>(random() % 10);
+        }
+        depthLimit = random() % 3 == 0 ? 2.0f : infinity;
+        isInPlace = mayBeInPlace && random() % 2;
+        pass = static_cast<int>(random() % static_cast<std::uint64_t>(passes));
+    }
+};
+
+struct ByteOutput {
+    TileOutput tile;
+    std::vector<float> normal;
+    std::int64_t faults = 0;
+};
+
+// Composites them as bytes, which stay so until finish(), or as floats.
+template <class Op>
+ByteOutput runBytes(const std::vector<ByteInput>& inputs, const dfb::TileInfo& info, bool asBytes,
+                    dfb::OutputFormat format, bool dither)
+{
+    namespace d = dfb::detail;
+    const auto pool = dfb::MemoryPool::create();
+    const dfb::TileLayout layout(50, 20, 64);
+    const d::WireCoder coder(dfb::Precision(), d::ActiveByDepth<Op>::value, true);
+    const auto sent = static_cast<dfb::ChannelMask>(dfb::colorChannel | dfb::depthChannel | info.wanted);
+    ByteOutput out;
+    d::InputFaults faults;
+    d::FaultCounts counts;
+    Op op;
+    op.newFrame(info);
+    for (std::size_t i = inputs.size(); i-- > 0;) {
+        const ByteInput& input = inputs[i];
+        dfb::TileView<dfb::colorChannel | dfb::depthChannel | dfb::normalChannel, 64> view;
+        view.tile = 0;
+        view.region = layout.region(0);
+        view.source = static_cast<std::uint32_t>(i);
+        view.pass = input.pass;
+        view.stride = 50;
+        view.color8 = asBytes ? input.bytes.data() : nullptr;
+        view.color = asBytes ? nullptr : input.floats.data();
+        view.depth = input.depth.data();
+        view.normal = input.normal.data();
+        view.valid = input.valid;
+        d::InputPixels pixels(view);
+        pixels.depthLimit = input.depthLimit;
+        if (input.isInPlace) {
+            dfb::Fragment::Parts parts;
+            parts.encoding = dfb::FragmentEncoding::InPlace;
+            parts.channels = sent;
+            parts.inPlace = d::pixelsInPlace(pixels, sent, coder.activeByDepth());
+            parts.faults = &counts;
+            op.add(dfb::Fragment(view, dfb::Buffer(), parts));
+            continue;
+        }
+        dfb::Buffer message =
+            d::encodeFragment(*pool, pixels, sent, 0, nullptr, coder, dfb::WireFormat::Float32, faults);
+        op.add(d::decodeFragment(
+            *pool, std::move(message), layout, [&](int) { return info.passes; }, nullptr, coder));
+    }
+    const bool hasDepth = (info.wanted & dfb::depthChannel) != 0, hasNormal = (info.wanted & dfb::normalChannel) != 0;
+    out.tile.color.assign(50 * 20 * dfb::bytesPerPixel(format), std::byte{0xcd});
+    out.tile.depth.assign(hasDepth ? 50 * 20 : 0, -7.0f);
+    out.normal.assign(hasNormal ? 3 * 50 * 20 : 0, -7.0f);
+    d::Planes planes;
+    planes.at[d::Color] = out.tile.color.data();
+    planes.at[d::Depth] = hasDepth ? reinterpret_cast<std::byte*>(out.tile.depth.data()) : nullptr;
+    planes.at[d::Normal] = hasNormal ? reinterpret_cast<std::byte*>(out.normal.data()) : nullptr;
+    dfb::FinishedTile finished(layout.region(0), format, planes, 50, dither);
+    op.finish(finished);
+    out.faults = counts.nonFinite + static_cast<std::int64_t>(faults.nonFinite);
+    return out;
+}
+
+template <class Op>
+void checkBytes(std::uint64_t seed)
+{
+    Random random(seed);
+    dfb::TileInfo info;
+    info.region = {0, 0, 50, 20};
+    info.passes = random() % 4 == 0 ? 2 : 1;
+    info.wanted = random() % 2 ? dfb::depthChannel : dfb::ChannelMask{0};
+    if ((Op::channels & dfb::normalChannel) != 0)
+        info.wanted |= dfb::normalChannel;
+    if (random() % 2)
+        info.background = {0.1f, 0.25f, 0.5f, random() % 2 ? 1.0f : 0.5f};
+    std::vector<ByteInput> inputs;
+    for (std::uint64_t i = 0, count = random() % 6; i < count; ++i)
+        inputs.emplace_back(random, info.passes, (Op::channels & dfb::normalChannel) == 0);
+    const dfb::OutputFormat formats[] = {dfb::OutputFormat::RGBA8, dfb::OutputFormat::RGBA8, dfb::OutputFormat::SRGBA8,
+                                         dfb::OutputFormat::RGBA32F};
+    const dfb::OutputFormat format = formats[random() % 4];
+    const bool dither = random() % 5 == 0;
+    INFO("seed " << seed << ", " << inputs.size() << " inputs, " << info.passes << " passes");
+    const ByteOutput bytes = runBytes<Op>(inputs, info, true, format, dither);
+    const ByteOutput floats = runBytes<Op>(inputs, info, false, format, dither);
+    CHECK(bytes.tile == floats.tile);
+    CHECK(bytes.normal == floats.normal);
+    CHECK(bytes.faults == floats.faults);
+}
+
 } // namespace
 
 TEST_CASE("AlphaBlend is within 1 ulp of exact in float, exact in 8 bits and in depth", "[ops]")
@@ -112,6 +238,15 @@ TEST_CASE("DepthComposite is within 1 ulp of exact in float, exact in 8 bits and
         const ErrorReport c = dfb::testing::compare<Op>(in, expected);
         CHECK(c.ulpsBelow() <= 2);
         CHECK(c.wrongBytes == 0);
+    }
+}
+
+TEST_CASE("Pixels of 8 bits a channel give the same picture as the same pixels as floats, bit for bit", "[ops]")
+{
+    for (std::uint64_t seed = 1000; seed < 1600; ++seed) {
+        checkBytes<dfb::DepthComposite>(seed);
+        checkBytes<dfb::BasicDepthComposite<64, dfb::colorChannel | dfb::depthChannel | dfb::normalChannel>>(seed);
+        checkBytes<dfb::AlphaBlend>(seed);
     }
 }
 
