@@ -14,11 +14,16 @@ namespace example {
 
 enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
 
-// The user's choice of view. Angles are in degrees, lengths in units of the largest extent of the visible scene.
+// The user's choice of view. Angles are in degrees, lengths in units of the largest extent of the visible scene, points
+// in the coordinates of the world.
 struct View {
-    float azimuth = 30;            // around the y axis, from +z towards +x
-    float elevation = 20;          // above the xz plane
-    float fieldOfView = 35;        // full vertical angle
+    float azimuth = 30;            // around the axis `up`: with y up from +z towards +x, with z up from -y towards +x
+    float elevation = 20;          // above the plane at right angles to `up`
+    float fieldOfView = 35;        // full vertical angle, before `zoom`
+    float zoom = 1;                // the image is so many times as large, seen from the same place
+    Vec3 up{0, 1, 0};              // of any length but 0
+    std::optional<Vec3> eye;       // none: by azimuth, elevation and distance
+    std::optional<Vec3> target;    // none: the centre of what there is to see
     std::optional<float> distance; // from the centre of what there is to see; none: so that all of it is in the image
     CameraKind kind = CameraKind::Perspective;
     float aperture = 0.05f;  // radius of the lens
@@ -32,15 +37,21 @@ namespace detail {
 inline constexpr double degree = 3.14159265358979323846 / 180.0;
 }
 
-// From the centre of the focus to the camera, in world space.
+// What the camera looks at.
+inline Vec3 targetOf(const Focus& focus, const View& view) { return view.target ? *view.target : focus.box.center(); }
+
+// From the target to the camera, in world space.
 inline double cameraDistance(const Focus& focus, const View& view, int width, int height)
 {
+    const Vec3 target = targetOf(focus, view);
+    if (view.eye)
+        return length(Vec3d(*view.eye) - Vec3d(target));
     const double unit = static_cast<double>(focus.box.largestExtent());
     if (view.distance)
         return static_cast<double>(*view.distance) * unit;
     // The ball touches the sides of the smaller angle of view, but for a margin.
     double angle = 0.5 * static_cast<double>(view.fieldOfView) * detail::degree;
-    double radius = static_cast<double>(focus.radius);
+    double radius = static_cast<double>(focus.radius) + static_cast<double>(length(target - focus.box.center()));
     const auto narrowTo = [&](double aspect) { angle = std::atan(std::tan(angle) * std::min(1.0, aspect)); };
     const double aspect = static_cast<double>(width) / height;
     switch (view.kind) {
@@ -64,7 +75,8 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
 // A camera of any kind at one frame: its rays, and for the library, where boxes project to.
 class FrameCamera {
 public:
-    // Frame `frame` of `frameCount`, which are a full turn around the centre of `focus`. y is up.
+    // Frame `frame` of `frameCount`, which are a full turn around the target. Throws dfb::InvalidArgument if the eye is
+    // where the target is.
     FrameCamera(const Focus& focus, const View& view, int frame, int frameCount, int width, int height)
         : FrameCamera(focus, view, orbit(focus, view, frame, frameCount, width, height), width, height)
     {
@@ -94,16 +106,48 @@ private:
     {
     }
 
+    // The axes of the orbit: up, and at right angles to it where azimuth 0 and azimuth 90 are.
+    struct Axes {
+        Vec3d up, front, side;
+
+        explicit Axes(const View& view) : up(unit(Vec3d(view.up)))
+        {
+            const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, -1, 0) : Vec3d(0, 0, 1);
+            front = unit(towards - up * dot(towards, up));
+            side = cross(up, front);
+        }
+    };
+
     static dfb::PerspectiveCamera orbit(const Focus& focus, const View& view, int frame, int frameCount, int width,
                                         int height)
     {
         using detail::degree;
-        const double azimuth = (static_cast<double>(view.azimuth) + 360.0 * frame / std::max(1, frameCount)) * degree;
+        const Axes axes(view);
+        const Vec3d target(targetOf(focus, view));
+        const double turn = 360.0 * frame / std::max(1, frameCount);
+        const float angle = view.zoom == 1 ? view.fieldOfView : zoomed(view.fieldOfView, view.zoom);
+        if (view.eye) {
+            const Vec3d arm = Vec3d(*view.eye) - target, along = axes.up * dot(arm, axes.up);
+            const Vec3d outward =
+                along + (arm - along) * std::cos(turn * degree) + cross(axes.up, arm) * std::sin(turn * degree);
+            const bool isAlongUp = length(cross(axes.up, arm)) <= 1e-4 * length(arm);
+            return dfb::PerspectiveCamera::along(frame == 0 ? *view.eye : rounded(target + outward),
+                                                 rounded(outward * -1.0), rounded(isAlongUp ? axes.front : axes.up),
+                                                 angle);
+        }
+        const double azimuth = (static_cast<double>(view.azimuth) + turn) * degree;
         const double elevation = std::clamp(static_cast<double>(view.elevation), -89.9, 89.9) * degree;
-        const Vec3d outward(std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
-                            std::cos(elevation) * std::cos(azimuth));
-        const Vec3 eye = rounded(Vec3d(focus.box.center()) + outward * cameraDistance(focus, view, width, height));
-        return dfb::PerspectiveCamera::along(eye, rounded(outward * -1.0), {0, 1, 0}, view.fieldOfView);
+        const Vec3d outward = axes.side * (std::cos(elevation) * std::sin(azimuth)) + axes.up * std::sin(elevation)
+                              + axes.front * (std::cos(elevation) * std::cos(azimuth));
+        const Vec3 eye = rounded(target + outward * cameraDistance(focus, view, width, height));
+        return dfb::PerspectiveCamera::along(eye, rounded(outward * -1.0), rounded(axes.up), angle);
+    }
+
+    static float zoomed(float degrees, float zoom)
+    {
+        using detail::degree;
+        const double half = std::tan(0.5 * static_cast<double>(degrees) * degree) / static_cast<double>(zoom);
+        return static_cast<float>(2 * std::atan(half) / degree);
     }
 
     static AnyCamera cameraOf(const Focus& focus, const View& view, const dfb::PerspectiveCamera& pinhole,
@@ -113,16 +157,14 @@ private:
         const auto orOne = [](float v) { return v > 0 ? v : 1.0f; }; // of a scene without extent
         const float sharp = orOne(view.focus > 0 ? view.focus * unit : static_cast<float>(distance));
         const Vec3 eye = pinhole.eye(), forward = pinhole.forward(), up = pinhole.up();
+        const float angle = view.zoom == 1 ? view.fieldOfView : zoomed(view.fieldOfView, view.zoom);
         switch (view.kind) {
         case CameraKind::Perspective: break;
-        case CameraKind::DepthOfField:
-            return dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
+        case CameraKind::DepthOfField: return dfb::ThinLensCamera(eye, forward, up, angle, view.aperture * unit, sharp);
         case CameraKind::MotionBlur:
-            return dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, focus.box.center(), {0, 1, 0},
-                                        view.shutter);
-        case CameraKind::Stereo:
-            return dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);
-        case CameraKind::Dome: return dfb::DomeCamera(eye, forward, up, view.domeAngle);
+            return dfb::OrbitBlurCamera(eye, forward, up, angle, targetOf(focus, view), view.up, view.shutter);
+        case CameraKind::Stereo: return dfb::StereoCamera(eye, forward, up, angle, view.separation * unit, sharp);
+        case CameraKind::Dome: return dfb::DomeCamera(eye, forward, up, std::min(360.0f, view.domeAngle / view.zoom));
         }
         return pinhole;
     }

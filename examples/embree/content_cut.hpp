@@ -40,6 +40,8 @@ public:
                 Box box;
                 for (const Vec3& p : {a, b, c})
                     box.grow(p);
+                if (!box.overlaps(bounds_)) // clipped away
+                    continue;
                 // Half of a side, as seen from all sides on average.
                 add(content, box, 0.25 * perHit * static_cast<double>(length(cross(b - a, c - a))));
             }
@@ -47,6 +49,8 @@ public:
             for (const Sphere& sphere : object.spheres) {
                 Box box;
                 box.grow(sphere.center, sphere.radius);
+                if (!box.overlaps(bounds_))
+                    continue;
                 const double radius = static_cast<double>(sphere.radius);
                 add(content, box, 2 * perHit * 3.14159265358979323846 * radius * radius); // a ray hits it twice
             }
@@ -138,6 +142,9 @@ private:
                         }
                         block.grow(object.placement.toWorld(p));
                     }
+                    block = intersection(block, object.bounds());
+                    if (block.empty())
+                        continue;
                     const Vec3 e = block.extent();
                     add(content, block,
                         samplesPerLength * static_cast<double>(e.x) * static_cast<double>(e.y)
@@ -151,7 +158,8 @@ private:
                  const RenderSettings& settings)
     {
         const Vec3 eye = camera.eye(), forward = camera.forward(), up = camera.up(), right = camera.right();
-        const double tangent = std::tan(0.5 * static_cast<double>(settings.view.fieldOfView) * detail::degree);
+        const double tangent = std::tan(0.5 * static_cast<double>(settings.view.fieldOfView) * detail::degree)
+                               / static_cast<double>(settings.view.zoom);
         const double aspect = static_cast<double>(settings.width) / settings.height;
         Vec3 cell;
         for (int axis = 0; axis < 3; ++axis)

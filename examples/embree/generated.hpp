@@ -111,7 +111,8 @@ inline std::vector<Sphere> sphereRing(int count, std::uint64_t seed)
 } // namespace detail
 
 // One 64^3 brick of one large volume per brick, on a near-cubic grid. No rank ever holds more than its bricks.
-inline Scene syntheticScene(int brickCount, std::uint64_t seed)
+// `lookOf`: how it is shown; empty: as embers in a haze. Likewise below.
+inline Scene syntheticScene(int brickCount, std::uint64_t seed, const LookOf& lookOf = {})
 {
     Scene scene;
     scene.grid = nearCubicGrid(brickCount);
@@ -119,12 +120,15 @@ inline Scene syntheticScene(int brickCount, std::uint64_t seed)
     for (std::size_t axis = 0; axis < 3; ++axis)
         dims[axis] = 64 * scene.grid[axis];
     auto field = std::make_shared<const detail::WaveField>(dims, seed);
-    scene.add(detail::generatedVolume(dims, [field](int x, int y, int z) { return (*field)(x, y, z); }), true);
+    VolumeSource source = detail::generatedVolume(dims, [field](int x, int y, int z) { return (*field)(x, y, z); });
+    if (lookOf)
+        source.look = lookOf(source);
+    scene.add(std::move(source), true);
     return scene;
 }
 
 // One of each kind in the unit cube: a cloud, a torus knot and a ring of spheres.
-inline Scene demoScene(std::uint64_t seed)
+inline Scene demoScene(std::uint64_t seed, const LookOf& lookOf = {})
 {
     Scene scene;
     const int size = 96;
@@ -136,7 +140,10 @@ inline Scene demoScene(std::uint64_t seed)
         const float inside = std::clamp(1.6f * (0.95f - length(p)), 0.0f, 1.0f);
         return std::min(1.0f, inside * (0.10f + 1.9f * (*waves)(x, y, z)));
     };
-    scene.add(detail::generatedVolume({size, size, size}, cloud), true);
+    VolumeSource source = detail::generatedVolume({size, size, size}, cloud);
+    if (lookOf)
+        source.look = lookOf(source);
+    scene.add(std::move(source), true);
     scene.add(detail::torusKnot(800, 24), false);
     scene.add(detail::sphereRing(1200, seed), false);
     return scene;

@@ -2,7 +2,10 @@
 #pragma once
 
 #include "camera.hpp"
+#include "file_look.hpp"
 #include "frame_pattern.hpp"
+#include "look_options.hpp"
+#include "option_values.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire/wire_format.hpp>
@@ -32,7 +35,8 @@ enum class Compression { None, Snappy, Auto };
 enum class OwnerMap { Lattice, Linear, Hash };
 
 struct Options {
-    std::vector<std::string> scene; // `synthetic`, `demo`, or files
+    std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
+    std::vector<SceneFile> files;   // of these, with what holds of each
     bool fit = true;
     int xyzFrame = 0; // of .xyz files; 0: the first
     Mode mode = Mode::Data;
@@ -65,6 +69,7 @@ struct Options {
     float aoDistance = 0.1f;
     bool shadows = false;
     View view;
+    FileLook look; // of files that do not say themselves
 
     float opacity = 0.6f;
     float earlyTermination = 0;                     // 0: off
@@ -100,109 +105,6 @@ struct ParsedOptions {
 
 namespace detail {
 
-inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
-
-// An empty string if the path ends in one of `endings`, else what is wrong with it: the form CLI11 wants.
-inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
-{
-    std::string all;
-    for (const std::string& ending : endings) {
-        if (endingOf(path) == ending && path.size() > ending.size())
-            return {};
-        all += (all.empty() ? "" : ", ") + ending;
-    }
-    return "'" + path + "' has an unknown ending, expected " + all;
-}
-
-inline CLI::Validator ending(std::vector<std::string> endings)
-{
-    return CLI::Validator([endings](std::string& path) { return checkEnding(path, endings); }, "");
-}
-
-// A number within [lo, hi] and nothing else; CLI11's own range lets NaN pass.
-inline CLI::Validator number(double lo, double hi)
-{
-    return CLI::Validator(
-        [lo, hi](std::string& text) {
-            char* end = nullptr;
-            const double value = std::strtod(text.c_str(), &end);
-            if (!text.empty() && *end == '\0' && value >= lo && value <= hi)
-                return std::string();
-            std::ostringstream message;
-            message.precision(16);
-            message << "'" << text << "' is no number from " << lo << " to " << hi;
-            return message.str();
-        },
-        "");
-}
-
-// One of the words, which becomes its index: the value of an enumerator.
-inline CLI::Validator choice(std::vector<std::string> words)
-{
-    return CLI::Validator(
-        [words](std::string& text) {
-            std::string all;
-            for (std::size_t i = 0; i < words.size(); ++i) {
-                if (text == words[i]) {
-                    text = std::to_string(i);
-                    return std::string();
-                }
-                all += (i == 0 ? "" : i + 1 == words.size() ? " or " : ", ") + words[i];
-            }
-            return "'" + text + "' is not " + all;
-        },
-        "");
-}
-
-// Breaks lines for the help's second column.
-inline std::string wrapped(std::string text)
-{
-    const std::size_t width = 74;
-    for (std::size_t begin = 0; text.size() - begin > width;) {
-        const std::size_t space = text.rfind(' ', begin + width);
-        if (space == std::string::npos || space < begin)
-            break;
-        text[space] = '\n';
-        begin = space + 1;
-    }
-    return text;
-}
-
-inline void parseSize(const std::string& name, const std::string& text, int most, int& width, int& height)
-{
-    const std::size_t x = text.find('x');
-    const auto side = [&](std::size_t from, std::size_t to) {
-        int value = 0;
-        bool ok = from < to;
-        for (; from < to && ok; ++from) {
-            ok = text[from] >= '0' && text[from] <= '9' && value <= most;
-            value = ok ? 10 * value + (text[from] - '0') : 0;
-        }
-        return ok && value >= 1 && value <= most ? value : 0;
-    };
-    width = x == std::string::npos ? 0 : side(0, x);
-    height = x == std::string::npos ? 0 : side(x + 1, text.size());
-    if (width == 0 || height == 0)
-        throw CLI::ValidationError(name, "'" + text + "' is no pair of numbers such as 4x3, each from 1 to "
-                                             + std::to_string(most));
-}
-
-// R,G,B
-inline std::array<float, 3> parseColor(const std::string& name, const std::string& text)
-{
-    std::array<float, 3> color{};
-    std::size_t begin = 0;
-    for (std::size_t c = 0; c < 3; ++c) {
-        const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
-        std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
-        if (part.empty() || part[0] == ' ' || !number(0, 1)(part).empty())
-            throw CLI::ValidationError(name, "'" + text + "' is not R,G,B with three numbers from 0 to 1");
-        color[c] = std::strtof(part.c_str(), nullptr);
-        begin = end + 1;
-    }
-    return color;
-}
-
 // All options as they count, for the record; without those that have no value.
 inline std::vector<std::pair<std::string, std::string>>
 valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std::string>>& wordsOf)
@@ -233,9 +135,13 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.get_formatter()->column_width(36);
     const int most = 1 << 20;
 
-    app.add_option("scene", options.scene,
-                   "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
-                   "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz")
+    app.add_option(
+           "scene", options.scene,
+           "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
+           "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz. Behind a file's "
+           "name may stand how it is shown, as in a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there "
+           "are color, opacity, scale, rotate, translate, and as the options of that name clip, transfer, "
+           "range, isovalue")
         ->required()
         ->option_text("SCENE...");
     app.option_defaults()->take_last(); // of an option that is given twice the last counts
@@ -249,6 +155,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         wordsOf[option] = all;
         return option->option_text(text);
     };
+    LookOptions lookOptions(app);
     bool noFit = false;
     app.add_flag("--no-fit", noFit,
                  "Leave files in their own coordinates; default: each is scaled and centred to fill the unit cube");
@@ -397,30 +304,30 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
           "dof: depth of field; motion: the camera goes on along its orbit while the shutter is open; stereo: the "
           "left eye's view in the left half, the right eye's in the right; dome: a fisheye; default perspective. "
           "dof and motion want --spp 16 or more")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--aperture", options.view.aperture,
                    "Radius of the lens of dof, in units of the largest extent of what there is to see; default 0.05")
         ->check(detail::number(0, 10))
         ->option_text("R")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--focus", options.view.focus,
                    "Distance of what is sharp with dof and at the screen with stereo, in the same units; default: the "
                    "centre's")
         ->check(detail::number(1e-6, 1e6))
         ->option_text("D")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--shutter", options.view.shutter, "Degrees of the orbit that motion blurs, up to 360; default 8")
         ->check(detail::number(-360, 360))
         ->option_text("DEG")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--eyes", options.view.separation, "Distance of the eyes of stereo, in the same units; default 0.1")
         ->check(detail::number(0, 10))
         ->option_text("D")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--dome-angle", options.view.domeAngle, "Degrees that dome covers, up to 360; default 180")
         ->check(detail::number(1, 360))
         ->option_text("DEG")
-        ->group(picture);
+        ->group("Camera");
     app.add_option(
            "--wall", wall,
            "Display wall of COLUMNSxROWS displays, which ranks drive in turn; the image size is that of all, and "
@@ -435,24 +342,28 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 9007199254740992.0))
         ->option_text("N")
         ->group(picture);
-    app.add_option("--azimuth", options.view.azimuth, "Of the camera around the vertical axis in degrees; default 30")
+    app.add_option("--azimuth", options.view.azimuth, "Of the camera around the axis --up, in degrees; default 30")
         ->check(detail::number(-36000, 36000))
         ->option_text("DEG")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--elevation", options.view.elevation, "Of the camera in degrees, -90 to 90; default 20")
         ->check(detail::number(-90, 90))
         ->option_text("DEG")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--fov", options.view.fieldOfView, "Vertical field of view in degrees, 1 to 170; default 35")
         ->check(detail::number(1, 170))
         ->option_text("DEG")
-        ->group(picture);
+        ->group("Camera");
+    app.add_option("--zoom", options.view.zoom, "How many times as large the scene is in the image; default 1")
+        ->check(detail::number(1e-3, 1e4))
+        ->option_text("Z")
+        ->group("Camera");
     app.add_option("--camera-distance", options.view.distance,
-                   "From the centre of what there is to see, in units of its largest extent; default: so far that all "
+                   "From the target, in units of its largest extent; default: so far that all "
                    "of it is in the image, from every side")
         ->check(detail::number(0, 1000))
         ->option_text("D")
-        ->group(picture);
+        ->group("Camera");
     app.add_option("--opacity", options.opacity, "Of surfaces and spheres, 0 to 1; default 0.6")
         ->check(detail::number(0, 1))
         ->option_text("A")
@@ -530,6 +441,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             detail::parseSize("--size", size, 65536, options.width, options.height);
         if (app.count("--wall") > 0)
             detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
+        lookOptions.apply(options.view, options.look);
         if (app.count("--background") > 0)
             options.background = detail::parseColor("--background", background);
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
@@ -587,13 +499,33 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         if (options.stats.find('%') != std::string::npos)
             throw CLI::ValidationError("--stats", "'" + options.stats + "': one file for all frames, without %");
         options.values = detail::valuesOf(app, wordsOf);
+        const std::vector<std::string> endings{".raw", ".ply", ".obj", ".xyz"};
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options.scene.size() > 1)
                 throw CLI::ValidationError("scene", "'" + word + "' stands alone, not beside other scenes");
-            if (const std::string wrong = detail::checkEnding(word, {".raw", ".ply", ".obj", ".xyz"});
-                !generated && !wrong.empty())
+            if (generated && options.look.clip)
+                throw CLI::ValidationError("--clip", "is for files, not for '" + word + "'");
+            if (generated)
+                continue;
+            SceneFile file;
+            try {
+                file = parseSceneFile(word, endings);
+            } catch (const std::invalid_argument& wrong) {
+                throw CLI::ValidationError("scene", wrong.what());
+            }
+            if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty())
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
+            const bool isVolume = detail::endingOf(file.path) == ".raw";
+            if (!isVolume && (!file.look.transfer.empty() || file.look.range || !file.look.isovalues.empty()))
+                throw CLI::ValidationError("scene", "'" + word + "': transfer, range and isovalue are for volumes");
+            if (isVolume && !isZero(file.look.rotate))
+                throw CLI::ValidationError("scene", "'" + word
+                                                        + "': a volume cannot be rotated; the camera can, with "
+                                                          "--up");
+            LookOptions::requireTransfer(file.look.transfer, "scene", "'" + word + "': transfer: ");
+            file.look = merged(file.look, options.look);
+            options.files.push_back(file);
         }
     } catch (const CLI::CallForHelp&) {
         return {std::nullopt, 0, app.help()};

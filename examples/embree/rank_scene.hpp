@@ -1,6 +1,7 @@
 // RankScene: what one rank holds of the scene that the command line asks for.
 #pragma once
 
+#include "auto_look.hpp"
 #include "content_cut.hpp"
 #include "generated.hpp"
 #include "options.hpp"
@@ -29,13 +30,17 @@ inline RenderSettings renderSettings(const Options& options)
 // Collective. Throws std::runtime_error that names the file, the same on all ranks.
 inline Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
 {
+    LookOf look;
+    if (!options.look.transfer.empty() || options.look.range || !options.look.isovalues.empty())
+        look = [&](const VolumeSource& source) { return lookOf(source, options.look, loaders); };
     if (options.scene.front() == "synthetic")
-        return syntheticScene(brickCount, options.seed);
+        return syntheticScene(brickCount, options.seed, look);
     if (options.scene.front() == "demo")
-        return demoScene(options.seed);
+        return demoScene(options.seed, look);
     Scene scene;
-    for (const std::string& path : options.scene)
-        addFile(scene, path, options.fit, options.xyzFrame, loaders);
+    for (const SceneFile& file : options.files)
+        addFile(scene, file.path, options.fit, options.xyzFrame, loaders, file.look,
+                [&](const VolumeSource& source) { return lookOf(source, file.look, loaders); });
     return scene;
 }
 
@@ -79,10 +84,17 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const Scene scene = makeScene(options, sceneBricks, loaders);
     const RenderSettings settings = renderSettings(options);
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
+    if (scene.volumes.empty())
+        for (const auto& [option, isGiven] : {std::pair{"--transfer", !options.look.transfer.empty()},
+                                              std::pair{"--range", options.look.range.has_value()},
+                                              std::pair{"--isovalue", !options.look.isovalues.empty()}})
+            if (isGiven)
+                result.notes.push_back(std::string(option) + " is for volumes, and there are none");
     if (options.path > 0 && !scene.volumes.empty())
         result.notes.push_back(scene.meshes.empty() && scene.spheres.empty()
                                    ? "there is nothing to see: --path leaves volumes out, and there are no surfaces"
                                    : "--path leaves volumes out");
+    frameCamera(result.info, settings, 0); // throws if there is none
     const float ghosts = ghostReach(result.info, settings);
     std::vector<Box> cells{scene.bounds};
     if (!isImage)

@@ -66,13 +66,16 @@ public:
     // Throws std::runtime_error if Embree does. A brick from loadBrick().
     Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings)
         : settings_(settings), scene_(scene), cell_(brick.cell),
-          surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres)), mostHits_(mostHits(settings))
+          mostHits_(mostHits(settings, leastOpacity(brick, settings))),
+          surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres))
     {
         looksAhead_ = ghostReach(scene, settings) > 0 && mostHits_ < std::numeric_limits<std::size_t>::max()
                       && !(cell_ == scene.bounds);
         volumes_.reserve(brick.volumes.size());
         for (BrickVolume& volume : brick.volumes)
             volumes_.emplace_back(std::move(volume), scene.step);
+        for (const VolumeSampler& volume : volumes_)
+            hasIsosurfaces_ |= !volume.look().isovalues.empty();
     }
 
     // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and
@@ -182,16 +185,28 @@ private:
     struct VolumeRay {
         int next = 0, end = 0;
         Vec3 inverseStep;
+        int valueOf = -1; // the sample whose value is known
+        float value = 0;
     };
 
-    // How many hits end a ray.
-    static std::size_t mostHits(const RenderSettings& settings)
+    static float leastOpacity(const Brick& brick, const RenderSettings& settings)
+    {
+        float least = 1;
+        for (const BrickMesh& mesh : brick.meshes)
+            least = std::min(least, mesh.opacity.value_or(settings.opacity));
+        for (const BrickSpheres& spheres : brick.spheres)
+            least = std::min(least, spheres.opacity.value_or(settings.opacity));
+        return least;
+    }
+
+    // How many hits of at least that opacity end a ray.
+    static std::size_t mostHits(const RenderSettings& settings, float opacity)
     {
         if (settings.pathBounces > 0)
             return 1;
         double through = 1; // reckoned as in Accumulator
         for (std::size_t hits = 1; hits <= 100; ++hits) {
-            through *= 1 - static_cast<double>(settings.opacity);
+            through *= 1 - static_cast<double>(opacity);
             if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
                 return hits;
         }
@@ -315,7 +330,7 @@ private:
             surfaces_.intersect(origin, direction, hits, 1);
             ++cost;
             if (hits.empty()) {
-                const float sky = 0.9f + 0.5f * direction.y; // brighter above
+                const float sky = 0.9f + 0.5f * dot(direction, unit(settings_.view.up)); // brighter above
                 return product(through, Vec3{sky, sky, 1.05f * sky});
             }
             hit = hits.front();
@@ -373,7 +388,7 @@ private:
         for (std::size_t i = 0; i < volumes_.size(); ++i) {
             float first = 0, last = 0;
             const Box box = volumes_[i].bounds().padded(2 * scene_.step);
-            rays[i] = {none, none, {}};
+            rays[i] = {none, none, {}, -1, 0};
             if (!clip(box, origin, inverse, first, last))
                 continue;
             first = std::max(first, enter);
@@ -388,20 +403,23 @@ private:
         auto hit = hits.begin();
         const double least = static_cast<double>(settings_.earlyTermination);
         const auto isDone = [&] { return sum.through <= 0 || sum.through < least; };
-        const auto addHits = [&](float before) {
-            for (; hit != hits.end() && hit->t <= before && !isDone(); ++hit) {
-                const Vec3 point = pointAt(origin, direction, hit->t);
-                const bool inShadow = settings_.shadows && settings_.opacity > 0 && isInShadow(point, light);
-                Vec3 c = (inShadow ? hit->color * light.ambient : light.shade(hit->color, hit->normal, direction))
-                         * settings_.opacity;
-                sum.cost += settings_.shadows;
-                if (settings_.aoRays > 0 && settings_.opacity > 0) {
-                    c = c * openness(*hit, point, direction, key);
-                    sum.cost += settings_.aoRays;
-                }
-                sum.addSurface(*hit, settings_.opacity);
-                sum.add(hit->t, c.x, c.y, c.z, settings_.opacity);
+        const auto addHit = [&](const Hit& surface) {
+            const float opacity = surface.opacity.value_or(settings_.opacity);
+            const Vec3 point = pointAt(origin, direction, surface.t);
+            const bool inShadow = settings_.shadows && opacity > 0 && isInShadow(point, light);
+            Vec3 c = (inShadow ? surface.color * light.ambient : light.shade(surface.color, surface.normal, direction))
+                     * opacity;
+            sum.cost += settings_.shadows;
+            if (settings_.aoRays > 0 && opacity > 0) {
+                c = c * openness(surface, point, direction, key);
+                sum.cost += settings_.aoRays;
             }
+            sum.addSurface(surface, opacity);
+            sum.add(surface.t, c.x, c.y, c.z, opacity);
+        };
+        const auto addHits = [&](float before) {
+            for (; hit != hits.end() && hit->t <= before && !isDone(); ++hit)
+                addHit(*hit);
         };
         while (!isDone()) {
             int k = none;
@@ -413,6 +431,16 @@ private:
             const float t = static_cast<float>(k) * scene_.step;
             const Vec3 point = pointAt(origin, direction, t);
             const bool mine = cell_.contains(point);
+            if (hasIsosurfaces_) {
+                findCrossings(origin, direction, k, rays, scratch);
+                for (auto crossing = scratch.begin(); crossing != scratch.end() && !isDone(); ++crossing) {
+                    addHits(crossing->t);
+                    if (!isDone())
+                        addHit(*crossing);
+                }
+                if (isDone())
+                    break;
+            }
             for (std::size_t i = 0; i < rays.size(); ++i) {
                 if (rays[i].next != k)
                     continue;
@@ -441,13 +469,63 @@ private:
         return sum;
     }
 
+    // Where the ray meets isosurfaces between samples k - 1 and k, front to back: those of its points that are in the
+    // cell. The values at both samples, which may be a step outside of it, are the same in all bricks.
+    void findCrossings(const Vec3& origin, const Vec3& direction, int k, std::vector<VolumeRay>& rays,
+                       std::vector<Hit>& crossings) const
+    {
+        crossings.clear();
+        for (std::size_t i = 0; i < rays.size(); ++i) {
+            const VolumeSampler& volume = volumes_[i];
+            const VolumeLook& look = volume.look();
+            if (rays[i].next != k || look.isovalues.empty())
+                continue;
+            const auto valueAt = [&](float t) { return volume.valueAt(volume.toVoxel(pointAt(origin, direction, t))); };
+            const float t0 = static_cast<float>(k - 1) * scene_.step, t1 = static_cast<float>(k) * scene_.step;
+            const float v0 = rays[i].valueOf == k - 1 ? rays[i].value : valueAt(t0), v1 = valueAt(t1);
+            rays[i].valueOf = k;
+            rays[i].value = v1;
+            for (std::size_t n = 0; n < look.isovalues.size(); ++n) {
+                const float iso = look.isovalues[n];
+                if (std::isnan(v0) || std::isnan(v1) || (v0 < iso) == (v1 < iso))
+                    continue;
+                float a = t0, b = t1, va = v0, vb = v1; // iso is between va and vb
+                float t = t0;
+                for (int step = 0; step < 4; ++step) {
+                    t = std::clamp(a + (b - a) * ((iso - va) / (vb - va)), a, b);
+                    const float v = valueAt(t);
+                    const bool isBehind = (v < iso) == (vb < iso);
+                    (isBehind ? b : a) = t;
+                    (isBehind ? vb : va) = v;
+                }
+                const Vec3 point = pointAt(origin, direction, t), voxel = volume.toVoxel(point);
+                if (!(t > 0) || !cell_.contains(point) || !volume.inDomain(voxel))
+                    continue;
+                Hit hit;
+                hit.t = t;
+                hit.geometry = volume.geometry();
+                hit.primitive = static_cast<std::uint32_t>(n);
+                hit.normal = volume.directionAt(voxel);
+                hit.color = look.isoColors[n];
+                hit.opacity = look.isoOpacity;
+                crossings.push_back(hit);
+            }
+        }
+        std::sort(crossings.begin(), crossings.end(), [](const Hit& a, const Hit& b) {
+            return a.t != b.t                 ? a.t < b.t
+                   : a.geometry != b.geometry ? a.geometry < b.geometry
+                                              : a.primitive < b.primitive;
+        });
+    }
+
     RenderSettings settings_;
     SceneInfo scene_;
     Box cell_;
+    std::size_t mostHits_; // by the brick's parts, which the next one takes
     Surfaces surfaces_;
-    std::size_t mostHits_;
     // Whether hits are left out that ghosts hide, which other bricks show: one ray instead of those of each hit.
     bool looksAhead_ = false;
+    bool hasIsosurfaces_ = false;
     std::vector<VolumeSampler> volumes_;
 };
 

@@ -6,10 +6,11 @@
 // rank knows all of them, and two cells that share a face have the same number for it.
 #pragma once
 
+#include "clip.hpp"
+#include "file_look.hpp"
 #include "loaders.hpp"
 #include "obj.hpp"
 #include "ply.hpp"
-#include "shading.hpp"
 #include "spheres.hpp"
 #include "volume.hpp"
 
@@ -21,53 +22,44 @@
 
 namespace example {
 
-// From the coordinates of a file to the world.
-struct Placement {
-    Vec3 scale{1, 1, 1}; // the same along all axes but for the sign
-    Vec3 offset;
-
-    float size() const { return std::fabs(scale.x); }
-    Vec3 toWorld(const Vec3& p) const
-    {
-        return {p.x * scale.x + offset.x, p.y * scale.y + offset.y, p.z * scale.z + offset.z};
-    }
-};
-
-// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false, or the box has no extent or
-// one that is lost beside its distance from 0.
-inline Placement fitToUnitCube(const Box& box, bool fit)
-{
-    Placement placement;
-    const float extent = box.largestExtent(), scale = 1 / extent;
-    if (fit && extent > 0 && isUsable(box.lo * scale) && isUsable(box.hi * scale)) {
-        placement.scale = {scale, scale, scale};
-        placement.offset = Vec3{0.5f, 0.5f, 0.5f} - box.center() * scale;
-    }
-    return placement;
-}
-
 // Scanners store the rows of an image from the top, so a volume stands with y down and, to stay no mirror image of
 // itself, with z backwards.
 struct VolumeObject {
     VolumeSource source;
     Placement placement;
+    Box shown;                  // in voxels; what is outside is clipped away
+    std::uint32_t geometry = 0; // if it has isosurfaces
 
-    VolumeObject(VolumeSource volume, bool fit) : source(std::move(volume))
+    // Throws std::runtime_error, which names the file, if nothing of it is left. It cannot be rotated.
+    VolumeObject(VolumeSource volume, bool fit, const FileLook& look = {}) : source(std::move(volume))
     {
+        const Index3& d = source.info.dims;
+        const Vec3 last{static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1), static_cast<float>(d[2] - 1)};
+        shown.lo = {0, 0, 0};
+        shown.hi = last;
         placement = fitToUnitCube(bounds(), fit);
         const Vec3 sum = bounds().lo + bounds().hi;
         placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
         placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
+        if (look.isPlaced()) {
+            const Vec3 center = bounds().center();
+            placement.scale = placement.scale * look.scale;
+            placement.offset = center + (placement.offset - center) * look.scale + look.translate;
+        }
+        if (look.clip) {
+            shown = intersection(shown, *look.clip);
+            if (!(shown.lo.x < shown.hi.x && shown.lo.y < shown.hi.y && shown.lo.z < shown.hi.z))
+                throw std::runtime_error(source.name + ": the clip box leaves nothing of it; it goes from 0,0,0 to "
+                                         + textOf(last));
+        }
     }
 
-    // The domain, between the centres of the outer voxels.
+    // What is shown of the domain, which is between the centres of the outer voxels.
     Box bounds() const
     {
-        const Index3& d = source.info.dims;
         Box box;
-        box.grow(placement.toWorld({0, 0, 0}));
-        box.grow(placement.toWorld(
-            {static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1), static_cast<float>(d[2] - 1)}));
+        box.grow(placement.toWorld(shown.lo));
+        box.grow(placement.toWorld(shown.hi));
         return box;
     }
 };
@@ -76,12 +68,16 @@ struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
     std::vector<Vec3> normals;
-    Vec3 color; // where vertices have none of their own
+    Vec3 color;                   // where vertices have none of their own
+    std::optional<float> opacity; // none: that of the run
+    std::optional<Clip> clip;
 };
 
 struct SphereObject {
     std::uint32_t geometry = 0;
     std::vector<Sphere> spheres; // in world space
+    std::optional<float> opacity;
+    std::optional<Clip> clip;
 };
 
 struct Scene {
@@ -92,16 +88,23 @@ struct Scene {
     Index3 grid{0, 0, 0}; // of the cells, x fastest; zero: by bisection
     Notes notes;          // for the user
 
-    void add(VolumeSource source, bool fit)
+    // Each throws std::runtime_error, which names the file, if a clip box leaves nothing of it.
+    void add(VolumeSource source, bool fit, const FileLook& look = {})
     {
-        VolumeObject object(std::move(source), fit);
+        VolumeObject object(std::move(source), fit, look);
+        if (!object.source.look.isovalues.empty())
+            object.geometry = nextGeometry_++;
         grow(object.bounds());
         const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
         const float slack = static_cast<float>(visible.slack) * object.placement.size();
         lookAt([&](const auto& take) {
+            bool isEmpty = true;
             for (const Vec3& p : visible.points)
-                take(object.placement.toWorld(p), slack);
-            if (visible.points.empty()) // the whole
+                if (const float s = static_cast<float>(visible.slack); object.shown.padded(s).overlaps({p, p})) {
+                    take(object.placement.toWorld(clamped(p, object.shown)), slack);
+                    isEmpty = false;
+                }
+            if (isEmpty) // the whole
                 for (int i = 0; i < 8; ++i)
                     take({i & 1 ? object.bounds().hi.x : object.bounds().lo.x,
                           i & 2 ? object.bounds().hi.y : object.bounds().lo.y,
@@ -111,41 +114,67 @@ struct Scene {
         noteOn(object.source, visible.points.empty());
         volumes.push_back(std::move(object));
     }
-    void add(Mesh mesh, bool fit)
+    void add(Mesh mesh, bool fit, const FileLook& look = {}, const std::string& name = {})
     {
         Box box;
         for (const Triangle& triangle : mesh.triangles) // a file may hold vertices that nothing uses
             for (const std::uint32_t index : triangle)
                 box.grow(mesh.positions[index]);
-        const Placement placement = fitToUnitCube(box, fit);
-        for (Vec3& p : mesh.positions)
-            p = placement.toWorld(p);
+        const FileToWorld place(fitToUnitCube(box, fit), box, look);
         static const Vec3 palette[] = {
             {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
-        MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
+        MeshObject object;
+        object.geometry = nextGeometry_++;
+        object.color = look.color.value_or(palette[meshes.size() % 4]);
+        object.opacity = look.opacity;
+        object.clip = clipOf(look, place);
+        if (look.color)
+            mesh.colors.clear();
+        const Box seen = lookAt([&](const auto& take) {
+            for (const Triangle& triangle : mesh.triangles)
+                if (!look.clip) {
+                    for (const std::uint32_t index : triangle)
+                        take(place.toWorld(mesh.positions[index]), 0);
+                } else {
+                    Box part;
+                    for (const std::uint32_t index : triangle)
+                        part.grow(mesh.positions[index]);
+                    takeCorners(intersection(part, *look.clip), place, take);
+                }
+        });
+        requireAnyOf(seen, name, box);
+        for (Vec3& p : mesh.positions)
+            p = place.toWorld(p);
+        object.mesh = std::move(mesh);
         object.normals = vertexNormals(object.mesh);
-        grow(lookAt([&](const auto& take) {
-            for (const Triangle& triangle : object.mesh.triangles)
-                for (const std::uint32_t index : triangle)
-                    take(object.mesh.positions[index], 0);
-        }));
+        grow(seen);
         meshes.push_back(std::move(object));
     }
-    void add(std::vector<Sphere> set, bool fit)
+    void add(std::vector<Sphere> set, bool fit, const FileLook& look = {}, const std::string& name = {})
     {
         Box box;
         for (const Sphere& sphere : set)
             box.grow(sphere.center, sphere.radius);
-        const Placement placement = fitToUnitCube(box, fit);
-        for (Sphere& sphere : set) {
-            sphere.center = placement.toWorld(sphere.center);
-            sphere.radius *= placement.size();
-        }
-        grow(lookAt([&](const auto& take) {
+        const FileToWorld place(fitToUnitCube(box, fit), box, look);
+        const Box seen = lookAt([&](const auto& take) {
             for (const Sphere& sphere : set)
-                take(sphere.center, sphere.radius);
-        }));
-        spheres.push_back({nextGeometry_++, std::move(set)});
+                if (!look.clip) {
+                    take(place.toWorld(sphere.center), sphere.radius * place.size());
+                } else {
+                    Box part;
+                    part.grow(sphere.center, sphere.radius);
+                    takeCorners(intersection(part, *look.clip), place, take);
+                }
+        });
+        requireAnyOf(seen, name, box);
+        for (Sphere& sphere : set) {
+            sphere.center = place.toWorld(sphere.center);
+            sphere.radius *= place.size();
+            if (look.color)
+                sphere.color = *look.color;
+        }
+        grow(seen);
+        spheres.push_back({nextGeometry_++, std::move(set), look.opacity, clipOf(look, place)});
     }
 
     // The visible part of the scene, for the camera.
@@ -168,18 +197,28 @@ private:
         if (!mayBeEmpty)
             return;
         const auto [lo, hi] = source.range ? *source.range : rangeOf(source);
-        const auto value = [&info](float v) { return (v - info.minimum) / (info.maximum - info.minimum); };
-        if (!TransferFunction(1).isTransparent(value(lo), value(hi)))
+        const VolumeLook& look = source.look;
+        const auto value = [&look](float v) { return (v - look.lo) * look.scale(); };
+        if (look.hasIsovalueIn(lo, hi) || !TransferFunction(1, look.points).isTransparent(value(lo), value(hi)))
             return;
         notes.push_back(source.name + ": there is nothing to see: "
                         + (lo == hi ? "all voxels are " + textOf(lo)
                                     : "all voxels, from " + textOf(lo) + " to " + textOf(hi) + ", are transparent"));
     }
-    static std::string textOf(float value)
+    // Of a file of which something is seen in the world; `box` is in its own coordinates.
+    static void requireAnyOf(const Box& seen, const std::string& name, const Box& box)
     {
-        char text[32];
-        std::snprintf(text, sizeof text, "%g", static_cast<double>(value));
-        return text;
+        if (seen.empty() && !box.empty())
+            throw std::runtime_error(name + ": the clip box leaves nothing of it; it goes from " + textOf(box.lo)
+                                     + " to " + textOf(box.hi));
+    }
+    template <class Take>
+    static void takeCorners(const Box& part, const FileToWorld& place, const Take& take)
+    {
+        for (int i = 0; i < 8 && !part.empty(); ++i)
+            take(place.toWorld(
+                     {i & 1 ? part.hi.x : part.lo.x, i & 2 ? part.hi.y : part.lo.y, i & 4 ? part.hi.z : part.lo.z}),
+                 0);
     }
 
     // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
@@ -216,9 +255,10 @@ private:
 // Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
 // of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
 // texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
-// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file,
-// the same on all ranks.
-inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {})
+// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(), `lookOf` as for openVolume(). Throws
+// std::runtime_error that names the file, the same on all ranks.
+inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
+                    const FileLook& look = {}, const LookOf& lookOf = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     const auto bytes = [&] {
@@ -234,14 +274,14 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFram
         return object;
     };
     if (ending == ".raw")
-        scene.add(openVolume(path, loaders), fit);
+        scene.add(openVolume(path, loaders, lookOf), fit, look);
     else if (ending == ".ply")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit, look, path);
     else if (ending == ".obj")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit);
+        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit, look, path);
     else if (ending == ".xyz")
         scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
-                  fit);
+                  fit, look, path);
     else
         throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
 }
@@ -321,6 +361,9 @@ inline int rankOfBrick(int brick, int brickCount, int rankCount)
 struct BrickVolume {
     VoxelBlock block;
     Placement placement;
+    VolumeLook look;
+    Box shown; // in voxels
+    std::uint32_t geometry = 0;
 };
 
 struct BrickMesh {
@@ -329,12 +372,16 @@ struct BrickMesh {
     std::vector<Vec3> normals;
     std::vector<std::uint32_t> primitives; // index of each triangle in the whole mesh
     Vec3 color;
+    std::optional<float> opacity; // none: that of the run
+    std::optional<Clip> clip;
 };
 
 struct BrickSpheres {
     std::uint32_t geometry = 0;
     std::vector<Sphere> spheres;
     std::vector<std::uint32_t> primitives;
+    std::optional<float> opacity;
+    std::optional<Clip> clip;
 };
 
 struct Brick {
@@ -367,7 +414,8 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
         hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
     }
-    brick.volumes.push_back({VoxelBlock(object.source, lo, hi), object.placement});
+    brick.volumes.push_back(
+        {VoxelBlock(object.source, lo, hi), object.placement, object.source.look, object.shown, object.geometry});
 }
 
 inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
@@ -399,6 +447,8 @@ inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
     }
     part.geometry = object.geometry;
     part.color = object.color;
+    part.opacity = object.opacity;
+    part.clip = object.clip;
     if (!part.primitives.empty())
         brick.meshes.push_back(std::move(part));
 }
@@ -407,6 +457,8 @@ inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reac
 {
     BrickSpheres part;
     part.geometry = object.geometry;
+    part.opacity = object.opacity;
+    part.clip = object.clip;
     for (std::size_t i = 0; i < object.spheres.size(); ++i) {
         Box box;
         box.grow(object.spheres[i].center, object.spheres[i].radius);

@@ -15,6 +15,7 @@
 
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <stdexcept>
 #include <type_traits>
 
@@ -25,6 +26,7 @@ struct Hit {
     std::uint32_t geometry = 0, primitive = 0; // in the whole scene
     Vec3 normal;                               // unit; which side it points to is open
     Vec3 color;
+    std::optional<float> opacity; // none: that of the run
 };
 
 // One device for all bricks of the process, for as long as there are any: Embree cannot make thousands.
@@ -174,11 +176,11 @@ private:
         double from = 0, to = 0; // of occluded()
 
         // Takes the hit if it is in the cell and one of the first `most` so far.
-        void keep(double distance, Hit hit) const
+        void keep(double distance, Hit hit, const std::optional<Clip>& clip) const
         {
             hit.t = static_cast<float>(distance);
             if (!(hit.t > 0 && hit.t < farthest) || (isFull() && hits->back().t < hit.t)
-                || (cell && !cell->contains(pointAt(origin, direction, hit.t))))
+                || (cell && !cell->contains(pointAt(origin, direction, hit.t))) || !shows(clip, distance))
                 return;
             // Embree goes roughly front to back, so the place is near the end.
             auto at = hits->end();
@@ -197,6 +199,11 @@ private:
             }
         }
         bool isFull() const { return hits->size() == most; }
+        // Whether the clip box of an object, if it has one, leaves the point at that distance.
+        bool shows(const std::optional<Clip>& clip, double distance) const
+        {
+            return !clip || clip->contains(pointAt(origin, direction, static_cast<float>(distance)));
+        }
 
         static bool isSamePoint(const Hit& a, const Hit& b) { return a.t == b.t && a.geometry == b.geometry; }
         static bool isBefore(const Hit& a, const Hit& b)
@@ -290,7 +297,8 @@ private:
         hit.primitive = part.primitives[index];
         hit.normal = rounded(unit(normal));
         hit.color = colorAt(part, triangle, u, v);
-        query.keep(distance, hit);
+        hit.opacity = part.opacity;
+        query.keep(distance, hit, part.clip);
     }
 
     static void onOccludingTriangle(const RTCFilterFunctionNArguments* arguments)
@@ -302,7 +310,7 @@ private:
         double u = 0, v = 0;
         const double distance =
             distanceTo(query, part.mesh, part.mesh.triangles[RTCHitN_primID(arguments->hit, arguments->N, 0)], u, v);
-        if (!(distance > query.from && distance < query.to))
+        if (!(distance > query.from && distance < query.to) || !query.shows(part.clip, distance))
             arguments->valid[0] = 0;
     }
 
@@ -321,7 +329,7 @@ private:
             return;
         const double half = std::sqrt(rest / dd);
         for (const double t : {along - half, along + half})
-            if (t > query.from && t < query.to)
+            if (t > query.from && t < query.to && query.shows(part.clip, t))
                 RTCRayN_tfar(arguments->ray, arguments->N, 0) = -std::numeric_limits<float>::infinity();
     }
 
@@ -340,7 +348,7 @@ private:
         bounds.upper_z = sphere.center.z + radius;
     }
 
-    // Only where the ray enters; tells Embree of no hit, so that it goes on.
+    // Where the ray enters, or if that is clipped away, leaves; tells Embree of no hit, so that it goes on.
     static void onSphere(const RTCIntersectFunctionNArguments* arguments)
     {
         if (arguments->valid[0] == 0)
@@ -355,13 +363,15 @@ private:
         const double rest = radius * radius - dot(off, off);
         if (!(rest > 0))
             return;
-        const double t = along - std::sqrt(rest / dd);
+        const double half = std::sqrt(rest / dd);
+        const double t = query.shows(part.clip, along - half) ? along - half : along + half;
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[arguments->primID];
         hit.normal = rounded(unit(d * t - toCenter));
         hit.color = sphere.color;
-        query.keep(t, hit);
+        hit.opacity = part.opacity;
+        query.keep(t, hit, part.clip);
         if (query.mayEnd && query.isFull()) { // with room for the rounding of Embree's boxes
             float& farthest = RTCRayN_tfar(RTCRayHitN_RayN(arguments->rayhit, arguments->N), arguments->N, 0);
             farthest = std::min(farthest, 1.00001f * query.hits->back().t);

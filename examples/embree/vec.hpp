@@ -56,6 +56,7 @@ inline Vec3 unit(const Vec3& a)
     const float l = length(a);
     return l > 0 ? a * (1 / l) : a;
 }
+inline bool isZero(const Vec3& a) { return a.x == 0 && a.y == 0 && a.z == 0; }
 // Finite, and small enough for squares and sums of such.
 inline bool isUsable(const Vec3& a)
 {

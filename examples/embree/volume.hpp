@@ -11,8 +11,8 @@
 #pragma once
 
 #include "loaders.hpp"
-#include "shading.hpp"
 #include "vec.hpp"
+#include "volume_look.hpp"
 
 #include <algorithm>
 #include <array>
@@ -52,7 +52,8 @@ inline std::size_t voxelBytes(VoxelType type)
 struct VolumeInfo {
     Index3 dims{};
     VoxelType type = VoxelType::UInt8;
-    float minimum = 0, maximum = 255; // mapped to 0 and 1
+    float minimum = 0, maximum = 255; // mapped to 0 and 1, unless there is another range to show
+    float least = 0;                  // of the voxels; `minimum` may be greater
     std::uint64_t notFinite = 0;      // voxels, which count as the minimum
 };
 
@@ -72,6 +73,7 @@ struct VisibleVoxels {
 
 struct VolumeSource {
     VolumeInfo info;
+    VolumeLook look;
     std::function<RowReader()> open; // each call gives a reader of its own
     std::string name;                // of the file
     // If they are known; the second only if there are no visible points.
@@ -226,6 +228,7 @@ inline VolumeInfo describeVolume(std::istream& stream, const std::string& path, 
         return std::vector<VoxelRange>{scanVoxels(stream, path, info.type, begin, end, *loaders.readCounter())};
     }));
     const float lo = range.lo, hi = range.hi;
+    info.least = lo;
     info.notFinite = range.notFinite;
     if (lo > hi)
         throw std::runtime_error(path + ": not one of its voxels is finite");
@@ -269,22 +272,31 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const std::stri
     };
 }
 
+// The value of a voxel.
+inline float voxelValue(VoxelType type, const std::byte* voxel)
+{
+    const auto as = [voxel](auto value) {
+        std::memcpy(&value, voxel, sizeof value);
+        return static_cast<float>(value);
+    };
+    return type == VoxelType::UInt8    ? as(std::uint8_t{})
+           : type == VoxelType::UInt16 ? as(std::uint16_t{})
+                                       : as(float{});
+}
+
+// Every how many voxels along an axis there is a row of the lattice that stands for a volume.
+inline int latticeStride(const VolumeInfo& info, std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; }
+
 // Collective: each rank reads a share of the rows. Throws std::runtime_error, the same on all ranks.
 inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& loaders = {})
 {
     const VolumeInfo& info = source.info;
-    const float threshold = info.minimum + 0.1f * (info.maximum - info.minimum);
+    const VolumeLook& look = source.look;
     std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * voxelBytes(info.type));
     const auto value = [&](int x) {
-        const auto as = [&](auto voxel) {
-            std::memcpy(&voxel, row.data() + static_cast<std::size_t>(x) * sizeof voxel, sizeof voxel);
-            return static_cast<float>(voxel);
-        };
-        return info.type == VoxelType::UInt8    ? as(std::uint8_t{})
-               : info.type == VoxelType::UInt16 ? as(std::uint16_t{})
-                                                : as(float{});
+        return voxelValue(info.type, row.data() + static_cast<std::size_t>(x) * voxelBytes(info.type));
     };
-    const auto stride = [&info](std::size_t axis) { return 1 + (info.dims[axis] - 1) / 64; };
+    const auto stride = [&info](std::size_t axis) { return latticeStride(info, axis); };
     const auto rows = [&](std::size_t axis) {
         return static_cast<std::uint64_t>(1 + (info.dims[axis] - 1) / stride(axis));
     };
@@ -294,8 +306,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
         visible.width[axis] = std::max(skipWidth, stride(axis)); // a row or more in each
         visible.blocks[axis] = 1 + (info.dims[axis] - 1) / visible.width[axis];
     }
-    const TransferFunction transferFunction(1);
-    const float scale = 1 / (info.maximum - info.minimum);
+    const TransferFunction transferFunction(1, look.points);
     std::vector<std::uint8_t> seenInRows; // for each block along a row
     visible.points = loaders.gatherOf<Vec3>([&] {
         const RowReader read = source.open();
@@ -306,7 +317,7 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
             read(0, info.dims[0], y, z, row.data());
             int first = -1, last = -1;
             for (int x = 0; x < info.dims[0]; x += stride(0))
-                if (value(x) > threshold) {
+                if (look.standsOut(value(x))) {
                     first = first < 0 ? x : first;
                     last = x;
                 }
@@ -319,8 +330,9 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
                     least = std::min(least, value(k));
                     greatest = std::max(greatest, value(k));
                 }
-                seenInRows.push_back(
-                    !transferFunction.isTransparent((least - info.minimum) * scale, (greatest - info.minimum) * scale));
+                seenInRows.push_back(look.hasIsovalueIn(least, greatest)
+                                     || !transferFunction.isTransparent((least - look.lo) * look.scale(),
+                                                                        (greatest - look.lo) * look.scale()));
             }
         }
         return points;
@@ -365,9 +377,12 @@ inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& l
     return {all.lo, all.hi};
 }
 
-// Collective: the ranks share what has to be known of the whole volume. Throws std::runtime_error, the same on all
-// ranks.
-inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {})
+// Collective: how a volume is to be shown, of one of which all but its look is known.
+using LookOf = std::function<VolumeLook(const VolumeSource&)>;
+
+// Collective: the ranks share what has to be known of the whole volume. Without `lookOf` it is shown as a generated
+// volume is. Throws std::runtime_error, the same on all ranks.
+inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {}, const LookOf& lookOf = {})
 {
     const auto open = [path] {
         auto stream = std::make_shared<std::ifstream>();
@@ -382,6 +397,10 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
     source.open = [open, path, info = source.info, counter = loaders.readCounter()] {
         return rowReader(open(), path, info, counter);
     };
+    source.look.lo = source.info.minimum;
+    source.look.hi = source.info.maximum;
+    if (lookOf)
+        source.look = lookOf(source);
     source.visible = visibleVoxels(source, loaders);
     if (source.visible->points.empty())
         source.range = rangeOf(source, loaders);

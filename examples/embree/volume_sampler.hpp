@@ -28,8 +28,9 @@ public:
                                                     1 / volume_.placement.scale.z},
           shift_{-volume_.placement.offset.x * inverseScale_.x, -volume_.placement.offset.y * inverseScale_.y,
                  -volume_.placement.offset.z * inverseScale_.z},
-          transferFunction_(256 * step / volume_.placement.size() / static_cast<float>(largestIndex())),
-          valueScale_(1 / (info().maximum - info().minimum))
+          transferFunction_(256 * step / volume_.placement.size() / static_cast<float>(largestIndex()),
+                            volume_.look.points),
+          valueScale_(volume_.look.scale())
     {
         for (int i = 0; i < 3; ++i)
             component(slopeScale_, i) = std::copysign(0.5f * valueScale_, component(inverseScale_, i));
@@ -53,13 +54,44 @@ public:
     Box bounds() const
     {
         Box box;
-        box.grow(volume_.placement.toWorld({0, 0, 0}));
-        box.grow(volume_.placement.toWorld({last(0), last(1), last(2)}));
+        box.grow(volume_.placement.toWorld(volume_.shown.lo));
+        box.grow(volume_.placement.toWorld(volume_.shown.hi));
         return box;
     }
+    // What a clip box has left of the domain.
     bool inDomain(const Vec3& v) const
     {
-        return v.x >= 0 && v.y >= 0 && v.z >= 0 && v.x <= last(0) && v.y <= last(1) && v.z <= last(2);
+        const Vec3 &lo = volume_.shown.lo, &hi = volume_.shown.hi;
+        return v.x >= lo.x && v.y >= lo.y && v.z >= lo.z && v.x <= hi.x && v.y <= hi.y && v.z <= hi.z;
+    }
+
+    const VolumeLook& look() const { return volume_.look; }
+    std::uint32_t geometry() const { return volume_.geometry; }
+
+    // The value of the data at a point, or NaN outside of the volume. The brick has it in its cell and up to half a
+    // voxel around.
+    float valueAt(const Vec3& v) const
+    {
+        const auto has = [this](float at, std::size_t axis) {
+            return at >= static_cast<float>(std::max(volume_.block.lo()[axis], 0)) && at <= last(static_cast<int>(axis))
+                   && at < static_cast<float>(volume_.block.hi()[axis] - 1);
+        };
+        if (!has(v.x, 0) || !has(v.y, 1) || !has(v.z, 2))
+            return std::numeric_limits<float>::quiet_NaN();
+        return dispatch([&](const auto* voxels) {
+            const auto at = cornerOf(voxels, v);
+            return lerp(at.plane(at.p, at.dx, at.dy, at.fx, at.fy), at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy),
+                        at.fz);
+        });
+    }
+    // Where the values rise, in the world; of length 1 or 0. For a point in the cell.
+    Vec3 directionAt(const Vec3& v) const
+    {
+        return dispatch([&](const auto* voxels) {
+            const auto at = cornerOf(voxels, v);
+            return unit(gradientOf(at, at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
+                                   at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy)));
+        });
     }
 
     // How many steps ahead the next sample is that may have an opacity above 0; 0 if that may be this one.
@@ -97,34 +129,60 @@ private:
 
     static float lerp(float a, float b, float f) { return mulAdd(f, b - a, a); }
 
+    // The voxel before a point along each axis, and how far behind it the point is.
     template <class T>
-    TransferFunction::Entry shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
-    {
-        const int x = static_cast<int>(v.x), y = static_cast<int>(v.y), z = static_cast<int>(v.z);
-        const float fx = v.x - static_cast<float>(x), fy = v.y - static_cast<float>(y),
-                    fz = v.z - static_cast<float>(z);
-        const T* p = voxels + volume_.block.index(x, y, z);
-        const std::ptrdiff_t dx = 1, dy = static_cast<std::ptrdiff_t>(volume_.block.rowStride()),
-                             dz = static_cast<std::ptrdiff_t>(volume_.block.sliceStride());
+    struct Corner {
+        const T* p;
+        std::ptrdiff_t dx, dy, dz;
+        float fx, fy, fz;
+
         // Interpolates in the plane through q that the axes a and b span.
-        const auto plane = [](const T* q, std::ptrdiff_t a, std::ptrdiff_t b, float fa, float fb) {
+        static float plane(const T* q, std::ptrdiff_t a, std::ptrdiff_t b, float fa, float fb)
+        {
             const auto at = [](T value) { return static_cast<float>(value); };
             return lerp(lerp(at(q[0]), at(q[a]), fa), lerp(at(q[b]), at(q[a + b]), fa), fb);
-        };
-        const float z0 = plane(p, dx, dy, fx, fy), z1 = plane(p + dz, dx, dy, fx, fy);
-        TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, fz) - info().minimum) * valueScale_);
-        if (!(entry.alpha > 0))
-            return {};
+        }
+    };
+    template <class T>
+    Corner<T> cornerOf(const T* voxels, const Vec3& v) const
+    {
+        const int x = static_cast<int>(v.x), y = static_cast<int>(v.y), z = static_cast<int>(v.z);
+        return {voxels + volume_.block.index(x, y, z),
+                1,
+                static_cast<std::ptrdiff_t>(volume_.block.rowStride()),
+                static_cast<std::ptrdiff_t>(volume_.block.sliceStride()),
+                v.x - static_cast<float>(x),
+                v.y - static_cast<float>(y),
+                v.z - static_cast<float>(z)};
+    }
 
-        // Central differences at distance one voxel.
-        const auto slope = [&](std::ptrdiff_t along, std::ptrdiff_t a, std::ptrdiff_t b, float f, float fa, float fb) {
+    // Central differences at distance one voxel. `z0` and `z1`: the values in the planes before and behind.
+    template <class T>
+    Vec3 gradientOf(const Corner<T>& at, float z0, float z1) const
+    {
+        const auto& [p, dx, dy, dz, fx, fy, fz] = at;
+        const auto slope = [&p = at.p](std::ptrdiff_t along, std::ptrdiff_t a, std::ptrdiff_t b, float f, float fa,
+                                       float fb) {
+            const auto plane = Corner<T>::plane;
             const float before = plane(p - along, a, b, fa, fb), here = plane(p, a, b, fa, fb),
                         next = plane(p + along, a, b, fa, fb), behind = plane(p + 2 * along, a, b, fa, fb);
             return lerp(next - before, behind - here, f);
         };
         const Vec3 rise{slope(dx, dy, dz, fx, fy, fz), slope(dy, dx, dz, fy, fx, fz),
-                        lerp(z1 - plane(p - dz, dx, dy, fx, fy), plane(p + 2 * dz, dx, dy, fx, fy) - z0, fz)};
-        const Vec3 gradient{rise.x * slopeScale_.x, rise.y * slopeScale_.y, rise.z * slopeScale_.z};
+                        lerp(z1 - at.plane(p - dz, dx, dy, fx, fy), at.plane(p + 2 * dz, dx, dy, fx, fy) - z0, fz)};
+        return {rise.x * slopeScale_.x, rise.y * slopeScale_.y, rise.z * slopeScale_.z};
+    }
+
+    template <class T>
+    TransferFunction::Entry shade(const T* voxels, const Vec3& v, const Vec3& view, const Light& light) const
+    {
+        const Corner<T> at = cornerOf(voxels, v);
+        const float z0 = at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
+                    z1 = at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy);
+        TransferFunction::Entry entry = transferFunction_((lerp(z0, z1, at.fz) - look().lo) * valueScale_);
+        if (!(entry.alpha > 0))
+            return {};
+        const Vec3 gradient = gradientOf(at, z0, z1);
         const float steepness = length(gradient);
         if (steepness > 0) {
             // Where the value hardly changes its direction is noise: there the colour is left as it is.
@@ -176,8 +234,10 @@ private:
                         greatest = std::max(greatest, row[i]);
                     }
                 }
-            const auto value = [this](T v) { return (static_cast<float>(v) - info().minimum) * valueScale_; };
-            distances_[cellIndex(x, y, z)] = transferFunction_.isTransparent(value(least), value(greatest)) ? 255 : 0;
+            const auto value = [this](T v) { return (static_cast<float>(v) - look().lo) * valueScale_; };
+            const bool isEmpty = transferFunction_.isTransparent(value(least), value(greatest))
+                                 && !look().hasIsovalueIn(static_cast<float>(least), static_cast<float>(greatest));
+            distances_[cellIndex(x, y, z)] = isEmpty ? 255 : 0;
         });
         // Two sweeps, each over the neighbours that it has already been to, give the exact distance.
         for (const int direction : {1, -1})

@@ -12,6 +12,9 @@ find_package(nlohmann_json CONFIG REQUIRED) # dfb_render has it, too
 add_executable(dfb_check_stats embree/tools/check_stats.cpp)
 target_link_libraries(dfb_check_stats PRIVATE dfb_developer nlohmann_json::nlohmann_json)
 
+add_executable(dfb_make_volume embree/tools/make_volume.cpp)
+target_link_libraries(dfb_make_volume PRIVATE dfb_developer)
+
 # The same program, but that rank 1 stops in the middle of its frames.
 if(TARGET dfb::mpi AND CMAKE_SYSTEM_NAME STREQUAL "Linux")
   add_executable(dfb_render_stopped $<TARGET_OBJECTS:dfb_render> embree/tools/stop_rank.cpp)
@@ -38,6 +41,7 @@ set(CHECK_STATS [==[$<TARGET_FILE:dfb_check_stats>]==])
 set(MPIEXEC [==[${_launch}]==]) # with its flags, up to the one before the number of ranks; empty: no MPI
 set(POSTFLAGS [==[${MPIEXEC_POSTFLAGS}]==])
 set(TIMEOUT_PROGRAM [==[${DFB_TIMEOUT}]==])
+set(MAKE_VOLUME [==[$<TARGET_FILE:dfb_make_volume>]==])
 set(SNAPPY ${_snappy})
 set(DATA [==[${DFB_TEST_DATA}]==])
 set(FOLDER [==[${CMAKE_CURRENT_BINARY_DIR}/render_cli]==])
@@ -74,6 +78,8 @@ _add_cli_case(precision ranks3 np4)
 _add_cli_case(wall_and_aux ranks3 np2 np4)
 _add_cli_case(png ranks2 np3)
 _add_cli_case(far ranks3 np3)
+_add_cli_case(look ranks3 np3)
+_add_cli_case(likeness ranks3)
 _add_cli_case(hash ranks1 ranks2 ranks5 np1 np3 np4)
 _add_cli_case(modes ranks3 np3)
 _add_cli_case(shared_memory np2)

@@ -563,14 +563,15 @@ elseif(CASE STREQUAL "stats")
 
 elseif(CASE STREQUAL "loading")
   # A rank reads its bricks with ghosts, and shares the rest: of 256 layers each of R ranks has 256 / R and, as ghosts
-  # and for rounding, 5 more; a share of all voxels for the range; and of the lattice, every 2nd row of every 4th layer.
+  # and for rounding, 5 more; a share of all voxels for the range; and twice of the lattice, every 2nd row of every 4th layer:
+  # for the histogram, and for what is visible then.
   # Cut by content it reads nothing more but a larger brick: of this volume, which is the same all over, one that is far
   # from the eye.
   string(REGEX REPLACE "[a-z]+" "" ranks ${START})
   string(REPEAT "some voxels; " 645278 voxels)
   string(SUBSTRING "${voxels}" 0 8388608 voxels)
   file(WRITE ${work}/volume_128x128x256_uint16.raw "${voxels}")
-  math(EXPR most "8388608 * (256 + 5 * ${ranks}) / (256 * ${ranks}) + 8388608 / ${ranks} + 1048576 / ${ranks} + 32768")
+  math(EXPR most "8388608 * (256 + 5 * ${ranks}) / (256 * ${ranks}) + 8388608 / ${ranks} + 2 * 1048576 / ${ranks} + 32768")
   math(EXPR mostByContent "${most} + 8388608 / (3 * ${ranks})")
   foreach(cut volume content)
     set(scene volume_128x128x256_uint16.raw --size 32x32 --cut ${cut})
@@ -725,6 +726,86 @@ elseif(CASE STREQUAL "far")
     succeed(${START} far.ply --no-fit --mode data --bricks 5 --size 128x128 --output data.pfm)
     compare(image.pfm data.pfm 2e-5 0)
   endforeach()
+
+elseif(CASE STREQUAL "look")
+  # Isosurfaces, clip boxes, colours and placement are the same in bricks: opaque ones bit for bit.
+  write_triangles(a:b.ply 0 1000)
+  file(WRITE ${work}/atoms.xyz "5\n\nC 0 0 0\nN 2 0 0\nO 0 2 0\nC 2 2 1\nH 1 1 3\n")
+  execute_process(COMMAND ${MAKE_VOLUME} vessels ${work} RESULT_VARIABLE code)
+  if(NOT code EQUAL 0)
+    message(SEND_ERROR "dfb_make_volume: ${code}")
+  endif()
+  set(volume vessels_128x128x128_uint8.raw)
+  set(colours a:b.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,0.5:rotate=0,30,0 atoms.xyz:scale=0.5)
+  foreach(scene
+      "0;synthetic;--bricks;7;--isovalue;60;--opacity;1" # exact: opaque
+      "0;${volume};--isovalue;90;--opacity;1"
+      "0;${volume}:clip=20,20,0,100,100,80:isovalue=60;--opacity;1"
+      "2e-5;${volume};--isovalue;60,120;--transfer;viridis"
+      "2e-5;${volume};--clip;20,20,0,100,100,80"
+      "2e-5;${volume}:transfer=inferno:range=20,150:opacity=0.5;${colours}"
+      "2e-5;demo;--transfer;cool-warm;--range;5%,95%"
+      "2e-5;demo;--eye;1.6,0.9,1.7;--up;1,0,0;--zoom;1.5;--target;0.4,0.5,0.6")
+    list(POP_FRONT scene tolerance)
+    list(APPEND scene --size 128x96)
+    succeed(ranks1 ${scene} --mode image --output i.pfm --depth id.pfm --stats i.json)
+    field(alpha i.json mean_alpha)
+    if(NOT alpha GREATER 0.01)
+      wrong("expected to see something, mean_alpha is ${alpha}")
+    endif()
+    succeed(${START} ${scene} --mode data --bricks 7 --output d.pfm --depth dd.pfm)
+    compare(i.pfm d.pfm ${tolerance} 0)
+    compare(id.pfm dd.pfm 0 0)
+  endforeach()
+  # They differ from each other: none is silently left out.
+  set(all "")
+  foreach(options "" "--transfer viridis" "--transfer inferno" "--transfer grey" "--transfer cool-warm" "--transfer bone"
+      "--transfer soft-tissue" "--transfer own.json" "--range 5,60" "--range 90%,99.9%" "--isovalue 60" "--isovalue 60,120"
+      "--clip 0,0,0,127,127,64" "--zoom 2" "--up x" "--eye 2,2,2" "--target 0,0,0")
+    file(WRITE ${work}/own.json "{\"points\": [{\"value\": 40, \"color\": \"#ffffff\", \"opacity\": 0},
+      {\"value\": 200, \"color\": [1, 0.5, 0], \"opacity\": 0.5}]}")
+    separate_arguments(options)
+    hash(one ${START} ${volume} --size 64x64 ${options})
+    list(FIND all ${one} found)
+    if(NOT found EQUAL -1)
+      wrong("expected another picture with '${options}'")
+    endif()
+    list(APPEND all ${one})
+  endforeach()
+  # What is not there or makes no sense is said.
+  fail(${START} "none.json: cannot be opened" ${volume} --transfer none.json --output o.png)
+  fail(${START} "wrong.json: " ${volume}:transfer=wrong.json --output o.png)
+  fail(${START} "${volume}: the clip box leaves nothing of it. it goes from 0,0,0 to 127,127,127"
+    ${volume} --clip 200,0,0,300,9,9 --output o.png)
+  fail(${START} "a:b.ply: the clip box" a:b.ply --clip 5000,0,0,6000,9,9 --output o.png)
+  refuse(${START} "isovalue are for volumes" a:b.ply:isovalue=3 --output o.png)
+  refuse(${START} "unknown .gloss." a:b.ply:gloss=3 --output o.png)
+  succeed_with(${START} "--isovalue is for volumes" a:b.ply --isovalue 3 --size 16x16 --output o.png)
+  succeed_with(${START} "nothing to see" ${volume} --isovalue 1000 --size 16x16 --output o.png)
+
+elseif(CASE STREQUAL "likeness")
+  # A head and vessels, by default: seen, and not a solid block.
+  foreach(kind head vessels)
+    execute_process(COMMAND ${MAKE_VOLUME} ${kind} ${work} RESULT_VARIABLE code)
+    file(GLOB file RELATIVE ${work} ${work}/${kind}_*.raw)
+    foreach(options "" "--transfer viridis" "--transfer grey --range 10%,99%")
+      separate_arguments(options)
+      succeed(${START} ${file} ${options} --size 128x128 --output i.png --stats i.json)
+      field(alpha i.json mean_alpha)
+      if(NOT alpha GREATER 0.02 OR NOT alpha LESS 0.7)
+        wrong("expected mean_alpha of ${kind} between 0.02 and 0.7, got ${alpha}")
+      endif()
+    endforeach()
+  endforeach()
+  # The presets for Hounsfield units: bone is within the skin.
+  foreach(preset bone soft-tissue)
+    file(GLOB head RELATIVE ${work} ${work}/head_*.raw)
+    succeed(${START} ${head} --transfer ${preset} --up=-z --size 128x128 --output ${preset}.png --stats ${preset}.json)
+    field(${preset} ${preset}.json mean_alpha)
+  endforeach()
+  if(NOT bone GREATER 0.03 OR NOT bone LESS soft-tissue)
+    wrong("expected bone to cover less than soft tissue: ${bone}, ${soft-tissue}")
+  endif()
 
 elseif(CASE STREQUAL "hash")
   set(scene demo --size 96x64 --bricks 5)

@@ -212,6 +212,48 @@ TEST_CASE("What is wrong on the command line is refused in one line that names i
     checkRefused({"-q"});
 }
 
+TEST_CASE("The camera's place and the look arrive", "[options]")
+{
+    const Options o = options({"a.ply:opacity=0.5", "b_2x2x2_uint8.raw:transfer=bone", "--eye", "1,2,-3", "--target",
+                               "0,0.5,0", "--up", "0,0,1", "--zoom", "2.5", "--transfer", "viridis", "--range",
+                               "1%,200", "--isovalue", "7,3", "--clip", "0,0,0,1,1,1"});
+    REQUIRE(o.view.eye);
+    CHECK(o.view.eye->z == -3.0f);
+    REQUIRE(o.view.target);
+    CHECK(o.view.target->y == 0.5f);
+    CHECK(o.view.up.z == 1.0f);
+    CHECK(o.view.zoom == 2.5f);
+    REQUIRE(o.files.size() == 2);
+    CHECK(o.files[0].path == "a.ply");
+    CHECK(o.files[0].look.opacity == 0.5f);
+    CHECK(o.files[0].look.clip);
+    CHECK(o.files[1].look.transfer == "bone");
+    CHECK(o.files[1].look.isovalues.empty()); // it says itself how it is shown
+    CHECK(o.look.isovalues == std::vector<float>{3, 7});
+    CHECK(options({"demo", "--up=-z"}).view.up.z == -1.0f);
+    CHECK(options({"demo", "--transfer", "auto"}).look.transfer.empty());
+    CHECK(options({"demo", "--transfer", "a/b.json"}).look.transfer == "a/b.json");
+    for (const std::string option : {"--eye", "--target", "--up"})
+        for (const std::string value : {"1,2", "1,2,3,4", "1,2,nan", "a", "1, 2,3", "w", ""})
+            checkRefused({option + "=" + value});
+    checkRefused({"--up", "0,0,0"});
+    checkRefused({"--zoom", "0"});
+    checkRefused({"--azimuth", "3", "--eye", "1,2,3"});
+    checkRefused({"--eye", "1,2,3", "--target", "1,2,3"});
+    for (const std::string value : {"rainbow", "a.toml", ""})
+        checkRefused({"--transfer=" + value});
+    for (const std::string value : {"1", "2,1", "1%,2%,3%", "120%,130%", ""})
+        checkRefused({"--range=" + value});
+    checkRefused({"--isovalue=1,"});
+    checkRefused({"--clip", "0,0,0,1,1,1"}); // of a generated scene
+    for (const std::string word : {"a.ply:isovalue=3", "a.obj:transfer=grey", "a_2x2x2_uint8.raw:rotate=1,0,0",
+                                   "a.ply:opacity=2", "a.ply:gloss=2", "a_2x2x2_uint8.raw:transfer=rainbow"}) {
+        const ParsedOptions parsed = parse({word});
+        CHECK(parsed.exitCode == 2);
+        CHECK(test::isLineWith(parsed.message, word));
+    }
+}
+
 TEST_CASE("Of an option that is given twice the last counts", "[options]")
 {
     const Options o =
@@ -260,6 +302,12 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
                                                                   {"--elevation", "2"},
                                                                   {"--fov", "9"},
                                                                   {"--camera-distance", "2"},
+                                                                  {"--target", "1,2,3"},
+                                                                  {"--up", "z"},
+                                                                  {"--zoom", "2"},
+                                                                  {"--transfer", "viridis"},
+                                                                  {"--range", "1%,9"},
+                                                                  {"--isovalue", "3"},
                                                                   {"--opacity", "1"},
                                                                   {"--early-termination", "0.1"},
                                                                   {"--background", "1,1,1"},
@@ -358,12 +406,39 @@ TEST_CASE("The help says it all", "[options]")
         const ParsedOptions parsed = parse({flag});
         CHECK_FALSE(parsed.options);
         CHECK(parsed.exitCode == 0);
-        for (const std::string word :
-             {"--mode",    "--ranks",  "--size",    "--frames", "--spp",         "--bricks",    "--seed",
-              "--threads", "--output", "--stats",   "--no-fit", "--compression", "--owner-map", "--early-termination", "--no-shared-memory",
-              "--opacity", "--help",   "synthetic", "demo",     ".raw",          "_XxYxZ_",     "uint8",
-              "uint16",    "float32",  ".ply",      ".obj",     ".xyz",          ".png",        ".pfm",
-              "data",      "image",    "65536",     "mpiexec"}) {
+        for (const std::string word : {"--mode",
+                                       "--ranks",
+                                       "--size",
+                                       "--frames",
+                                       "--spp",
+                                       "--bricks",
+                                       "--seed",
+                                       "--threads",
+                                       "--output",
+                                       "--stats",
+                                       "--no-fit",
+                                       "--compression",
+                                       "--owner-map",
+                                       "--early-termination",
+                                       "--no-shared-memory",
+                                       "--opacity",
+                                       "--help",
+                                       "synthetic",
+                                       "demo",
+                                       ".raw",
+                                       "_XxYxZ_",
+                                       "uint8",
+                                       "uint16",
+                                       "float32",
+                                       ".ply",
+                                       ".obj",
+                                       ".xyz",
+                                       ".png",
+                                       ".pfm",
+                                       "data",
+                                       "image",
+                                       "65536",
+                                       "mpiexec"}) {
             INFO(word);
             CHECK(test::contains(parsed.message, word));
         }

@@ -1,0 +1,121 @@
+// Placement: from the coordinates of a file to the world. Clip: the part of a mesh or of spheres that is shown.
+#pragma once
+
+#include "file_look.hpp"
+#include "vec.hpp"
+
+#include <cmath>
+#include <cstdio>
+#include <optional>
+#include <string>
+
+namespace example {
+
+// From the coordinates of a file to the world.
+struct Placement {
+    Vec3 scale{1, 1, 1}; // the same along all axes but for the sign
+    Vec3 offset;
+
+    float size() const { return std::fabs(scale.x); }
+    Vec3 toWorld(const Vec3& p) const
+    {
+        return {p.x * scale.x + offset.x, p.y * scale.y + offset.y, p.z * scale.z + offset.z};
+    }
+};
+
+// Centres the box in [0, 1]^3 with its largest extent 1; the identity if `fit` is false, or the box has no extent or
+// one that is lost beside its distance from 0.
+inline Placement fitToUnitCube(const Box& box, bool fit)
+{
+    Placement placement;
+    const float extent = box.largestExtent(), scale = 1 / extent;
+    if (fit && extent > 0 && isUsable(box.lo * scale) && isUsable(box.hi * scale)) {
+        placement.scale = {scale, scale, scale};
+        placement.offset = Vec3{0.5f, 0.5f, 0.5f} - box.center() * scale;
+    }
+    return placement;
+}
+
+// A placement, and behind it what a FileLook adds: scale and rotation about the box's centre, then a translation.
+class FileToWorld {
+public:
+    // `box`: of the file, in its own coordinates.
+    FileToWorld(const Placement& fit, const Box& box, const FileLook& look)
+        : fit_(fit), isPlaced_(look.isPlaced() && !box.empty()), scale_(static_cast<double>(look.scale)),
+          translate_(look.translate)
+    {
+        if (!isPlaced_)
+            return;
+        center_ = Vec3d(fit.toWorld(box.center()));
+        for (int axis = 0; axis < 3; ++axis) {
+            const double angle = static_cast<double>(component(look.rotate, axis)) * (3.14159265358979323846 / 180.0);
+            const int b = (axis + 1) % 3, c = (axis + 2) % 3;
+            for (Vec3d& column : columns_) {
+                const double u = component(column, b), v = component(column, c);
+                component(column, b) = std::cos(angle) * u - std::sin(angle) * v;
+                component(column, c) = std::sin(angle) * u + std::cos(angle) * v;
+            }
+        }
+    }
+
+    float size() const { return fit_.size() * static_cast<float>(scale_); }
+    Vec3 toWorld(const Vec3& p) const
+    {
+        const Vec3 world = fit_.toWorld(p);
+        if (!isPlaced_)
+            return world;
+        const Vec3d arm = (Vec3d(world) - center_) * scale_;
+        return rounded(center_ + columns_[0] * arm.x + columns_[1] * arm.y + columns_[2] * arm.z + translate_);
+    }
+    // A function of the point alone.
+    Vec3d toFile(const Vec3& world) const
+    {
+        Vec3d p(world);
+        if (isPlaced_) {
+            const Vec3d arm = p - translate_ - center_;
+            p = center_ + Vec3d(dot(columns_[0], arm), dot(columns_[1], arm), dot(columns_[2], arm)) * (1 / scale_);
+        }
+        return (p - Vec3d(fit_.offset)) * (1 / static_cast<double>(fit_.scale.x));
+    }
+
+private:
+    Placement fit_; // of a mesh or spheres: the same along all axes
+    bool isPlaced_;
+    double scale_;
+    Vec3d center_, translate_;
+    Vec3d columns_[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}; // of the rotation
+};
+
+// What of an object is shown: the points that lie in a box of its file's coordinates.
+struct Clip {
+    Box box;
+    FileToWorld place;
+
+    bool contains(const Vec3& world) const
+    {
+        const Vec3 p = rounded(place.toFile(world));
+        return p.x >= box.lo.x && p.x <= box.hi.x && p.y >= box.lo.y && p.y <= box.hi.y && p.z >= box.lo.z
+               && p.z <= box.hi.z;
+    }
+};
+
+inline std::optional<Clip> clipOf(const FileLook& look, const FileToWorld& place)
+{
+    return look.clip ? std::optional<Clip>(Clip{*look.clip, place}) : std::nullopt;
+}
+
+inline Vec3 clamped(const Vec3& p, const Box& box)
+{
+    return {std::clamp(p.x, box.lo.x, box.hi.x), std::clamp(p.y, box.lo.y, box.hi.y),
+            std::clamp(p.z, box.lo.z, box.hi.z)};
+}
+
+inline std::string textOf(float value)
+{
+    char text[32];
+    std::snprintf(text, sizeof text, "%g", static_cast<double>(value));
+    return text;
+}
+inline std::string textOf(const Vec3& v) { return textOf(v.x) + ',' + textOf(v.y) + ',' + textOf(v.z); }
+
+} // namespace example

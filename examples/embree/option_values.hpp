@@ -1,0 +1,122 @@
+// Values of options: checks and parsers for words of the command line, with one-line errors.
+#pragma once
+
+#include "vec.hpp"
+
+#include <CLI/CLI.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cstdlib>
+#include <sstream>
+#include <string>
+#include <vector>
+
+namespace example {
+namespace detail {
+
+inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
+
+// An empty string if the path ends in one of `endings`, else what is wrong with it: the form CLI11 wants.
+inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)
+{
+    std::string all;
+    for (const std::string& ending : endings) {
+        if (endingOf(path) == ending && path.size() > ending.size())
+            return {};
+        all += (all.empty() ? "" : ", ") + ending;
+    }
+    return "'" + path + "' has an unknown ending, expected " + all;
+}
+
+inline CLI::Validator ending(std::vector<std::string> endings)
+{
+    return CLI::Validator([endings](std::string& path) { return checkEnding(path, endings); }, "");
+}
+
+// A number within [lo, hi] and nothing else; CLI11's own range lets NaN pass.
+inline CLI::Validator number(double lo, double hi)
+{
+    return CLI::Validator(
+        [lo, hi](std::string& text) {
+            char* end = nullptr;
+            const double value = std::strtod(text.c_str(), &end);
+            if (!text.empty() && *end == '\0' && value >= lo && value <= hi)
+                return std::string();
+            std::ostringstream message;
+            message.precision(16);
+            message << "'" << text << "' is no number from " << lo << " to " << hi;
+            return message.str();
+        },
+        "");
+}
+
+// One of the words, which becomes its index: the value of an enumerator.
+inline CLI::Validator choice(std::vector<std::string> words)
+{
+    return CLI::Validator(
+        [words](std::string& text) {
+            std::string all;
+            for (std::size_t i = 0; i < words.size(); ++i) {
+                if (text == words[i]) {
+                    text = std::to_string(i);
+                    return std::string();
+                }
+                all += (i == 0 ? "" : i + 1 == words.size() ? " or " : ", ") + words[i];
+            }
+            return "'" + text + "' is not " + all;
+        },
+        "");
+}
+
+// Breaks lines for the help's second column.
+inline std::string wrapped(std::string text)
+{
+    const std::size_t width = 74;
+    for (std::size_t begin = 0; text.size() - begin > width;) {
+        const std::size_t space = text.rfind(' ', begin + width);
+        if (space == std::string::npos || space < begin)
+            break;
+        text[space] = '\n';
+        begin = space + 1;
+    }
+    return text;
+}
+
+inline void parseSize(const std::string& name, const std::string& text, int most, int& width, int& height)
+{
+    const std::size_t x = text.find('x');
+    const auto side = [&](std::size_t from, std::size_t to) {
+        int value = 0;
+        bool ok = from < to;
+        for (; from < to && ok; ++from) {
+            ok = text[from] >= '0' && text[from] <= '9' && value <= most;
+            value = ok ? 10 * value + (text[from] - '0') : 0;
+        }
+        return ok && value >= 1 && value <= most ? value : 0;
+    };
+    width = x == std::string::npos ? 0 : side(0, x);
+    height = x == std::string::npos ? 0 : side(x + 1, text.size());
+    if (width == 0 || height == 0)
+        throw CLI::ValidationError(name, "'" + text + "' is no pair of numbers such as 4x3, each from 1 to "
+                                             + std::to_string(most));
+}
+
+// R,G,B
+inline std::array<float, 3> parseColor(const std::string& name, const std::string& text)
+{
+    std::array<float, 3> color{};
+    std::size_t begin = 0;
+    for (std::size_t c = 0; c < 3; ++c) {
+        const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
+        std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
+        if (part.empty() || part[0] == ' ' || !number(0, 1)(part).empty())
+            throw CLI::ValidationError(name, "'" + text + "' is not R,G,B with three numbers from 0 to 1");
+        color[c] = std::strtof(part.c_str(), nullptr);
+        begin = end + 1;
+    }
+    return color;
+}
+
+} // namespace detail
+} // namespace example
