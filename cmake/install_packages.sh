@@ -1,9 +1,9 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site and the examples of other
-# people's programs need: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when
-# nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
+# people's programs, and pictures as EXR and plots need: on Debian and Ubuntu with apt-get; elsewhere says what is missing
+# and exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -34,7 +34,7 @@ tools() {
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
-[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev"
+[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib"
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {

@@ -1,7 +1,10 @@
 // Values of options: checks and parsers for words of the command line, with one-line errors.
 #pragma once
 
+#include "file_look.hpp"
 #include "vec.hpp"
+
+#include <dfb/channels.hpp>
 
 #include <CLI/CLI.hpp>
 
@@ -116,6 +119,28 @@ inline std::array<float, 3> parseColor(const std::string& name, const std::strin
         begin = end + 1;
     }
     return color;
+}
+
+// The channels that an .exr has beside colour, by the words of --layers.
+inline dfb::ChannelMask parseLayers(const std::string& name, const std::string& text)
+{
+    static const std::vector<std::pair<std::string, dfb::ChannelMask>> layers = {
+        {"depth", dfb::depthChannel},
+        {"normal", dfb::normalChannel},
+        {"albedo", dfb::albedoChannel},
+        {"position", dfb::positionChannel},
+        {"ids", dfb::primitiveIdChannel | dfb::instanceIdChannel},
+        {"all", dfb::depthChannel | dfb::imageAuxChannels},
+        {"none", 0}};
+    dfb::ChannelMask all = 0;
+    for (const std::string& word : splitAt(text, ',')) {
+        const auto layer =
+            std::find_if(layers.begin(), layers.end(), [&word](const auto& l) { return l.first == word; });
+        if (layer == layers.end())
+            throw CLI::ValidationError(name, "'" + word + "' is not depth, normal, albedo, position, ids, all or none");
+        all = static_cast<dfb::ChannelMask>(all | layer->second);
+    }
+    return all;
 }
 
 } // namespace detail

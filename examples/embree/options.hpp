@@ -2,11 +2,13 @@
 #pragma once
 
 #include "camera.hpp"
+#include "config_file.hpp"
 #include "file_look.hpp"
-#include "frame_pattern.hpp"
 #include "look_options.hpp"
 #include "option_values.hpp"
+#include "output_options.hpp"
 
+#include <dfb/channels.hpp>
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire/wire_format.hpp>
 
@@ -34,7 +36,7 @@ enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
 enum class Compression { None, Snappy, Auto };
 enum class OwnerMap { Lattice, Linear, Hash };
 
-struct Options {
+struct Options : OutputFiles {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
     std::vector<SceneFile> files;   // of these, with what holds of each
     bool fit = true;
@@ -80,15 +82,9 @@ struct Options {
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
-    std::string output, alpha, depth, aux, stats; // empty: not written. All but stats may be patterns
-
     // All options but the scene as they count, by name and as words of the command line; without those that are empty.
     std::vector<std::pair<std::string, std::string>> values;
-
-    bool writesNothing() const
-    {
-        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty();
-    }
+    std::vector<std::pair<std::string, std::string>> given; // those of them that the user gave
 };
 
 // Exit codes beside 0.
@@ -107,11 +103,12 @@ namespace detail {
 
 // All options as they count, for the record; without those that have no value.
 inline std::vector<std::pair<std::string, std::string>>
-valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std::string>>& wordsOf)
+valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std::string>>& wordsOf, bool areGiven)
 {
     std::vector<std::pair<std::string, std::string>> values;
     for (const CLI::Option* option : app.get_options()) {
-        if (option->get_positional() || option == app.get_help_ptr())
+        if (option->get_positional() || option == app.get_help_ptr() || option == app.get_config_ptr()
+            || option->get_name() == "--save-options" || (areGiven && option->count() == 0))
             continue;
         std::string text = option->count() > 0 ? option->results().back() : option->get_default_str();
         if (option->get_expected_max() == 0) // a flag
@@ -364,7 +361,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1000))
         ->option_text("D")
         ->group("Camera");
-    app.add_option("--opacity", options.opacity, "Of surfaces and spheres, 0 to 1; default 0.6")
+    app.add_option("--opacity", options.opacity, "Of surfaces, isosurfaces and spheres, 0 to 1; default 0.6")
         ->check(detail::number(0, 1))
         ->option_text("A")
         ->group(picture);
@@ -388,37 +385,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--dither", options.dither, "Dither the colour of a .png, so that gradients have no bands")
         ->group(picture);
 
-    const char* files = "Files to write";
-    app.add_option("--output", options.output,
-                   "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
-                   "black in a .pfm. %d, or %04d for 4 digits, in the name stands for the number of the frame, from 0 "
-                   "on; without it the last frame is written. Also in the next three; default none")
-        ->check(detail::ending({".png", ".pfm"}))
-        ->option_text("FILE")
-        ->group(files);
-    app.add_option("--alpha", options.alpha, "The opacity, as a greyscale .pfm; default none")
-        ->check(detail::ending({".pfm"}))
-        ->option_text("FILE")
-        ->group(files);
-    app.add_option("--depth", options.depth,
-                   "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
-                   "nothing; default none")
-        ->check(detail::ending({".pfm"}))
-        ->option_text("FILE")
-        ->group(files);
-    app.add_option("--aux", options.aux,
-                   "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
-                   ".instance.png with a colour for each id; default none")
-        ->option_text("PREFIX")
-        ->group(files);
-    app.add_option(
-           "--stats", options.stats,
-           "Where the time has gone, in ms, on each rank and the slowest: total = load + render + compositing (with "
-           "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of the image, "
-           "the options; default none")
-        ->check(detail::ending({".json"}))
-        ->option_text("FILE")
-        ->group(files);
+    OutputOptions outputOptions(app, options);
+    app.config_formatter(std::make_shared<OptionsFile>());
+    app.allow_config_extras(CLI::config_extras_mode::error);
+    app.set_config(
+           "--config", "",
+           "Read options, and the scene, from a file: JSON as --save-options writes it, or TOML. The command line "
+           "counts more")
+        ->option_text("FILE");
 
     for (CLI::Option* option : app.get_options()) {
         option->capture_default_str();
@@ -441,6 +415,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             detail::parseSize("--size", size, 65536, options.width, options.height);
         if (app.count("--wall") > 0)
             detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
+        outputOptions.apply(options);
         lookOptions.apply(options.view, options.look);
         if (app.count("--background") > 0)
             options.background = detail::parseColor("--background", background);
@@ -470,6 +445,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         refuse(options.adaptive > 0 && options.spp < 8, "--adaptive",
                "needs --spp 8 or more: the most samples per pixel");
         refuse(options.errorBudget > 0, "--wire", "does not go with --error-budget");
+        if (options.isExr() && options.wallColumns > 0)
+            throw CLI::ValidationError("--output", "an .exr is not written for a wall");
+        if (options.isExr() && app.count("--layers") == 0 && (options.interleave > 1 || options.deep > 0))
+            options.layers &= dfb::depthChannel;
+        if (options.isExr() && (options.layers & dfb::imageAuxChannels) && (options.interleave > 1 || options.deep > 0))
+            throw CLI::ValidationError("--layers", "other than depth do not go with --interleave or --deep");
+        refuse(options.pngBits == 16, "--dither", "does not go with --png-bits 16");
+        refuse(options.wallColumns > 0, "--png-bits", "does not go with --wall");
         refuse(options.wallColumns > 0, "--dither", "does not go with --wall");
         refuse(detail::endingOf(options.output) != ".png", "--dither", "needs --output FILE.png");
         for (const char* other :
@@ -488,17 +471,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                                                          + " equal displays with bezels of "
                                                          + std::to_string(options.bezel));
         }
-        for (const auto& [name, text] : {std::pair{"--output", &options.output}, std::pair{"--alpha", &options.alpha},
-                                         std::pair{"--depth", &options.depth}, std::pair{"--aux", &options.aux}}) {
-            try {
-                FramePattern{*text};
-            } catch (const std::invalid_argument& wrong) {
-                throw CLI::ValidationError(name, wrong.what());
-            }
-        }
-        if (options.stats.find('%') != std::string::npos)
-            throw CLI::ValidationError("--stats", "'" + options.stats + "': one file for all frames, without %");
-        options.values = detail::valuesOf(app, wordsOf);
+        outputOptions.checkPatterns(options);
         const std::vector<std::string> endings{".raw", ".ply", ".obj", ".xyz"};
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";
@@ -527,6 +500,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             file.look = merged(file.look, options.look);
             options.files.push_back(file);
         }
+        options.values = detail::valuesOf(app, wordsOf, false);
+        options.given = detail::valuesOf(app, wordsOf, true);
     } catch (const CLI::CallForHelp&) {
         return {std::nullopt, 0, app.help()};
     } catch (const CLI::ParseError& error) {

@@ -1,6 +1,8 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
+#include "config_file.hpp"
+
 #include <dfb/image.hpp>
 
 #include <nlohmann/json.hpp>
@@ -10,6 +12,8 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <cmath>
+#include <csetjmp>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -54,6 +58,35 @@ inline void writeFloats(const std::string& path, int width, int height, const fl
         failToWrite(path, std::strerror(errno));
 }
 
+// Rows of 16-bit sRGB; `fillRow(y)` puts each into `row`. Returns false if libpng fails, which it tells by longjmp: so
+// nothing here has a destructor.
+template <class FillRow>
+bool writePngRows(std::FILE* file, int width, int height, bool hasAlpha, const std::uint8_t* row,
+                  const FillRow& fillRow)
+{
+    png_structp png = png_create_write_struct(
+        PNG_LIBPNG_VER_STRING, nullptr, [](png_structp p, png_const_charp) { png_longjmp(p, 1); },
+        [](png_structp, png_const_charp) {});
+    png_infop info = png == nullptr ? nullptr : png_create_info_struct(png);
+    if (info == nullptr || setjmp(png_jmpbuf(png)) != 0) {
+        png_destroy_write_struct(&png, &info);
+        return false;
+    }
+    png_init_io(png, file);
+    png_set_IHDR(png, info, static_cast<png_uint_32>(width), static_cast<png_uint_32>(height), 16,
+                 hasAlpha ? PNG_COLOR_TYPE_RGB_ALPHA : PNG_COLOR_TYPE_RGB, PNG_INTERLACE_NONE,
+                 PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
+    png_set_sRGB(png, info, PNG_sRGB_INTENT_PERCEPTUAL);
+    png_write_info(png, info);
+    for (int y = 0; y < height; ++y) {
+        fillRow(y);
+        png_write_row(png, row);
+    }
+    png_write_end(png, info);
+    png_destroy_write_struct(&png, &info);
+    return true;
+}
+
 } // namespace detail
 
 // Throws if the file cannot be opened for writing. What it holds stays; if there is none, none is left behind.
@@ -94,6 +127,42 @@ inline void writePng(const std::string& path, int width, int height, const std::
     const bool closed = std::fclose(file) == 0;
     if (!written || !closed)
         detail::failToWrite(path, written ? std::strerror(errno) : image.message);
+}
+
+// Likewise with 16 bits a channel, from linear premultiplied RGBA: sRGB-encoded, and straight where it has alpha, as
+// straightPixels() says; over black where it has none.
+inline void writePng16(const std::string& path, int width, int height, const float* rgba, bool hasAlpha)
+{
+    const std::size_t channels = hasAlpha ? 4 : 3;
+    std::vector<std::uint8_t> row(2 * channels * static_cast<std::size_t>(width));
+    const auto encoded = [](double linear) {
+        const double v = std::clamp(linear, 0.0, 1.0); // NaN: 0
+        return v <= 0.0031308 ? 12.92 * v : 1.055 * std::pow(v, 1 / 2.4) - 0.055;
+    };
+    const auto fill = [&](const float* pixels) {
+        std::size_t at = 0;
+        for (int x = 0; x < width; ++x, pixels += 4) {
+            const double alpha = hasAlpha ? std::min(static_cast<double>(pixels[3]), 1.0) : 1.0;
+            for (std::size_t c = 0; c < channels; ++c) {
+                const double v = c == 3      ? std::clamp(alpha, 0.0, 1.0)
+                                 : alpha > 0 ? encoded(static_cast<double>(pixels[c]) / alpha)
+                                             : 0.0;
+                const unsigned level = static_cast<unsigned>(v * 65535 + 0.5);
+                row[at++] = static_cast<std::uint8_t>(level >> 8); // big-endian
+                row[at++] = static_cast<std::uint8_t>(level & 255);
+            }
+        }
+    };
+    errno = 0;
+    std::FILE* file = std::fopen(path.c_str(), "wb");
+    if (file == nullptr)
+        detail::failToWrite(path, std::strerror(errno));
+    const bool written = detail::writePngRows(file, width, height, hasAlpha, row.data(), [&](int y) {
+        fill(rgba + 4 * static_cast<std::size_t>(y) * static_cast<std::size_t>(width));
+    });
+    const bool closed = std::fclose(file) == 0;
+    if (!written || !closed)
+        detail::failToWrite(path, errno != 0 ? std::strerror(errno) : "libpng cannot");
 }
 
 // Pixels of a PNG from linear premultiplied RGBA of an image, row 0 on top: sRGB-encoded colour with straight alpha.
@@ -247,13 +316,6 @@ nlohmann::ordered_json ofRanks(const std::vector<Rank>& ranks, const Value& valu
     return all;
 }
 
-// An option's value: a number, true or false where it is one, else a text.
-inline nlohmann::ordered_json valueOf(const std::string& text)
-{
-    const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);
-    return value.is_number() || value.is_boolean() ? value : nlohmann::ordered_json(text);
-}
-
 } // namespace detail
 
 inline nlohmann::ordered_json toJson(const RunStats& run)
@@ -316,14 +378,16 @@ inline nlohmann::ordered_json toJson(const RunStats& run)
     return json;
 }
 
-inline void writeStats(const std::string& path, const RunStats& run)
+inline void writeText(const std::string& path, const std::string& text)
 {
     errno = 0;
     std::ofstream stream(path, std::ios::trunc);
-    stream << toJson(run).dump(2) << '\n';
+    stream << text;
     stream.close();
     if (!stream)
         detail::failToWrite(path, std::strerror(errno));
 }
+
+inline void writeStats(const std::string& path, const RunStats& run) { writeText(path, toJson(run).dump(2) + '\n'); }
 
 } // namespace example

@@ -1,21 +1,47 @@
 // ProgressLine: on a terminal, when rendering takes long, one line that tells how far it is.
 #pragma once
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cstddef>
 #include <cstdint>
 #include <cstdio>
+#include <string>
 
 #include <unistd.h>
 
 namespace example {
+
+// "frame 2 of 8, 120 of 260 tiles of this rank, 12 s, 35 s to go": `tiles` of the frame are done of about `expected`,
+// and time goes by tiles.
+inline std::string progressText(int frame, int frameCount, std::int64_t tiles, std::int64_t expected, double seconds)
+{
+    const std::int64_t all = std::max({expected, tiles, std::int64_t{1}});
+    const double done = (frame + static_cast<double>(tiles) / static_cast<double>(all)) / std::max(1, frameCount);
+    char text[160];
+    const int length =
+        std::snprintf(text, sizeof text, "frame %d of %d, %lld of %lld tiles of this rank, %.0f s", frame + 1,
+                      frameCount, static_cast<long long>(tiles), static_cast<long long>(all), seconds);
+    if (done > 0)
+        std::snprintf(text + length, sizeof text - static_cast<std::size_t>(length), ", %.0f s to go",
+                      seconds / done * (1 - done));
+    return text;
+}
 
 class ProgressLine {
 public:
     // Silent unless `enabled` and standard error is a terminal.
     ProgressLine(bool enabled, int frameCount) : enabled_(enabled && isatty(STDERR_FILENO)), frameCount_(frameCount) {}
 
-    void beginFrame(int frame) { frame_ = frame; }
+    // `tiles`: of this rank in the frame, about.
+    void beginFrame(int frame, std::int64_t tiles)
+    {
+        frame_ = frame;
+        expected_ = tiles;
+        tiles_ = 0;
+    }
+    bool isEnabled() const { return enabled_; }
 
     // A tile of this rank has been rendered. From any thread.
     void tileDone()
@@ -27,8 +53,8 @@ public:
         std::int64_t due = nextNs_.load();
         if (now < due || !nextNs_.compare_exchange_strong(due, now + intervalNs))
             return;
-        std::fprintf(stderr, "\rframe %d of %d, %lld tiles rendered on this rank, %.0f s ", frame_ + 1, frameCount_,
-                     static_cast<long long>(tiles), static_cast<double>(now) / 1e9);
+        std::fprintf(stderr, "\r%s   ",
+                     progressText(frame_, frameCount_, tiles, expected_, static_cast<double>(now) / 1e9).c_str());
         shown_ = true;
     }
 
@@ -45,7 +71,7 @@ private:
     bool enabled_;
     int frameCount_;
     std::atomic<int> frame_{0};
-    std::atomic<std::int64_t> tiles_{0}, nextNs_{4 * intervalNs};
+    std::atomic<std::int64_t> tiles_{0}, expected_{0}, nextNs_{4 * intervalNs};
     std::atomic<bool> shown_{false};
     std::chrono::steady_clock::time_point begin_ = std::chrono::steady_clock::now();
 };

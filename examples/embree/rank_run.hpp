@@ -1,6 +1,8 @@
 // RankRun: loads what a rank holds, renders the frames in the way that was asked for, and writes the files.
 #pragma once
 
+#include "cinema.hpp"
+#include "exr.hpp"
 #include "options.hpp"
 #include "output.hpp"
 #include "phase_clock.hpp"
@@ -56,7 +58,7 @@ inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 inline bool wantsFloat(const Options& o)
 {
     return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background)
-           || detail::endingOf(o.output) == ".pfm";
+           || detail::endingOf(o.output) == ".pfm" || o.isExr() || o.pngBits == 16;
 }
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
@@ -69,11 +71,13 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
                               ? dfb::OutputFormat::SRGBA8
                               : dfb::OutputFormat::None;
     config.image.dither = o.dither;
-    config.image.depth = !o.depth.empty();
+    const dfb::ChannelMask layers = o.isExr() ? o.layers : dfb::ChannelMask{0};
+    config.image.depth = !o.depth.empty() || (layers & dfb::depthChannel) != 0;
     config.precision = o.errorBudget > 0 ? dfb::Precision(dfb::ErrorBudget{o.errorBudget}) : dfb::Precision(o.wire);
     config.minTransmittance = o.minTransmittance;
     config.framesInFlight = std::min(o.inFlight, o.frames);
-    config.image.aux = o.aux.empty() ? 0 : dfb::imageAuxChannels;
+    config.image.aux =
+        o.aux.empty() ? static_cast<dfb::ChannelMask>(layers & dfb::imageAuxChannels) : dfb::imageAuxChannels;
     config.image.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
                             : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
                                                            : dfb::latticeOwner;
@@ -124,6 +128,15 @@ inline dfb::WallLayout wallOf(const Options& o, int rankCount)
     for (int d = 0; d < layout.displayCount(); ++d)
         layout.ranks.push_back(d % rankCount);
     return layout;
+}
+
+// The pictures of a Cinema database, relative to its folder.
+inline std::vector<std::string> framesOf(const Options& o)
+{
+    std::vector<std::string> files;
+    for (int frame = 0; frame < o.frames; ++frame)
+        files.push_back(FramePattern("frame_%04d.png").path(frame));
+    return files;
 }
 
 // image.png -> image.3.png
@@ -280,12 +293,22 @@ private:
             for (const char* ending :
                  {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
                 all.push_back(aux.path(frame) + ending);
-        if (!areNumbered && !o_.stats.empty())
-            all.push_back(o_.stats);
+        for (const std::string& path : {o_.stats, o_.saveOptions, cinemaTable()})
+            if (!areNumbered && !path.empty())
+                all.push_back(path);
         return all;
     }
+    // Empty: none.
+    std::string cinemaTable() const { return o_.cinema.empty() ? "" : o_.cinema + "/data.csv"; }
     void requireFilesWritable() const
     {
+        if (o_.isExr() && !hasOpenExr)
+            throw std::runtime_error("this dfb_render was built without OpenEXR: install libopenexr-dev, or write "
+                                     "another kind of file");
+        std::error_code ignored; // an error shows when the files are opened
+        if (!o_.cinema.empty())
+            std::filesystem::create_directories(o_.cinema, ignored);
+
         for (const bool areNumbered : {false, true})
             for (const std::string& path : files(0, areNumbered))
                 requireWritable(path);
@@ -323,7 +346,11 @@ private:
         if (!fb_->isDisplayRank())
             return;
         const dfb::Image& image = fb_->image();
-        if (!output.empty())
+        if (!output.empty() && o_.isExr())
+            writeExr(output, image, o_.layers, optionsText(o_.scene, o_.given));
+        else if (!output.empty() && o_.pngBits == 16)
+            writePng16(output, o_.width, o_.height, image.rgba32f(), !isOpaque);
+        else if (!output.empty())
             writeImage(output, image, isOpaque, o_.dither);
         if (!alpha.empty())
             writeGreyPfm(alpha, o_.width, o_.height, image.rgba32f() + 3, 4);
@@ -343,7 +370,7 @@ private:
         frames_.resize(static_cast<std::size_t>(o_.frames));
         std::deque<typename FrameBuffer::Frame> open;
         for (int frame = 0; frame < o_.frames; ++frame) {
-            progress.beginFrame(frame);
+            progress.beginFrame(frame, progress.isEnabled() ? tilesAhead(frame, world) : 0);
             tiles_ = work_ = 0;
             if constexpr (is_adaptive_v<TileOp>) {
                 reports_.push_back(renderAdaptively(frame, world, progress));
@@ -358,6 +385,17 @@ private:
         }
         while (!open.empty())
             endFirst(open);
+    }
+
+    // About how many tiles this rank renders in a frame, those of each sample and brick by themselves.
+    std::int64_t tilesAhead(int frame, const dfb::World& world) const
+    {
+        if constexpr (is_single_v<TileOp>)
+            return static_cast<std::int64_t>(fb_->layout().tileCount()) * o_.spp / fb_->size();
+        const FrameCamera camera = frameCamera(scene_->info, settings_, frame);
+        const std::size_t visible = dfb::visibleTiles(world, camera, fb_->layout()).size();
+        const int copies = o_.mode == Mode::Mixed ? std::min(o_.replicate, fb_->size()) : 1;
+        return static_cast<std::int64_t>(visible) * o_.spp / copies;
     }
 
     typename FrameBuffer::Frame start(int frame, const dfb::World& world, const dfb::FrameConfig& params,
@@ -520,6 +558,10 @@ private:
             const RunStats stats = statsOf(ofRanks);
             if (!o_.stats.empty())
                 writeStats(o_.stats, stats);
+            if (!o_.saveOptions.empty())
+                writeText(o_.saveOptions, optionsText(o_.scene, o_.given));
+            if (!o_.cinema.empty())
+                writeCinema(cinemaTable(), o_.view, framesOf(o_));
             say(stats);
             if (o_.verify)
                 std::printf("%lld of %lld values are not the exact result rounded\n",
@@ -614,15 +656,16 @@ private:
                 std::printf("wrote %s\n", first[i].c_str());
         }
         for (const std::string& path : files(0, false)) {
-            if (o_.frames > 1 && path != o_.stats)
+            const bool isOfRun = path == o_.stats || path == o_.saveOptions || path == cinemaTable();
+            if (o_.frames > 1 && !isOfRun)
                 std::printf("wrote %s, the last of %d frames; %%04d in the name gives a file for each\n", path.c_str(),
                             o_.frames);
             else
                 std::printf("wrote %s\n", path.c_str());
         }
         if (o_.writesNothing())
-            std::fprintf(stderr, "dfb_render: nothing was written: there is no --output, --alpha, --depth, --aux or "
-                                 "--stats\n");
+            std::fprintf(stderr, "dfb_render: nothing was written: there is no --output, --alpha, --depth, --aux, "
+                                 "--stats, --cinema or --save-options\n");
     }
 
     PhaseClock clock_;

@@ -233,6 +233,11 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
     CHECK(options({"demo", "--up=-z"}).view.up.z == -1.0f);
     CHECK(options({"demo", "--transfer", "auto"}).look.transfer.empty());
     CHECK(options({"demo", "--transfer", "a/b.json"}).look.transfer == "a/b.json");
+    CHECK(options({"demo", "--output", "a.exr"}).layers == dfb::depthChannel);
+    CHECK(options({"demo", "--output", "a.exr", "--layers", "none"}).layers == 0);
+    CHECK(options({"demo", "--output", "a.exr", "--layers", "normal,ids"}).layers
+          == (dfb::normalChannel | dfb::primitiveIdChannel | dfb::instanceIdChannel));
+    CHECK(options({"demo", "--cinema", "50%.cdb"}).output == "50%%.cdb/frame_%04d.png");
     for (const std::string option : {"--eye", "--target", "--up"})
         for (const std::string value : {"1,2", "1,2,3,4", "1,2,nan", "a", "1, 2,3", "w", ""})
             checkRefused({option + "=" + value});
@@ -246,6 +251,17 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
         checkRefused({"--range=" + value});
     checkRefused({"--isovalue=1,"});
     checkRefused({"--clip", "0,0,0,1,1,1"}); // of a generated scene
+    checkRefused({"--png-bits", "12", "--output", "a.png"});
+    checkRefused({"--png-bits", "16", "--output", "a.pfm"});
+    checkRefused({"--png-bits", "16"});
+    checkRefused({"--layers", "depth", "--output", "a.png"});
+    checkRefused({"--layers", "colour", "--output", "a.exr"});
+    checkRefused({"--layers", "normal", "--output", "a.exr", "--deep", "3"});
+    checkRefused({"--output", "a.exr", "--wall", "1x1"});
+    checkRefused({"--cinema", "folder"});
+    checkRefused({"--cinema", "a.cdb", "--output", "a.png"});
+    checkRefused({"--save-options", "a.toml"});
+    checkRefused({"--save-options", "a_%d.json"});
     for (const std::string word : {"a.ply:isovalue=3", "a.obj:transfer=grey", "a_2x2x2_uint8.raw:rotate=1,0,0",
                                    "a.ply:opacity=2", "a.ply:gloss=2", "a_2x2x2_uint8.raw:transfer=rainbow"}) {
         const ParsedOptions parsed = parse({word});
@@ -308,6 +324,8 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
                                                                   {"--transfer", "viridis"},
                                                                   {"--range", "1%,9"},
                                                                   {"--isovalue", "3"},
+                                                                  {"--png-bits", "8"},
+                                                                  {"--save-options", "o.json"},
                                                                   {"--opacity", "1"},
                                                                   {"--early-termination", "0.1"},
                                                                   {"--background", "1,1,1"},

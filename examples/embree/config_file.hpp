@@ -1,0 +1,71 @@
+// Options in files: JSON or TOML to read, JSON to write, so that a picture can be made again.
+#pragma once
+
+#include "option_values.hpp"
+
+#include <CLI/CLI.hpp>
+#include <nlohmann/json.hpp>
+
+#include <istream>
+#include <iterator>
+#include <sstream>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+// What --config reads: an object of JSON, {"scene": ["a.ply"], "size": "300x200", "spp": 4, "shadows": true}, or the
+// same as TOML, without # in a value.
+class OptionsFile : public CLI::ConfigTOML {
+public:
+    // Throws CLI::ConfigError.
+    std::vector<CLI::ConfigItem> from_config(std::istream& stream) const override
+    {
+        const std::string text{std::istreambuf_iterator<char>(stream), {}};
+        const std::size_t first = text.find_first_not_of(" \t\r\n");
+        if (first == std::string::npos || text[first] != '{') {
+            std::istringstream toml(text);
+            return CLI::ConfigTOML::from_config(toml);
+        }
+        const auto all = nlohmann::ordered_json::parse(text, nullptr, false);
+        if (all.is_discarded())
+            throw CLI::ConfigError("--config: the file is no JSON");
+        std::vector<CLI::ConfigItem> found;
+        for (const auto& [name, value] : all.items()) {
+            CLI::ConfigItem item;
+            item.name = name;
+            for (const auto& word : value.is_array() ? value : nlohmann::ordered_json::array({value})) {
+                if (!word.is_string() && !word.is_number() && !word.is_boolean())
+                    throw CLI::ConfigError("--config: " + name + ": expected a text, a number, true or false");
+                item.inputs.push_back(word.is_string() ? word.get<std::string>() : word.dump());
+            }
+            found.push_back(std::move(item));
+        }
+        return found;
+    }
+};
+
+namespace detail {
+
+// An option's value: a number, true or false where it is one, else a text.
+inline nlohmann::ordered_json valueOf(const std::string& text)
+{
+    const nlohmann::ordered_json value = nlohmann::ordered_json::parse(text, nullptr, false);
+    return value.is_number() || value.is_boolean() ? value : nlohmann::ordered_json(text);
+}
+
+} // namespace detail
+
+// What --config reads to do the same again.
+inline std::string optionsText(const std::vector<std::string>& scene,
+                               const std::vector<std::pair<std::string, std::string>>& given)
+{
+    nlohmann::ordered_json json;
+    json["scene"] = scene;
+    for (const auto& [name, text] : given)
+        json[name] = detail::valueOf(text);
+    return json.dump(2) + '\n';
+}
+
+} // namespace example

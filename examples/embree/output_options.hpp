@@ -1,0 +1,142 @@
+// OutputOptions: the options of the files that a run writes.
+#pragma once
+
+#include "frame_pattern.hpp"
+#include "option_values.hpp"
+
+#include <dfb/channels.hpp>
+
+#include <CLI/CLI.hpp>
+
+#include <stdexcept>
+#include <string>
+#include <utility>
+
+namespace example {
+
+struct OutputFiles {
+    // Empty: not written. All but the last two may be patterns.
+    std::string output, alpha, depth, aux, stats, saveOptions;
+    std::string cinema; // a folder; empty: none. `output` is in it then
+    int pngBits = 8;
+    dfb::ChannelMask layers = dfb::depthChannel; // of an .exr, beside colour
+
+    bool isExr() const { return detail::endingOf(output) == ".exr"; }
+    bool writesNothing() const
+    {
+        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && saveOptions.empty();
+    }
+};
+
+// Adds the options to a command line, for as long as that and `files` live.
+class OutputOptions {
+public:
+    OutputOptions(CLI::App& app, OutputFiles& files) : app_(app)
+    {
+        const char* group = "Files to write";
+        app_.add_option(
+                "--output", files.output,
+                "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
+                "black in a .pfm; linear colour, alpha and --layers in an .exr. %d, or %04d for 4 digits, in the name "
+                "stands for the number of the frame, from 0 "
+                "on; without it the last frame is written. Also in the next three; default none")
+            ->check(detail::ending({".png", ".pfm", ".exr"}))
+            ->option_text("FILE")
+            ->group(group);
+        app_.add_option("--png-bits", files.pngBits, "Bits of each channel of a .png: 8 or 16; default 8")
+            ->check([](const std::string& text) {
+                return text == "8" || text == "16" ? std::string() : "'" + text + "' is not 8 or 16";
+            })
+            ->option_text("8|16")
+            ->group(group);
+        app_.add_option(
+                "--layers", layers_,
+                "What an .exr has beside colour and alpha: none, all, or some of depth (channel Z), normal (N), "
+                "albedo, position (P), ids (id.primitive, id.instance), with commas between; default depth")
+            ->option_text("LAYER[,LAYER...]")
+            ->group(group);
+        app_.add_option(
+                "--cinema", files.cinema,
+                "Write the frames of a turn into this folder as a Cinema database, whose data.csv has phi, theta and "
+                "the picture of each; default none")
+            ->option_text("DIR.cdb")
+            ->group(group);
+        app_.add_option("--alpha", files.alpha, "The opacity, as a greyscale .pfm; default none")
+            ->check(detail::ending({".pfm"}))
+            ->option_text("FILE")
+            ->group(group);
+        app_.add_option("--depth", files.depth,
+                        "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
+                        "nothing; default none")
+            ->check(detail::ending({".pfm"}))
+            ->option_text("FILE")
+            ->group(group);
+        app_.add_option("--aux", files.aux,
+                        "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
+                        ".instance.png with a colour for each id; default none")
+            ->option_text("PREFIX")
+            ->group(group);
+        app_.add_option("--stats", files.stats,
+                        "Where the time has gone, in ms, on each rank and the slowest: total = load + render + "
+                        "compositing (with "
+                        "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of "
+                        "the image, "
+                        "the options; default none")
+            ->check(detail::ending({".json"}))
+            ->option_text("FILE")
+            ->group(group);
+
+        app_.add_option(
+                "--save-options", files.saveOptions,
+                "The options of this run and its scene, for --config: {\"scene\": [\"a.ply\"], \"spp\": 4}; default "
+                "none")
+            ->check(detail::ending({".json"}))
+            ->option_text("FILE")
+            ->group(group);
+    }
+
+    // To be called when the command line is parsed. Throws CLI::ValidationError.
+    void apply(OutputFiles& files) const
+    {
+        if (!files.cinema.empty()) {
+            if (!detail::checkEnding(files.cinema, {".cdb"}).empty())
+                throw CLI::ValidationError("--cinema", "'" + files.cinema + "' does not end in .cdb");
+            for (const char* other : {"--output", "--eye", "--wall"})
+                if (app_.count(other) > 0)
+                    throw CLI::ValidationError("--cinema", std::string("does not go with ") + other);
+            std::string folder;
+            for (const char c : files.cinema)
+                folder += c == '%' ? "%%" : std::string(1, c);
+            files.output = folder + "/frame_%04d.png";
+        }
+        if (app_.count("--layers") > 0 && !files.isExr())
+            throw CLI::ValidationError("--layers", "needs --output FILE.exr");
+        if (app_.count("--png-bits") > 0 && detail::endingOf(files.output) != ".png")
+            throw CLI::ValidationError("--png-bits", "needs --output FILE.png");
+        if (app_.count("--layers") > 0)
+            files.layers = detail::parseLayers("--layers", layers_);
+    }
+
+    // Throws CLI::ValidationError if a name is no pattern, or must not be one.
+    void checkPatterns(const OutputFiles& files) const
+    {
+        for (const auto& [name, text] : {std::pair{"--output", &files.output}, std::pair{"--alpha", &files.alpha},
+                                         std::pair{"--depth", &files.depth}, std::pair{"--aux", &files.aux}}) {
+            try {
+                FramePattern{*text};
+            } catch (const std::invalid_argument& wrong) {
+                throw CLI::ValidationError(name, wrong.what());
+            }
+        }
+        if (files.stats.find('%') != std::string::npos)
+            throw CLI::ValidationError("--stats", "'" + files.stats + "': one file for all frames, without %");
+        if (files.saveOptions.find('%') != std::string::npos)
+            throw CLI::ValidationError("--save-options", "'" + files.saveOptions + "': one file, without %");
+    }
+
+private:
+    CLI::App& app_;
+    std::string layers_;
+};
+
+} // namespace example
