@@ -73,7 +73,7 @@ struct Options : OutputFiles {
     View view;
     FileLook look; // of files that do not say themselves
 
-    float opacity = 0.6f;
+    float opacity = 1;
     float earlyTermination = 0;                     // 0: off
     float exposure = 0;                             // 0: off
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
@@ -278,8 +278,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->group(picture);
     app.add_option(
            "--ao", options.ao,
-           "Ambient occlusion of surfaces and spheres, with N rays per hit; default 0: none. Bricks then hold what "
-           "is within --ao-distance of them as ghosts")
+           "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are no volumes, "
+           "without --path; else 0: none. Bricks then hold what is within --ao-distance of them as ghosts")
         ->check(detail::number(0, 4096))
         ->option_text("N")
         ->group(picture);
@@ -361,7 +361,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         ->check(detail::number(0, 1000))
         ->option_text("D")
         ->group("Camera");
-    app.add_option("--opacity", options.opacity, "Of surfaces, isosurfaces and spheres, 0 to 1; default 0.6")
+    app.add_option("--opacity", options.opacity, "Of surfaces, isosurfaces and spheres, 0 to 1; default 1")
         ->check(detail::number(0, 1))
         ->option_text("A")
         ->group(picture);
@@ -499,7 +499,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             LookOptions::requireTransfer(file.look.transfer, "scene", "'" + word + "': transfer: ");
             file.look = merged(file.look, options.look);
             options.files.push_back(file);
+            if (app.count("--ao") == 0 && !isVolume && options.path == 0)
+                options.ao = 16;
         }
+        app.get_option("--ao")->default_str(std::to_string(options.ao));
         options.values = detail::valuesOf(app, wordsOf, false);
         options.given = detail::valuesOf(app, wordsOf, true);
     } catch (const CLI::CallForHelp&) {

@@ -288,23 +288,36 @@ private:
     static Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
     {
         const std::uint64_t h = hash64(key, static_cast<std::uint64_t>(index));
-        const double u = unitReal(h), angle = 2 * 3.14159265358979323846 * unitReal(hash64(h)), r = std::sqrt(u);
+        return cosineDirection(normal, unitReal(h), unitReal(hash64(h)));
+    }
+    // That of two numbers from 0 to 1.
+    static Vec3 cosineDirection(const Vec3& normal, double u, double v)
+    {
+        const double angle = 2 * 3.14159265358979323846 * v, r = std::sqrt(u);
         const Vec3d n(normal);
         const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d(0, 1, 0) : Vec3d(1, 0, 0);
         const Vec3d a = unit(cross(n, other)), b = cross(n, a);
         return rounded(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
     }
 
-    // The part of the sky that a hit sees, as far as the rays look. Of everything that the brick has, in its cell or
-    // not.
+    // The part of the sky that a hit sees, as far as the rays look: the R2 sequence of Roberts, which has less noise
+    // than chance. Of everything that the brick has, in its cell or not.
     float openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const
     {
         const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
         const float reach = ghostReach(scene_, settings_), least = 1e-3f * reach;
         const std::uint64_t own = hash64(key, (static_cast<std::uint64_t>(hit.geometry) << 32) | hit.primitive);
+        const double first = unitReal(own), second = unitReal(hash64(own));
+        const auto at = [](double shift, double step, int i) {
+            const double v = shift + step * i;
+            return v - std::floor(v);
+        };
         int open = 0;
-        for (int i = 0; i < settings_.aoRays; ++i)
-            open += !surfaces_.occluded(point, cosineDirection(normal, own, i), least, reach);
+        for (int i = 0; i < settings_.aoRays; ++i) {
+            const Vec3 ray =
+                cosineDirection(normal, at(first, 0.7548776662466927, i), at(second, 0.5698402909980532, i));
+            open += !surfaces_.occluded(point, ray, least, reach);
+        }
         return static_cast<float>(open) / static_cast<float>(settings_.aoRays);
     }
 
@@ -411,7 +424,7 @@ private:
                      * opacity;
             sum.cost += settings_.shadows;
             if (settings_.aoRays > 0 && opacity > 0) {
-                c = c * openness(surface, point, direction, key);
+                c = c * (0.3f + 0.7f * openness(surface, point, direction, key)); // some comes by many bounces
                 sum.cost += settings_.aoRays;
             }
             sum.addSurface(surface, opacity);

@@ -353,7 +353,8 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
     CHECK(values.at("mode") == "image"); // a word, as on the command line
     CHECK(values.at("blend") == "sort"); // defaults, too
     CHECK(values.at("size") == "1024x1024");
-    CHECK(values.at("opacity") == "0.6");
+    CHECK(values.at("opacity") == "1");
+    CHECK(values.at("ao") == "0");
     CHECK(values.at("dither") == "true");
     CHECK(values.at("shadows") == "false");
     CHECK(values.at("output") == "a.png");
@@ -361,6 +362,19 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
     CHECK(values.count("alpha") == 0); // no such file
     CHECK(values.count("help") == 0);
     CHECK(values.count("scene") == 0);
+}
+
+TEST_CASE("Surfaces from files have ambient occlusion, unless the user says otherwise", "[options]")
+{
+    CHECK(options({"demo"}).ao == 0);
+    CHECK(options({"v_2x2x2_uint8.raw"}).ao == 0);
+    CHECK(options({"a.ply"}).ao == 16);
+    CHECK(options({"v_2x2x2_uint8.raw", "a.xyz"}).ao == 16);
+    CHECK(options({"a.ply", "--ao", "0"}).ao == 0);
+    CHECK(options({"a.ply", "--mode", "image", "--path", "2"}).ao == 0);
+    for (const auto& [name, value] : options({"a.ply"}).values)
+        if (name == "ao")
+            CHECK(value == "16");
 }
 
 TEST_CASE("A pattern numbers the files of the frames", "[options]")
