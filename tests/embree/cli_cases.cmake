@@ -861,6 +861,42 @@ elseif(CASE STREQUAL "exr")
     wrong("expected layers to take room: ${all}, ${none}")
   endif()
 
+elseif(CASE STREQUAL "plots")
+  if(NOT PYTHON)
+    message("skipped: no python3 with matplotlib")
+    return()
+  endif()
+  foreach(ranks 1 2 3)
+    succeed(ranks${ranks} demo --size 64x64 --frames 3 --output o.png --stats ${ranks}.json)
+  endforeach()
+  succeed(ranks2 demo --size 64x64 --mode image --frames 3 --output o.png --stats i2.json)
+  execute_process(COMMAND ${PYTHON} ${PLOT_STATS} plot 1.json 2.json 3.json i2.json WORKING_DIRECTORY ${work}
+    RESULT_VARIABLE code OUTPUT_VARIABLE out ERROR_VARIABLE err)
+  if(NOT code EQUAL 0 OR NOT out MATCHES "data.* 1 .*data.* 2 .*data.* 3 .*image.* 2 ")
+    wrong("expected a table of two series")
+  endif()
+  foreach(name scaling breakdown frames)
+    file(READ ${work}/plot.${name}.svg text)
+    if(NOT text MATCHES "image" OR NOT text MATCHES "data")
+      wrong("expected both series in plot.${name}.svg")
+    endif()
+  endforeach()
+  # The numbers are those of the file.
+  file(WRITE ${work}/by_hand.json "{\"ranks\": 4, \"scene\": [\"x/a.ply\"], \"options\": {\"mode\": \"data\"}, \"frames\": [
+    {\"render_ms\": 900, \"compositing_ms\": 1}, {\"render_ms\": 30, \"compositing_ms\": 10},
+    {\"render_ms\": 36, \"compositing_ms\": 14}, {\"render_ms\": 24, \"compositing_ms\": 6}]}")
+  execute_process(COMMAND ${PYTHON} ${PLOT_STATS} --table by_hand.json WORKING_DIRECTORY ${work} OUTPUT_VARIABLE out
+    RESULT_VARIABLE code ERROR_VARIABLE err)
+  if(NOT out MATCHES "\\| 4 \\| 4 \\| 40.0 \\| 25.00 \\| 30.0 \\| 10.0 \\|")
+    wrong("unexpected table")
+  endif()
+  file(WRITE ${work}/wrong.json "{}")
+  execute_process(COMMAND ${PYTHON} ${PLOT_STATS} plot wrong.json WORKING_DIRECTORY ${work} RESULT_VARIABLE code
+    OUTPUT_VARIABLE out ERROR_VARIABLE err)
+  if(code EQUAL 0 OR NOT err MATCHES "no statistics of dfb_render")
+    wrong("expected to be told what is wrong")
+  endif()
+
 elseif(CASE STREQUAL "hash")
   set(scene demo --size 96x64 --bricks 5)
   hash(plain ranks1 ${scene})
