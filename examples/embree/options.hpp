@@ -34,7 +34,8 @@ enum class OwnerMap { Lattice, Linear, Hash };
 struct Options {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files
     bool fit = true;
-    int xyzFrame = 0; // of .xyz files; 0: the first
+    int xyzFrame = 0;                                    // of .xyz files; 0: the first
+    std::optional<std::array<float, 3>> spacing, origin; // of volumes; none: as the file says
     Mode mode = Mode::Data;
     int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;    // 0: one per rank
@@ -187,20 +188,21 @@ inline void parseSize(const std::string& name, const std::string& text, int most
                                              + std::to_string(most));
 }
 
-// R,G,B
-inline std::array<float, 3> parseColor(const std::string& name, const std::string& text)
+// Three numbers within [lo, hi], as in R,G,B; `what` says so.
+inline std::array<float, 3> parseThree(const std::string& name, const std::string& text, double lo, double hi,
+                                       const std::string& what)
 {
-    std::array<float, 3> color{};
+    std::array<float, 3> values{};
     std::size_t begin = 0;
     for (std::size_t c = 0; c < 3; ++c) {
         const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
         std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
-        if (part.empty() || part[0] == ' ' || !number(0, 1)(part).empty())
-            throw CLI::ValidationError(name, "'" + text + "' is not R,G,B with three numbers from 0 to 1");
-        color[c] = std::strtof(part.c_str(), nullptr);
+        if (part.empty() || part[0] == ' ' || !number(lo, hi)(part).empty())
+            throw CLI::ValidationError(name, "'" + text + "' is not " + what);
+        values[c] = std::strtof(part.c_str(), nullptr);
         begin = end + 1;
     }
-    return color;
+    return values;
 }
 
 // All options as they count, for the record; without those that have no value.
@@ -227,7 +229,8 @@ valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std
 inline ParsedOptions parseOptions(int argc, const char* const* argv)
 {
     Options options;
-    std::string size = std::to_string(options.width) + 'x' + std::to_string(options.height), wall, background;
+    std::string size = std::to_string(options.width) + 'x' + std::to_string(options.height), wall, background, spacing,
+                origin;
     CLI::App app("Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render");
     app.set_help_flag("-h,--help", "Print this and exit");
     app.get_formatter()->column_width(36);
@@ -235,7 +238,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
 
     app.add_option("scene", options.scene,
                    "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
-                   "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz")
+                   "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, or "
+                   "name_XxYxZ_TYPE.raw with uint8, int8, uint16, int16, uint32, int32, float32 or float64, and 'be' "
+                   "behind it where it is big-endian; meshes: .ply, .obj; atoms: .xyz")
         ->required()
         ->option_text("SCENE...");
     app.option_defaults()->take_last(); // of an option that is given twice the last counts
@@ -256,6 +261,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option("--xyz-frame", options.xyzFrame, "Which frame of an .xyz file that has several, from 1; default 1")
         ->check(detail::number(1, 2147483647))
         ->option_text("N");
+
+    app.add_option("--spacing", spacing,
+                   "Distances between the voxels of volumes along their three axes, as in 1,1,2 for slices that are "
+                   "twice as thick as their pixels are wide; default: as the header says, or 1,1,1")
+        ->option_text("X,Y,Z");
+    app.add_option("--origin", origin,
+                   "Where the first voxel of volumes is, with --no-fit; default: as the header says, or 0,0,0")
+        ->option_text("X,Y,Z");
 
     const char* how = "Distribution";
     words("--mode", options.mode, {"data", "image", "mixed"},
@@ -531,7 +544,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         if (app.count("--wall") > 0)
             detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
         if (app.count("--background") > 0)
-            options.background = detail::parseColor("--background", background);
+            options.background =
+                detail::parseThree("--background", background, 0, 1, "R,G,B with three numbers from 0 to 1");
+        if (app.count("--spacing") > 0)
+            options.spacing =
+                detail::parseThree("--spacing", spacing, 1e-15, 1e9, "X,Y,Z with three distances from 1e-15 to 1e9");
+        if (app.count("--origin") > 0)
+            options.origin =
+                detail::parseThree("--origin", origin, -1e12, 1e12, "X,Y,Z with three numbers of at most 1e12");
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
@@ -591,7 +611,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options.scene.size() > 1)
                 throw CLI::ValidationError("scene", "'" + word + "' stands alone, not beside other scenes");
-            if (const std::string wrong = detail::checkEnding(word, {".raw", ".ply", ".obj", ".xyz"});
+            if (const std::string wrong =
+                    detail::checkEnding(word, {".raw", ".nrrd", ".nhdr", ".mha", ".mhd", ".ply", ".obj", ".xyz"});
                 !generated && !wrong.empty())
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
         }

@@ -34,8 +34,14 @@ inline Scene makeScene(const Options& options, int brickCount, const Loaders& lo
     if (options.scene.front() == "demo")
         return demoScene(options.seed);
     Scene scene;
+    const auto vec = [](const std::array<float, 3>& v) { return Vec3{v[0], v[1], v[2]}; };
+    VoxelGrid grid;
+    if (options.spacing)
+        grid.spacing = vec(*options.spacing);
+    if (options.origin)
+        grid.origin = vec(*options.origin);
     for (const std::string& path : options.scene)
-        addFile(scene, path, options.fit, options.xyzFrame, loaders);
+        addFile(scene, path, options.fit, options.xyzFrame, loaders, grid);
     return scene;
 }
 

@@ -11,7 +11,7 @@
 #include "ply.hpp"
 #include "shading.hpp"
 #include "spheres.hpp"
-#include "volume.hpp"
+#include "voxel_block.hpp"
 
 #include <cstdint>
 #include <cstdio>
@@ -23,10 +23,12 @@ namespace example {
 
 // From the coordinates of a file to the world.
 struct Placement {
-    Vec3 scale{1, 1, 1}; // the same along all axes but for the sign
+    Vec3 scale{1, 1, 1}; // of volumes: the sides of a voxel; else the same along all axes but for the sign
     Vec3 offset;
 
-    float size() const { return std::fabs(scale.x); }
+    // The least and the greatest scale.
+    float size() const { return std::min({std::fabs(scale.x), std::fabs(scale.y), std::fabs(scale.z)}); }
+    float largest() const { return std::max({std::fabs(scale.x), std::fabs(scale.y), std::fabs(scale.z)}); }
     Vec3 toWorld(const Vec3& p) const
     {
         return {p.x * scale.x + offset.x, p.y * scale.y + offset.y, p.z * scale.z + offset.z};
@@ -50,14 +52,25 @@ inline Placement fitToUnitCube(const Box& box, bool fit)
 // itself, with z backwards.
 struct VolumeObject {
     VolumeSource source;
-    Placement placement;
+    Placement placement; // of voxels by their index
 
+    // Throws std::runtime_error if floats have too few digits to tell the volume's voxels apart.
     VolumeObject(VolumeSource volume, bool fit) : source(std::move(volume))
     {
-        placement = fitToUnitCube(bounds(), fit);
+        placement.scale = source.info.spacing;
+        placement.offset = fit ? Vec3() : source.info.origin; // it is centred
+        const Placement fitted = fitToUnitCube(bounds(), fit);
+        placement.offset = fitted.toWorld(placement.offset);
+        placement.scale = placement.scale * fitted.size();
         const Vec3 sum = bounds().lo + bounds().hi;
         placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
         placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
+        for (int axis = 0; axis < 3; ++axis)
+            if (!(std::max(std::fabs(component(bounds().lo, axis)), std::fabs(component(bounds().hi, axis)))
+                  <= 131072 * std::fabs(component(placement.scale, axis)))) // what addVolume() allows for rounding
+                throw std::runtime_error(source.name + ": its voxels are too small beside "
+                                         + (fit ? "its extent" : "the distance from 0 to its end")
+                                         + ", which can be 131072 of their sides at most");
     }
 
     // The domain, between the centres of the outer voxels.
@@ -97,7 +110,7 @@ struct Scene {
         VolumeObject object(std::move(source), fit);
         grow(object.bounds());
         const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
-        const float slack = static_cast<float>(visible.slack) * object.placement.size();
+        const float slack = static_cast<float>(visible.slack) * object.placement.largest();
         lookAt([&](const auto& take) {
             for (const Vec3& p : visible.points)
                 take(object.placement.toWorld(p), slack);
@@ -162,6 +175,7 @@ private:
     void noteOn(const VolumeSource& source, bool mayBeEmpty)
     {
         const VolumeInfo& info = source.info;
+        notes.insert(notes.end(), source.notes.begin(), source.notes.end());
         if (info.notFinite > 0)
             notes.push_back(source.name + ": voxels that are not finite: " + std::to_string(info.notFinite)
                             + "; they count as " + textOf(info.minimum));
@@ -216,9 +230,10 @@ private:
 // Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
 // of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
 // texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
-// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(). Throws std::runtime_error that names the file,
-// the same on all ranks.
-inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {})
+// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(), `grid` for volumes. Throws std::runtime_error
+// that names the file, the same on all ranks.
+inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
+                    const VoxelGrid& grid = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     const auto bytes = [&] {
@@ -233,8 +248,8 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFram
             scene.notes.push_back(std::move(note));
         return object;
     };
-    if (ending == ".raw")
-        scene.add(openVolume(path, loaders), fit);
+    if (isVolumeEnding(ending))
+        scene.add(openVolume(path, loaders, grid), fit);
     else if (ending == ".ply")
         scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit);
     else if (ending == ".obj")
@@ -243,7 +258,8 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFram
         scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
                   fit);
     else
-        throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
+        throw std::runtime_error(path + ": unknown type '" + ending
+                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .ply, .obj or .xyz");
 }
 
 // ---- cutting ---------------------------------------------------------------------------------------------------
