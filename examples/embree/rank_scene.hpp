@@ -1,10 +1,15 @@
 // RankScene: what one rank holds of the scene that the command line asks for.
 #pragma once
 
+#include "brick_exchange.hpp"
 #include "content_cut.hpp"
 #include "generated.hpp"
 #include "options.hpp"
 #include "renderer.hpp"
+#include "scene_files.hpp"
+
+#include <algorithm>
+#include <iterator>
 
 namespace example {
 
@@ -82,7 +87,7 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const int rank = loaders.rank(), rankCount = loaders.size();
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
-    const Scene scene = makeScene(options, sceneBricks, loaders);
+    Scene scene = makeScene(options, sceneBricks, loaders);
     const RenderSettings settings = renderSettings(options);
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
     if (options.path > 0 && !scene.volumes.empty())
@@ -91,15 +96,23 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
                                    : "--path leaves volumes out");
     const float ghosts = ghostReach(result.info, settings);
     std::vector<Box> cells{scene.bounds};
-    if (!isImage)
-        cells = cutsByContent(options, scene)
-                    ? loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
-                          return loaders.rank() > 0
-                                     ? std::vector<Box>()
-                                     : ContentCut(scene, result.info, settings).cells(brickCount * options.interleave);
-                      })
-                    : cutScene(scene, brickCount * options.interleave);
+    if (!isImage && cutsByContent(options, scene)) {
+        const ContentCut cut(scene, result.info, settings, loaders);
+        cells = loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
+            return rank > 0 ? std::vector<Box>() : cut.cells(brickCount * options.interleave);
+        });
+    } else if (!isImage) {
+        cells = cutScene(scene, brickCount * options.interleave);
+    }
     const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
+    std::vector<Holders> holders;
+    std::vector<Box> reaches;
+    for (std::size_t c = 0; c < cells.size(); ++c) {
+        const int brick = static_cast<int>(c) % brickCount;
+        holders.push_back(isImage ? Holders{0, rankCount} : Holders{rankOfBrick(brick, brickCount, rankCount), copies});
+        reaches.push_back(reachOf(scene, cells[c], ghosts));
+    }
+    std::vector<CellSurfaces> surfaces = exchangeBricks(scene, holders, reaches, loaders);
     for (int brick = 0; brick < brickCount; ++brick) {
         Box bounds;
         for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
@@ -112,8 +125,13 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
         result.brickIds.push_back(id);
         result.renderers.emplace_back();
         for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
-             c += static_cast<std::size_t>(brickCount))
-            result.renderers.back().emplace_back(loadBrick(scene, id, cells[c], ghosts), result.info, settings);
+             c += static_cast<std::size_t>(brickCount)) {
+            Brick loaded = loadBrick(scene, id, cells[c], ghosts);
+            std::move(surfaces[c].meshes.begin(), surfaces[c].meshes.end(), std::back_inserter(loaded.meshes));
+            std::move(surfaces[c].spheres.begin(), surfaces[c].spheres.end(), std::back_inserter(loaded.spheres));
+            surfaces[c] = CellSurfaces();
+            result.renderers.back().emplace_back(std::move(loaded), result.info, settings);
+        }
     }
     return result;
 }

@@ -1,17 +1,15 @@
 // Scene: what there is to render, and the bricks that it is cut into.
 //
-// World space: each file is scaled and centred to fill the unit cube, unless told not to. A brick is a half-open
-// cell of the scene's bounds with all that can be seen in it: the voxels (with ghosts), and each primitive that
-// touches it, under its index in the whole scene. Cells are a pure function of the bounds and their number, so every
-// rank knows all of them, and two cells that share a face have the same number for it.
+// World space: each file is scaled and centred to fill the unit cube, unless told not to. Cells are a pure function of
+// the bounds and their number, so every rank knows all of them, and two cells that share a face have the same number
+// for it.
 #pragma once
 
 #include "loaders.hpp"
-#include "obj.hpp"
-#include "ply.hpp"
+#include "mesh_share.hpp"
 #include "shading.hpp"
 #include "spheres.hpp"
-#include "voxel_block.hpp"
+#include "volume.hpp"
 
 #include <cstdint>
 #include <cstdio>
@@ -85,16 +83,21 @@ struct VolumeObject {
     }
 };
 
+// A mesh, or a run of its triangles where several ranks have loaded it together.
 struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
     std::vector<Vec3> normals;
-    Vec3 color; // where vertices have none of their own
+    Vec3 color;                       // where vertices have none of their own
+    std::uint32_t firstPrimitive = 0; // number of the first triangle in the whole mesh
+    bool isPart = false;              // the other ranks have the rest
 };
 
 struct SphereObject {
     std::uint32_t geometry = 0;
     std::vector<Sphere> spheres; // in world space
+    std::uint32_t firstPrimitive = 0;
+    bool isPart = false;
 };
 
 struct Scene {
@@ -126,39 +129,46 @@ struct Scene {
     }
     void add(Mesh mesh, bool fit)
     {
-        Box box;
-        for (const Triangle& triangle : mesh.triangles) // a file may hold vertices that nothing uses
-            for (const std::uint32_t index : triangle)
-                box.grow(mesh.positions[index]);
-        const Placement placement = fitToUnitCube(box, fit);
+        const Placement placement = fitToUnitCube(boxOf(mesh), fit);
         for (Vec3& p : mesh.positions)
             p = placement.toWorld(p);
-        static const Vec3 palette[] = {
-            {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
-        MeshObject object{nextGeometry_++, std::move(mesh), {}, palette[meshes.size() % 4]};
-        object.normals = vertexNormals(object.mesh);
-        grow(lookAt([&](const auto& take) {
-            for (const Triangle& triangle : object.mesh.triangles)
-                for (const std::uint32_t index : triangle)
-                    take(object.mesh.positions[index], 0);
-        }));
-        meshes.push_back(std::move(object));
+        std::vector<Vec3> normals = vertexNormals(mesh);
+        add(std::move(mesh), std::move(normals), {});
     }
-    void add(std::vector<Sphere> set, bool fit)
+    void add(std::vector<Sphere> set, bool fit) { add({std::move(set), 0}, fit, {}); }
+
+    // Collective: of a mesh, or of spheres, this rank's share.
+    void add(MeshShare share, bool fit, const Loaders& loaders)
+    {
+        const std::vector<std::uint32_t> vertices = verticesOf(share);
+        const VertexLookup lookup(vertices, share.vertexBegins, loaders);
+        MeshPart part = partOf(share, lookup, vertices);
+        const Placement placement = fitToUnitCube(unionOf(boxOf(part.mesh), loaders), fit);
+        for (Vec3& p : part.mesh.positions)
+            p = placement.toWorld(p);
+        std::vector<Vec3> normals = normalsOf(part, share.vertexBegins, lookup, loaders);
+        add(std::move(part.mesh), std::move(normals), loaders);
+        meshes.back().firstPrimitive = part.firstTriangle;
+        meshes.back().isPart = loaders.size() > 1;
+    }
+    void add(SphereShare share, bool fit, const Loaders& loaders)
     {
         Box box;
-        for (const Sphere& sphere : set)
+        for (const Sphere& sphere : share.spheres)
             box.grow(sphere.center, sphere.radius);
-        const Placement placement = fitToUnitCube(box, fit);
-        for (Sphere& sphere : set) {
+        const Placement placement = fitToUnitCube(unionOf(box, loaders), fit);
+        for (Sphere& sphere : share.spheres) {
             sphere.center = placement.toWorld(sphere.center);
             sphere.radius *= placement.size();
         }
-        grow(lookAt([&](const auto& take) {
-            for (const Sphere& sphere : set)
-                take(sphere.center, sphere.radius);
-        }));
-        spheres.push_back({nextGeometry_++, std::move(set)});
+        grow(lookAt(
+            [&](const auto& take) {
+                for (const Sphere& sphere : share.spheres)
+                    take(sphere.center, sphere.radius);
+            },
+            loaders));
+        spheres.push_back(
+            {nextGeometry_++, std::move(share.spheres), static_cast<std::uint32_t>(share.first), loaders.size() > 1});
     }
 
     // The visible part of the scene, for the camera.
@@ -171,6 +181,40 @@ struct Scene {
     }
 
 private:
+    // Of what the triangles use: a file may hold vertices that nothing does.
+    static Box boxOf(const Mesh& mesh)
+    {
+        Box box;
+        for (const Triangle& triangle : mesh.triangles)
+            for (const std::uint32_t index : triangle)
+                box.grow(mesh.positions[index]);
+        return box;
+    }
+    // Collective.
+    static Box unionOf(const Box& own, const Loaders& loaders)
+    {
+        Box all;
+        for (const Box& box : loaders.gatherOf<Box>([&] { return std::vector<Box>{own}; }))
+            all.grow(box);
+        return all;
+    }
+
+    // In world space.
+    void add(Mesh mesh, std::vector<Vec3> normals, const Loaders& loaders)
+    {
+        static const Vec3 palette[] = {
+            {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
+        MeshObject object{nextGeometry_++, std::move(mesh), std::move(normals), palette[meshes.size() % 4]};
+        grow(lookAt(
+            [&](const auto& take) {
+                for (const Triangle& triangle : object.mesh.triangles)
+                    for (const std::uint32_t index : triangle)
+                        take(object.mesh.positions[index], 0);
+            },
+            loaders));
+        meshes.push_back(std::move(object));
+    }
+
     // `mayBeEmpty`: nothing was seen at a glance.
     void noteOn(const VolumeSource& source, bool mayBeEmpty)
     {
@@ -196,15 +240,19 @@ private:
         return text;
     }
 
-    // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
+    // `forEach` calls its argument with the centre and radius of all spheres of one object, or on each rank of its
+    // part. Returns the box of these. Collective over the loaders.
     template <class ForEach>
-    Box lookAt(const ForEach& forEach)
+    Box lookAt(const ForEach& forEach, const Loaders& loaders = {})
     {
         Box box;
         forEach([&](const Vec3& center, float radius) { box.grow(center, radius); });
+        box = unionOf(box, loaders);
         const Vec3 middle = box.center();
         float reach = 0;
         forEach([&](const Vec3& center, float radius) { reach = std::max(reach, length(center - middle) + radius); });
+        for (const float other : loaders.gatherOf<float>([&] { return std::vector<float>{reach}; }))
+            reach = std::max(reach, other);
         if (!box.empty()) {
             seen_.grow(box);
             balls_.emplace_back(middle, reach);
@@ -226,41 +274,6 @@ private:
     std::vector<std::pair<Vec3, float>> balls_; // of each object, around all there is to see of it
     std::uint32_t nextGeometry_ = 0;
 };
-
-// Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
-// of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
-// texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
-// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(), `grid` for volumes. Throws std::runtime_error
-// that names the file, the same on all ranks.
-inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
-                    const VoxelGrid& grid = {})
-{
-    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
-    const auto bytes = [&] {
-        std::string all = readFile(path);
-        *loaders.readCounter() += all.size();
-        return all;
-    };
-    const auto parsed = [&](auto kind, const auto& parse) {
-        Notes notes;
-        auto object = loaders.fromFirst<decltype(kind)>([&] { return parse(&notes); });
-        for (std::string& note : loaders.linesOfFirst(notes))
-            scene.notes.push_back(std::move(note));
-        return object;
-    };
-    if (isVolumeEnding(ending))
-        scene.add(openVolume(path, loaders, grid), fit);
-    else if (ending == ".ply")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit);
-    else if (ending == ".obj")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit);
-    else if (ending == ".xyz")
-        scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
-                  fit);
-    else
-        throw std::runtime_error(path + ": unknown type '" + ending
-                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .ply, .obj or .xyz");
-}
 
 // ---- cutting ---------------------------------------------------------------------------------------------------
 
@@ -330,132 +343,6 @@ inline std::vector<Box> cutScene(const Scene& scene, int count)
 inline int rankOfBrick(int brick, int brickCount, int rankCount)
 {
     return static_cast<int>(static_cast<std::int64_t>(brick) * rankCount / brickCount);
-}
-
-// ---- bricks ----------------------------------------------------------------------------------------------------
-
-struct BrickVolume {
-    VoxelBlock block;
-    Placement placement;
-};
-
-struct BrickMesh {
-    std::uint32_t geometry = 0;
-    Mesh mesh;
-    std::vector<Vec3> normals;
-    std::vector<std::uint32_t> primitives; // index of each triangle in the whole mesh
-    Vec3 color;
-};
-
-struct BrickSpheres {
-    std::uint32_t geometry = 0;
-    std::vector<Sphere> spheres;
-    std::vector<std::uint32_t> primitives;
-};
-
-struct Brick {
-    std::uint32_t id = 0;
-    Box cell; // half-open
-    std::vector<BrickVolume> volumes;
-    std::vector<BrickMesh> meshes;
-    std::vector<BrickSpheres> spheres;
-};
-
-namespace detail {
-
-inline void addVolume(Brick& brick, const VolumeObject& object)
-{
-    const Box part = intersection(brick.cell, object.bounds().padded(1e-5f * object.bounds().largestExtent()));
-    if (part.empty())
-        return;
-    Index3 lo, hi;
-    for (int i = 0; i < 3; ++i) {
-        const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
-        const std::size_t axis = static_cast<std::size_t>(i);
-        const float low = component(part.lo, i), high = component(part.hi, i);
-        const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
-        const int last = object.source.info.dims[axis] - 1;
-        // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
-        const auto voxel = [&](float world, float slack) {
-            return static_cast<int>(
-                std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
-        };
-        lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
-        hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
-    }
-    brick.volumes.push_back({VoxelBlock(object.source, lo, hi), object.placement});
-}
-
-inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
-{
-    BrickMesh part;
-    const std::uint32_t none = ~std::uint32_t{0};
-    std::vector<std::uint32_t> newIndex(object.mesh.positions.size(), none);
-    for (std::size_t i = 0; i < object.mesh.triangles.size(); ++i) {
-        const Triangle& triangle = object.mesh.triangles[i];
-        Box box;
-        for (const std::uint32_t index : triangle)
-            box.grow(object.mesh.positions[index]);
-        if (!box.overlaps(reach))
-            continue;
-        Triangle renamed;
-        for (std::size_t k = 0; k < 3; ++k) {
-            std::uint32_t& index = newIndex[triangle[k]];
-            if (index == none) {
-                index = static_cast<std::uint32_t>(part.mesh.positions.size());
-                part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
-                part.normals.push_back(object.normals[triangle[k]]);
-                if (!object.mesh.colors.empty())
-                    part.mesh.colors.push_back(object.mesh.colors[triangle[k]]);
-            }
-            renamed[k] = index;
-        }
-        part.mesh.triangles.push_back(renamed);
-        part.primitives.push_back(static_cast<std::uint32_t>(i));
-    }
-    part.geometry = object.geometry;
-    part.color = object.color;
-    if (!part.primitives.empty())
-        brick.meshes.push_back(std::move(part));
-}
-
-inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reach)
-{
-    BrickSpheres part;
-    part.geometry = object.geometry;
-    for (std::size_t i = 0; i < object.spheres.size(); ++i) {
-        Box box;
-        box.grow(object.spheres[i].center, object.spheres[i].radius);
-        if (box.overlaps(reach)) {
-            part.spheres.push_back(object.spheres[i]);
-            part.primitives.push_back(static_cast<std::uint32_t>(i));
-        }
-    }
-    if (!part.primitives.empty())
-        brick.spheres.push_back(std::move(part));
-}
-
-} // namespace detail
-
-// Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
-// the scene itself can go when all bricks are loaded. Meshes and spheres are kept up to `ghosts` beyond the cell, for
-// secondary rays.
-inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
-{
-    Brick brick;
-    brick.id = id;
-    brick.cell = cell;
-    // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
-    const Box reach = cell.padded(
-        ghosts
-        + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
-    for (const VolumeObject& object : scene.volumes)
-        detail::addVolume(brick, object);
-    for (const MeshObject& object : scene.meshes)
-        detail::addMesh(brick, object, reach);
-    for (const SphereObject& object : scene.spheres)
-        detail::addSpheres(brick, object, reach);
-    return brick;
 }
 
 } // namespace example

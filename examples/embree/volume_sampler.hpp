@@ -2,7 +2,7 @@
 // nothing. All coordinates are voxel indices in the whole volume, so that neighbouring bricks compute the same bits.
 #pragma once
 
-#include "scene.hpp"
+#include "bricks.hpp"
 #include "shading.hpp"
 
 namespace example {

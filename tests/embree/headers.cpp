@@ -3,7 +3,7 @@
 #include "support.hpp"
 #include "together.hpp"
 
-#include <scene.hpp>
+#include <scene_files.hpp>
 #include <volume_sampler.hpp>
 
 #include <algorithm>

@@ -4,9 +4,9 @@
 
 #include <obj.hpp>
 #include <ply.hpp>
-#include <scene.hpp>
-#include <spheres.hpp>
-#include <volume.hpp>
+#include <scene_files.hpp>
+#include <voxel_block.hpp>
+#include <xyz.hpp>
 
 #include <cstdint>
 #include <cstring>

@@ -5,11 +5,10 @@
 // break before. A volume with a header has it and the voxels in one file.
 #include "fuzz.hpp"
 
+#include <bricks.hpp>
 #include <obj.hpp>
 #include <ply.hpp>
-#include <scene.hpp>
-#include <spheres.hpp>
-#include <volume.hpp>
+#include <xyz.hpp>
 
 #include <cmath>
 #include <sstream>
