@@ -3,6 +3,7 @@
 
 #include "camera.hpp"
 #include "frame_pattern.hpp"
+#include "hdf5_path.hpp"
 
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/wire/wire_format.hpp>
@@ -240,7 +241,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                    "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
                    "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, or "
                    "name_XxYxZ_TYPE.raw with uint8, int8, uint16, int16, uint32, int32, float32 or float64, and 'be' "
-                   "behind it where it is big-endian; meshes: .ply, .obj; atoms: .xyz")
+                   "behind it where it is big-endian, or a data set of an HDF5 file, FILE.h5:/PATH; meshes: .ply, "
+                   ".obj; atoms: .xyz")
         ->required()
         ->option_text("SCENE...");
     app.option_defaults()->take_last(); // of an option that is given twice the last counts
@@ -613,7 +615,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                 throw CLI::ValidationError("scene", "'" + word + "' stands alone, not beside other scenes");
             if (const std::string wrong =
                     detail::checkEnding(word, {".raw", ".nrrd", ".nhdr", ".mha", ".mhd", ".ply", ".obj", ".xyz"});
-                !generated && !wrong.empty())
+                !generated && !wrong.empty() && !isHdf5(word))
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
         }
     } catch (const CLI::CallForHelp&) {

@@ -1,6 +1,7 @@
 // The files of a scene: who reads them, and how they come into it.
 #pragma once
 
+#include "hdf5_volume.hpp"
 #include "obj.hpp"
 #include "ply_share.hpp"
 #include "scene.hpp"
@@ -73,7 +74,9 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFram
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     Notes notes;
-    if (isVolumeEnding(ending))
+    if (isHdf5(path))
+        scene.add(openHdf5(path, loaders, grid), fit);
+    else if (isVolumeEnding(ending))
         scene.add(openVolume(path, loaders, grid), fit);
     else if (ending == ".ply")
         detail::addMesh(scene, path, fit, {parsePly, readPlyShare}, loaders, notes);
@@ -83,7 +86,7 @@ inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFram
         detail::addSpheres(scene, path, fit, xyzFrame, loaders, notes);
     else
         throw std::runtime_error(path + ": unknown type '" + ending
-                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .ply, .obj or .xyz");
+                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .h5:/dataset, .ply, .obj or .xyz");
     for (std::string& note : loaders.linesOfFirst(notes))
         scene.notes.push_back(std::move(note));
 }

@@ -103,6 +103,35 @@ inline VoxelRange scanVoxels(std::istream& stream, const VolumeFile& file, std::
     return range;
 }
 
+// Of a whole volume: the range that its values are normalised over. Throws std::runtime_error that begins with `name`.
+inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, const std::string& name)
+{
+    const float lo = range.lo, hi = range.hi;
+    info.notFinite = range.notFinite;
+    if (lo > hi)
+        throw std::runtime_error(name + ": not one of its voxels is finite");
+    info.minimum = lo < 0 && hi > 0 && isFloat ? 0 : lo;
+    info.maximum = hi;
+    if (hi == info.minimum) { // all alike: something above them, or else below
+        info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
+        if (!std::isfinite(info.maximum)) {
+            info.minimum = hi / 2;
+            info.maximum = hi;
+        }
+    }
+}
+
+// Of floats in memory, `count` of them.
+inline void replaceNotFinite(std::byte* voxels, int count, float replacement)
+{
+    for (int i = 0; i < count; ++i, voxels += sizeof(float)) {
+        float value;
+        std::memcpy(&value, voxels, sizeof value);
+        if (!std::isfinite(value))
+            std::memcpy(voxels, &replacement, sizeof value);
+    }
+}
+
 // Collective: findVoxels() in this rank's own stream, and the range, of which each rank looks at a share of the
 // voxels. Throws std::runtime_error, the same on all ranks.
 inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const Loaders& loaders = {})
@@ -119,19 +148,7 @@ inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const L
     info.type = file.format.inMemory();
     info.spacing = file.spacing;
     info.origin = file.origin;
-    const float lo = range.lo, hi = range.hi;
-    info.notFinite = range.notFinite;
-    if (lo > hi)
-        throw std::runtime_error(file.path + ": not one of its voxels is finite");
-    info.minimum = lo < 0 && hi > 0 && file.format.isFloat() ? 0 : lo;
-    info.maximum = hi;
-    if (hi == info.minimum) { // all alike: something above them, or else below
-        info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
-        if (!std::isfinite(info.maximum)) {
-            info.minimum = hi / 2;
-            info.maximum = hi;
-        }
-    }
+    setRange(info, range, file.format.isFloat(), file.path);
     return info;
 }
 
@@ -160,12 +177,7 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const VolumeFil
         if (!format.isAsInMemory())
             format.convert(stored.data(), static_cast<std::size_t>(x1 - x0), out);
         if (format.isFloat())
-            for (int i = 0; i < x1 - x0; ++i) {
-                float value;
-                std::memcpy(&value, out + 4 * i, sizeof value);
-                if (!std::isfinite(value))
-                    std::memcpy(out + 4 * i, &minimum, sizeof value);
-            }
+            replaceNotFinite(out, x1 - x0, minimum);
     };
 }
 
