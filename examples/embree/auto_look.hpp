@@ -176,7 +176,11 @@ template <class Density>
 double meanDepth(const VolumeSource& source, const LatticeRows& lattice, const Loaders& loaders, const Density& density)
 {
     const Index3& dims = source.info.dims;
-    const double length = 256.0 * lattice.stride / std::max({dims[0], dims[1], dims[2]});
+    const Vec3 size{static_cast<float>(dims[0]) * source.info.spacing.x,
+                    static_cast<float>(dims[1]) * source.info.spacing.y,
+                    static_cast<float>(dims[2]) * source.info.spacing.z};
+    const double length =
+        256.0 * lattice.stride * static_cast<double>(source.info.spacing.x / std::max({size.x, size.y, size.z}));
     const double unit = 1 << 20; // sums of integers do not depend on their order
     std::int64_t sum = 0, rows = 0;
     for (const std::int64_t part : loaders.gatherOf<std::int64_t>([&] {
@@ -346,8 +350,11 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
             look.hi = greatestHounsfield + shift;
         }
     } else {
-        const auto file =
-            loaders.fromFirst<TransferFile>([&] { return parseTransfer(readFile(choice.transfer), choice.transfer); });
+        const std::vector<char> text = loaders.gatherOf<char>([&] {
+            const std::string all = loaders.rank() == 0 ? readFile(choice.transfer) : std::string();
+            return std::vector<char>(all.begin(), all.end());
+        });
+        const TransferFile file = parseTransfer(std::string(text.begin(), text.end()), choice.transfer);
         look.points = detail::linearPoints(file.points);
         for (TransferPoint& p : look.points)
             p.opacity *= opacity;

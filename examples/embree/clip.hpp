@@ -13,10 +13,12 @@ namespace example {
 
 // From the coordinates of a file to the world.
 struct Placement {
-    Vec3 scale{1, 1, 1}; // the same along all axes but for the sign
+    Vec3 scale{1, 1, 1}; // of volumes: the sides of a voxel; else the same along all axes but for the sign
     Vec3 offset;
 
-    float size() const { return std::fabs(scale.x); }
+    // The least and the greatest scale.
+    float size() const { return std::min({std::fabs(scale.x), std::fabs(scale.y), std::fabs(scale.z)}); }
+    float largest() const { return std::max({std::fabs(scale.x), std::fabs(scale.y), std::fabs(scale.z)}); }
     Vec3 toWorld(const Vec3& p) const
     {
         return {p.x * scale.x + offset.x, p.y * scale.y + offset.y, p.z * scale.z + offset.z};

@@ -12,6 +12,7 @@
 #include <array>
 #include <cmath>
 #include <cstddef>
+#include <cstdint>
 #include <limits>
 #include <numeric>
 #include <utility>
@@ -21,7 +22,9 @@ namespace example {
 
 class ContentCut {
 public:
-    ContentCut(const Scene& scene, const SceneInfo& info, const RenderSettings& settings) : bounds_(scene.bounds)
+    // Collective: of meshes and spheres in parts each rank looks at its own.
+    ContentCut(const Scene& scene, const SceneInfo& info, const RenderSettings& settings, const Loaders& loaders = {})
+        : bounds_(scene.bounds)
     {
         const double extent = static_cast<double>(bounds_.largestExtent());
         for (int axis = 0; axis < 3; ++axis) {
@@ -29,31 +32,11 @@ public:
             size_[static_cast<std::size_t>(axis)] =
                 std::max<std::size_t>(1, static_cast<std::size_t>(std::lround(finest * length / extent)));
         }
-        std::vector<double> content(size_[0] * size_[1] * size_[2]);
+        std::vector<double> content = surfaceContent(scene, loaders);
+        for (double& amount : content)
+            amount *= 1 + settings.aoRays + settings.shadows;
         for (const VolumeObject& volume : scene.volumes)
             addVolume(content, volume, 1 / static_cast<double>(info.step));
-        const double perHit = 1 + settings.aoRays + settings.shadows;
-        for (const MeshObject& object : scene.meshes)
-            for (const Triangle& triangle : object.mesh.triangles) {
-                const Vec3 &a = object.mesh.positions[triangle[0]], &b = object.mesh.positions[triangle[1]],
-                           &c = object.mesh.positions[triangle[2]];
-                Box box;
-                for (const Vec3& p : {a, b, c})
-                    box.grow(p);
-                if (!box.overlaps(bounds_)) // clipped away
-                    continue;
-                // Half of a side, as seen from all sides on average.
-                add(content, box, 0.25 * perHit * static_cast<double>(length(cross(b - a, c - a))));
-            }
-        for (const SphereObject& object : scene.spheres)
-            for (const Sphere& sphere : object.spheres) {
-                Box box;
-                box.grow(sphere.center, sphere.radius);
-                if (!box.overlaps(bounds_))
-                    continue;
-                const double radius = static_cast<double>(sphere.radius);
-                add(content, box, 2 * perHit * 3.14159265358979323846 * radius * radius); // a ray hits it twice
-            }
         const int views = std::min(settings.frames, mostViews);
         for (int view = 0; view < views; ++view)
             addView(content, frameCamera(info, settings, view * settings.frames / views).pinhole(), settings);
@@ -97,8 +80,45 @@ private:
         return std::clamp((static_cast<double>(world) - lo) / extent * cells, 0.0, cells);
     }
 
-    // Spreads an amount over a box.
-    void add(std::vector<double>& content, const Box& box, double amount) const
+    // What rays that hit surfaces cost, but for secondary ones. It is summed in units of which doubles hold all
+    // multiples, so that it does not depend on the number of ranks, nor of their order.
+    std::vector<double> surfaceContent(const Scene& scene, const Loaders& loaders) const
+    {
+        const double extent = static_cast<double>(bounds_.largestExtent()), unit = extent * extent * 0x1.0p-30;
+        std::vector<double> own(size_[0] * size_[1] * size_[2]);
+        if (!(unit > 0))
+            return own;
+        const auto isMine = [&](const auto& object) { return object.isPart || loaders.rank() == 0; };
+        for (const MeshObject& object : scene.meshes)
+            for (const Triangle& triangle : object.mesh.triangles) {
+                const Vec3 &a = object.mesh.positions[triangle[0]], &b = object.mesh.positions[triangle[1]],
+                           &c = object.mesh.positions[triangle[2]];
+                Box box;
+                for (const Vec3& p : {a, b, c})
+                    box.grow(p);
+                // Half of a side, as seen from all sides on average.
+                if (isMine(object) && box.overlaps(bounds_)) // else it is clipped away
+                    add(own, box, 0.25 * static_cast<double>(length(cross(b - a, c - a))) / unit, std::nearbyint);
+            }
+        for (const SphereObject& object : scene.spheres)
+            for (const Sphere& sphere : object.spheres) {
+                Box box;
+                box.grow(sphere.center, sphere.radius);
+                const double radius = static_cast<double>(sphere.radius);
+                if (isMine(object) && box.overlaps(bounds_)) // a ray hits it twice
+                    add(own, box, 2 * 3.14159265358979323846 * radius * radius / unit, std::nearbyint);
+            }
+        std::vector<std::int64_t> whole;
+        for (const double amount : own)
+            whole.push_back(static_cast<std::int64_t>(std::min(amount, 0x1.0p52)));
+        whole = loaders.sumOf(whole);
+        for (std::size_t i = 0; i < own.size(); ++i)
+            own[i] = static_cast<double>(whole[i]) * unit;
+        return own;
+    }
+
+    // Spreads an amount over a box, each part of it rounded by a function.
+    void add(std::vector<double>& content, const Box& box, double amount, double (*round)(double)) const
     {
         std::array<std::size_t, 3> first{}, last{};
         std::array<std::array<double, 2>, 3> ends{};
@@ -118,7 +138,7 @@ private:
         for (std::size_t z = first[2]; z <= last[2]; ++z)
             for (std::size_t y = first[1]; y <= last[1]; ++y)
                 for (std::size_t x = first[0]; x <= last[0]; ++x)
-                    content[indexOf(x, y, z)] += amount * part(0, x) * part(1, y) * part(2, z);
+                    content[indexOf(x, y, z)] += round(amount * part(0, x) * part(1, y) * part(2, z));
     }
 
     void addVolume(std::vector<double>& content, const VolumeObject& object, double samplesPerLength) const
@@ -148,7 +168,8 @@ private:
                     const Vec3 e = block.extent();
                     add(content, block,
                         samplesPerLength * static_cast<double>(e.x) * static_cast<double>(e.y)
-                            * static_cast<double>(e.z));
+                            * static_cast<double>(e.z),
+                        [](double v) { return v; });
                 }
     }
 

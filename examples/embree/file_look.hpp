@@ -37,6 +37,8 @@ struct FileLook {
 };
 
 struct SceneFile {
+    SceneFile(std::string itsPath = {}, FileLook itsLook = {}) : path(std::move(itsPath)), look(std::move(itsLook)) {}
+
     std::string path;
     FileLook look;
 };

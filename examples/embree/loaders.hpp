@@ -2,12 +2,14 @@
 #pragma once
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <exception>
 #include <functional>
 #include <memory>
+#include <numeric>
 #include <stdexcept>
 #include <string>
 #include <type_traits>
@@ -21,23 +23,29 @@ public:
     using Bytes = std::vector<std::byte>;
     // Collective: the bytes of each rank, by rank.
     using Gather = std::function<std::vector<Bytes>(const Bytes&)>;
+    // Collective: the sums over all ranks, element by element.
+    using Sum = std::function<std::vector<std::int64_t>(const std::vector<std::int64_t>&)>;
 
     // A rank by itself.
     Loaders() = default;
-    Loaders(int rank, int size, Gather gather) : rank_(rank), size_(size), gather_(std::move(gather)) {}
+    Loaders(int rank, int size, Gather gather, Sum sum)
+        : rank_(rank), size_(size), gather_(std::move(gather)), sum_(std::move(sum))
+    {
+    }
 
     int rank() const { return rank_; }
     int size() const { return size_; }
 
-    // This rank's share of `count` things, which go to the ranks in equal runs: [first, second).
-    std::pair<std::uint64_t, std::uint64_t> shareOf(std::uint64_t count) const
+    // A rank's share of `count` things, which go to the ranks in equal runs: [first, second). And this rank's.
+    static std::pair<std::uint64_t, std::uint64_t> shareOf(std::uint64_t count, int rank, int size)
     {
-        const auto at = [&](int rank) {
-            const auto r = static_cast<std::uint64_t>(rank), n = static_cast<std::uint64_t>(size_);
+        const auto at = [&](int i) {
+            const auto r = static_cast<std::uint64_t>(i), n = static_cast<std::uint64_t>(size);
             return count / n * r + count % n * r / n;
         };
-        return {at(rank_), at(rank_ + 1)};
+        return {at(rank), at(rank + 1)};
     }
+    std::pair<std::uint64_t, std::uint64_t> shareOf(std::uint64_t count) const { return shareOf(count, rank_, size_); }
 
     // Bytes of files that this rank has read. A reader adds to the counter, also after these loaders are gone.
     std::uint64_t bytesRead() const { return *bytesRead_; }
@@ -79,29 +87,89 @@ public:
         return all;
     }
 
-    // Collective: what `make` returns on rank 0, which alone calls it, on all ranks. If it throws, all throw
-    // std::runtime_error with its text. There is a function `arraysOf(T&, f)`, which calls f with the vectors that T is
-    // made of.
-    template <class T, class Make>
-    T fromFirst(const Make& make) const
+    // Collective: whether `step` returns true on all ranks. On one where it throws it does not.
+    template <class Step>
+    bool isOnAll(const Step& step) const
     {
-        if (size_ == 1)
-            return make();
-        T value;
-        Bytes bytes;
-        gatherOf<char>([&] { // whether rank 0 has it
-            if (rank_ == 0) {
-                value = make();
-                arraysOf(value, [&](const auto&... arrays) { (pack(arrays, bytes), ...); });
+        bool isSo = false;
+        try {
+            isSo = step();
+        } catch (const std::exception&) { // what is wrong is said by who tries another way
+        }
+        for (const char other : gatherOf<char>([&] { return std::vector<char>{isSo ? '\1' : '\0'}; }))
+            isSo = isSo && other != '\0';
+        return isSo;
+    }
+
+    // Collective.
+    std::vector<std::int64_t> sumOf(const std::vector<std::int64_t>& own) const { return size_ == 1 ? own : sum_(own); }
+
+    // Collective: this rank's number of things, which the ranks have in runs, in their order. Returns where the run of
+    // each begins, and the end.
+    std::vector<std::uint64_t> beginsOf(std::uint64_t count) const
+    {
+        std::vector<std::uint64_t> begins{0};
+        for (const std::uint64_t of : gatherOf<std::uint64_t>([&] { return std::vector<std::uint64_t>{count}; }))
+            begins.push_back(begins.back() + of);
+        return begins;
+    }
+
+    // Collective: `parts` has one for each rank and, behind these, one for all. Returns what each rank has sent to this
+    // one, by rank: its part and then that for all. They travel in rounds, so that a rank does not hold what is for
+    // others; but all see them pass by.
+    std::vector<Bytes> exchange(std::vector<Bytes> parts) const
+    {
+        const std::size_t ranks = static_cast<std::size_t>(size_);
+        std::vector<std::uint64_t> sizes;
+        for (const Bytes& part : parts)
+            sizes.push_back(part.size());
+        Bytes stream;
+        const std::vector<std::uint64_t> all = gatherOf<std::uint64_t>([&] {
+            stream.reserve(static_cast<std::size_t>(std::accumulate(sizes.begin(), sizes.end(), std::uint64_t{0})));
+            for (Bytes& part : parts) {
+                stream.insert(stream.end(), part.begin(), part.end());
+                part = Bytes();
             }
+            return sizes;
+        });
+        if (size_ == 1)
+            return {stream};
+        std::vector<Bytes> received(ranks);
+        std::vector<std::array<std::uint64_t, 2>> wanted; // of the stream of each rank, two sections
+        std::uint64_t longest = 0;
+        for (std::size_t source = 0; source < ranks; ++source) {
+            const auto first = all.begin() + static_cast<std::ptrdiff_t>(source * (ranks + 1));
+            const std::uint64_t whole = std::accumulate(first, first + size_ + 1, std::uint64_t{0}),
+                                begin = std::accumulate(first, first + rank_, std::uint64_t{0});
+            wanted.push_back({begin, begin + first[rank_]});
+            wanted.push_back({whole - first[size_], whole});
+            longest = std::max(longest, whole);
+        }
+        gatherOf<char>([&] { // nobody waits for a rank without memory
+            for (std::size_t source = 0; source < ranks; ++source)
+                received[source].reserve(static_cast<std::size_t>(wanted[2 * source][1] - wanted[2 * source][0]
+                                                                  + wanted[2 * source + 1][1]
+                                                                  - wanted[2 * source + 1][0]));
             return std::vector<char>();
         });
-        share(bytes);
-        if (rank_ != 0) {
-            const std::byte* at = bytes.data();
-            arraysOf(value, [&](auto&... arrays) { (unpack(at, arrays), ...); });
+        const std::uint64_t most = std::max<std::uint64_t>(std::uint64_t{1} << 16, (std::uint64_t{8} << 20) / ranks);
+        for (std::uint64_t done = 0; done < longest; done += most) {
+            const auto sliceOf = [done](const Bytes& bytes, std::uint64_t begin, std::uint64_t end) {
+                const auto at = [&](std::uint64_t i) {
+                    return bytes.begin() + static_cast<std::ptrdiff_t>(std::min<std::uint64_t>(i - done, bytes.size()));
+                };
+                return std::pair(at(std::max(begin, done)), at(std::max(end, done)));
+            };
+            const std::uint64_t begin = std::min<std::uint64_t>(done, stream.size()),
+                                end = std::min<std::uint64_t>(done + most, stream.size());
+            const std::vector<Bytes> slices = gather_(Bytes(stream.begin() + static_cast<std::ptrdiff_t>(begin),
+                                                            stream.begin() + static_cast<std::ptrdiff_t>(end)));
+            for (std::size_t i = 0; i < wanted.size(); ++i) {
+                const auto [from, to] = sliceOf(slices[i / 2], wanted[i][0], wanted[i][1]);
+                received[i / 2].insert(received[i / 2].end(), from, to);
+            }
         }
-        return value;
+        return received;
     }
 
     // Collective: the lines of rank 0, which have no line ends, on all ranks.
@@ -123,26 +191,7 @@ public:
         return all;
     }
 
-private:
-    // Rank 0's bytes to all, in parts, so that nobody holds them twice.
-    void share(Bytes& bytes) const
-    {
-        const std::size_t most = std::size_t{4} << 20;
-        for (std::size_t done = 0;;) {
-            Bytes part;
-            if (rank_ == 0) {
-                const auto begin = bytes.begin() + static_cast<std::ptrdiff_t>(done);
-                part.assign(begin, begin + static_cast<std::ptrdiff_t>(std::min(most, bytes.size() - done)));
-            }
-            part = std::move(gather_(part).front());
-            if (rank_ != 0)
-                bytes.insert(bytes.end(), part.begin(), part.end());
-            done += part.size();
-            if (part.size() < most)
-                return;
-        }
-    }
-
+    // Adds an array to some bytes, or takes it from them.
     template <class T>
     static void pack(const std::vector<T>& array, Bytes& bytes)
     {
@@ -167,8 +216,10 @@ private:
         at += array.size() * sizeof(T);
     }
 
+private:
     int rank_ = 0, size_ = 1;
     Gather gather_;
+    Sum sum_;
     std::shared_ptr<std::uint64_t> bytesRead_ = std::make_shared<std::uint64_t>(0);
 };
 

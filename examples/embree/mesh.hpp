@@ -23,14 +23,6 @@ struct Mesh {
     std::vector<Vec3> colors{}; // of each vertex, linear RGB; or none
 };
 
-// For Loaders::fromFirst(): all that a mesh is made of. Does not compile if there is anything else in it.
-template <class Function>
-void arraysOf(Mesh& mesh, const Function& function)
-{
-    auto& [positions, triangles, colors] = mesh;
-    function(positions, triangles, colors);
-}
-
 // The whole file. Throws std::runtime_error if it cannot be read or is empty.
 inline std::string readFile(const std::string& path)
 {
@@ -48,17 +40,18 @@ inline std::string readFile(const std::string& path)
 
 namespace detail {
 
-// Fans a polygon; throws on an index that is no vertex. `where` gives the beginning of the error, as below.
+// Fans a polygon; throws on an index that is none of so many vertices. `where` gives the beginning of the error, as
+// below.
 template <class Where>
-void addPolygon(Mesh& mesh, const std::vector<std::int64_t>& polygon, const Where& where)
+void addPolygon(Mesh& mesh, const std::vector<std::int64_t>& polygon, std::uint64_t vertexCount, const Where& where)
 {
     if (polygon.size() < 3)
         throw std::runtime_error(where() + ": a face of " + std::to_string(polygon.size())
                                  + " vertices, expected 3 or more");
     for (const std::int64_t index : polygon)
-        if (index < 0 || index >= static_cast<std::int64_t>(mesh.positions.size()))
+        if (index < 0 || index >= static_cast<std::int64_t>(vertexCount))
             throw std::runtime_error(where() + ": a face with vertex " + std::to_string(index) + ", expected 0 to "
-                                     + std::to_string(static_cast<std::int64_t>(mesh.positions.size()) - 1));
+                                     + std::to_string(static_cast<std::int64_t>(vertexCount) - 1));
     for (std::size_t i = 2; i < polygon.size(); ++i)
         mesh.triangles.push_back({static_cast<std::uint32_t>(polygon[0]), static_cast<std::uint32_t>(polygon[i - 1]),
                                   static_cast<std::uint32_t>(polygon[i])});
@@ -79,13 +72,12 @@ inline Vec3 linearOf(const Vec3& srgb)
     return {linear(srgb.x), linear(srgb.y), linear(srgb.z)};
 }
 
+inline bool isColor(const Vec3& c) { return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= 1 && c.y <= 1 && c.z <= 1; }
+
 // Of the colours of vertices as they are in a file, in sRGB, makes those of a mesh. Where some are missing or are no
 // colours, all are left out.
 inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
 {
-    const auto isColor = [](const Vec3& c) {
-        return c.x >= 0 && c.y >= 0 && c.z >= 0 && c.x <= 1 && c.y <= 1 && c.z <= 1;
-    };
     if (mesh.colors.empty())
         return;
     if (mesh.colors.size() == mesh.positions.size() && std::all_of(mesh.colors.begin(), mesh.colors.end(), isColor)) {
@@ -100,13 +92,19 @@ inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
 
 } // namespace detail
 
+// As long as twice the triangle's area.
+inline Vec3d weightedNormal(const Mesh& mesh, const Triangle& t)
+{
+    const Vec3d a(mesh.positions[t[0]]), b(mesh.positions[t[1]]), c(mesh.positions[t[2]]);
+    return cross(b - a, c - a);
+}
+
 // Unit vertex normals, the mean of the triangles around weighted by their area; zero where there are none.
 inline std::vector<Vec3> vertexNormals(const Mesh& mesh)
 {
     std::vector<Vec3d> sums(mesh.positions.size());
     for (const Triangle& t : mesh.triangles) {
-        const Vec3d a(mesh.positions[t[0]]), b(mesh.positions[t[1]]), c(mesh.positions[t[2]]);
-        const Vec3d normal = cross(b - a, c - a);
+        const Vec3d normal = weightedNormal(mesh, t);
         for (const std::uint32_t i : t)
             sums[i] = sums[i] + normal;
     }

@@ -4,14 +4,18 @@
 // neither lines nor the colours of vertices to who wants to check them.
 #pragma once
 
-#include "mesh.hpp"
+#include "file_share.hpp"
+#include "mesh_share.hpp"
 #include "text.hpp"
+
+#include <optional>
 
 namespace example {
 
-// The lines v, with or without a colour, and f; all else is skipped, polygons become fans. Throws std::runtime_error
-// with `name`, the line, what was expected and what was found. `notes` gets what was left out, if not null.
-inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
+namespace detail {
+
+// Some lines of a file, before which there are so many vertices. Colours are as they are in the file.
+inline Mesh parseObjLines(std::string_view bytes, const std::string& name, std::uint64_t verticesBefore)
 {
     Mesh mesh;
     std::vector<std::int64_t> polygon;
@@ -34,11 +38,11 @@ inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* not
                     break;
             }
             const auto at = [&v](int i) { return static_cast<float>(v[i]); };
-            detail::addVertex(mesh, {at(0), at(1), at(2)}, where);
+            addVertex(mesh, {at(0), at(1), at(2)}, where);
             if (count == 6)
                 mesh.colors.push_back({at(3), at(4), at(5)});
         } else if (kind == "f") {
-            const std::int64_t vertices = static_cast<std::int64_t>(mesh.positions.size());
+            const std::int64_t vertices = static_cast<std::int64_t>(verticesBefore + mesh.positions.size());
             polygon.clear();
             for (std::string_view word = nextWord(line); !word.empty(); word = nextWord(line)) {
                 std::string_view rest = word;
@@ -51,14 +55,58 @@ inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* not
                          + ", or -1 to -" + std::to_string(vertices));
                 polygon.push_back(index > 0 ? index - 1 : vertices + index);
             }
-            detail::addPolygon(mesh, polygon, where);
+            addPolygon(mesh, polygon, static_cast<std::uint64_t>(vertices), where);
         }
     }
+    return mesh;
+}
+
+inline std::uint64_t countObjVertices(std::string_view bytes)
+{
+    std::uint64_t count = 0;
+    for (TextLines lines(bytes); !lines.atEnd();) {
+        std::string_view line = lines.next();
+        count += nextWord(line) == "v";
+    }
+    return count;
+}
+
+} // namespace detail
+
+// The lines v, with or without a colour, and f; all else is skipped, polygons become fans. Throws std::runtime_error
+// with `name`, the line, what was expected and what was found. `notes` gets what was left out, if not null.
+inline Mesh parseObj(std::string_view bytes, const std::string& name, Notes* notes = nullptr)
+{
+    Mesh mesh = detail::parseObjLines(bytes, name, 0);
     if (mesh.triangles.empty())
         throw std::runtime_error(name + ": expected vertices and faces, got " + std::to_string(mesh.positions.size())
                                  + " vertices and no faces");
     detail::finishColors(mesh, name, notes);
     return mesh;
+}
+
+// Collective: the same, of which each rank reads a share of the lines. Nothing, on all ranks, if anything is not as it
+// should be: parseObj() of the whole says what.
+inline std::optional<MeshShare> readObjShare(const std::string& path, const Loaders& loaders, Notes* notes)
+{
+    std::string bytes;
+    std::uint64_t vertices = 0;
+    if (!loaders.isOnAll([&] {
+            bytes = readLinesOfShare(path, 0, fileSize(path), loaders);
+            vertices = detail::countObjVertices(bytes);
+            return true;
+        }))
+        return std::nullopt;
+    MeshShare share;
+    share.vertexBegins = loaders.beginsOf(vertices);
+    if (!loaders.isOnAll([&] {
+            share.mesh =
+                detail::parseObjLines(bytes, path, share.vertexBegins[static_cast<std::size_t>(loaders.rank())]);
+            bytes = std::string();
+            return share.mesh.positions.size() == vertices; // a comment may cut a 'v' short
+        }))
+        return std::nullopt;
+    return finished(std::move(share), path, loaders, notes);
 }
 
 } // namespace example

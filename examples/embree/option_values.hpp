@@ -105,20 +105,21 @@ inline void parseSize(const std::string& name, const std::string& text, int most
                                              + std::to_string(most));
 }
 
-// R,G,B
-inline std::array<float, 3> parseColor(const std::string& name, const std::string& text)
+// Three numbers within [lo, hi], as in R,G,B; `what` says so.
+inline std::array<float, 3> parseThree(const std::string& name, const std::string& text, double lo, double hi,
+                                       const std::string& what)
 {
-    std::array<float, 3> color{};
+    std::array<float, 3> values{};
     std::size_t begin = 0;
     for (std::size_t c = 0; c < 3; ++c) {
         const std::size_t end = c < 2 ? text.find(',', begin) : text.size();
         std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
-        if (part.empty() || part[0] == ' ' || !number(0, 1)(part).empty())
-            throw CLI::ValidationError(name, "'" + text + "' is not R,G,B with three numbers from 0 to 1");
-        color[c] = std::strtof(part.c_str(), nullptr);
+        if (part.empty() || part[0] == ' ' || !number(lo, hi)(part).empty())
+            throw CLI::ValidationError(name, "'" + text + "' is not " + what);
+        values[c] = std::strtof(part.c_str(), nullptr);
         begin = end + 1;
     }
-    return color;
+    return values;
 }
 
 // The channels that an .exr has beside colour, by the words of --layers.

@@ -7,6 +7,7 @@
 #include "look_options.hpp"
 #include "option_values.hpp"
 #include "output_options.hpp"
+#include "volume_file.hpp"
 
 #include <dfb/channels.hpp>
 #include <dfb/comm/heartbeat.hpp>
@@ -40,7 +41,8 @@ struct Options : OutputFiles {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
     std::vector<SceneFile> files;   // of these, with what holds of each
     bool fit = true;
-    int xyzFrame = 0; // of .xyz files; 0: the first
+    int xyzFrame = 0;                                    // of .xyz files; 0: the first
+    std::optional<std::array<float, 3>> spacing, origin; // of volumes; none: as the file says
     Mode mode = Mode::Data;
     int ranks = 0;     // threads as ranks, without MPI; 0: MPI's ranks
     int bricks = 0;    // 0: one per rank
@@ -126,7 +128,8 @@ valuesOf(const CLI::App& app, const std::map<const CLI::Option*, std::vector<std
 inline ParsedOptions parseOptions(int argc, const char* const* argv)
 {
     Options options;
-    std::string size = std::to_string(options.width) + 'x' + std::to_string(options.height), wall, background;
+    std::string size = std::to_string(options.width) + 'x' + std::to_string(options.height), wall, background, spacing,
+                origin;
     CLI::App app("Renders volumes, meshes and spheres over several ranks into one image.\n", "dfb_render");
     app.set_help_flag("-h,--help", "Print this and exit");
     app.get_formatter()->column_width(36);
@@ -135,10 +138,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option(
            "scene", options.scene,
            "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
-           "together), or one or more files: name_XxYxZ_uint8|uint16|float32.raw, .ply, .obj, .xyz. Behind a file's "
-           "name may stand how it is shown, as in a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there "
-           "are color, opacity, scale, rotate, translate, and as the options of that name clip, transfer, "
-           "range, isovalue")
+           "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, or name_XxYxZ_TYPE.raw with uint8, "
+           "int8, uint16, int16, uint32, int32, float32 or float64, and 'be' behind it where it is big-endian; "
+           "meshes: .ply, .obj; atoms: .xyz. Behind a file's name may stand how it is shown, as in "
+           "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, scale, rotate, translate, "
+           "and as the options of that name clip, transfer, range, isovalue")
         ->required()
         ->option_text("SCENE...");
     app.option_defaults()->take_last(); // of an option that is given twice the last counts
@@ -160,6 +164,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option("--xyz-frame", options.xyzFrame, "Which frame of an .xyz file that has several, from 1; default 1")
         ->check(detail::number(1, 2147483647))
         ->option_text("N");
+
+    app.add_option("--spacing", spacing,
+                   "Distances between the voxels of volumes along their three axes, as in 1,1,2 for slices that are "
+                   "twice as thick as their pixels are wide; default: as the header says, or 1,1,1")
+        ->option_text("X,Y,Z");
+    app.add_option("--origin", origin,
+                   "Where the first voxel of volumes is, with --no-fit; default: as the header says, or 0,0,0")
+        ->option_text("X,Y,Z");
 
     const char* how = "Distribution";
     words("--mode", options.mode, {"data", "image", "mixed"},
@@ -418,7 +430,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         outputOptions.apply(options);
         lookOptions.apply(options.view, options.look);
         if (app.count("--background") > 0)
-            options.background = detail::parseColor("--background", background);
+            options.background =
+                detail::parseThree("--background", background, 0, 1, "R,G,B with three numbers from 0 to 1");
+        if (app.count("--spacing") > 0)
+            options.spacing =
+                detail::parseThree("--spacing", spacing, 1e-15, 1e9, "X,Y,Z with three distances from 1e-15 to 1e9");
+        if (app.count("--origin") > 0)
+            options.origin =
+                detail::parseThree("--origin", origin, -1e12, 1e12, "X,Y,Z with three numbers of at most 1e12");
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
@@ -472,7 +491,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                                                          + std::to_string(options.bezel));
         }
         outputOptions.checkPatterns(options);
-        const std::vector<std::string> endings{".raw", ".ply", ".obj", ".xyz"};
+        const std::vector<std::string> endings{".raw", ".nrrd", ".nhdr", ".mha", ".mhd", ".ply", ".obj", ".xyz"};
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options.scene.size() > 1)
@@ -489,7 +508,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             }
             if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty())
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
-            const bool isVolume = detail::endingOf(file.path) == ".raw";
+            const bool isVolume = isVolumeEnding(detail::endingOf(file.path));
             if (!isVolume && (!file.look.transfer.empty() || file.look.range || !file.look.isovalues.empty()))
                 throw CLI::ValidationError("scene", "'" + word + "': transfer, range and isovalue are for volumes");
             if (isVolume && !isZero(file.look.rotate))

@@ -18,6 +18,13 @@ namespace detail {
 
 enum class PlyType { Int8, UInt8, Int16, UInt16, Int32, UInt32, Float32, Float64 };
 
+// In a binary file.
+inline std::size_t plyBytes(PlyType type)
+{
+    static const std::array<std::size_t, 8> sizes{1, 1, 2, 2, 4, 4, 4, 8};
+    return sizes[static_cast<std::size_t>(type)];
+}
+
 struct PlyProperty {
     std::string name;
     PlyType type = PlyType::Float32;
@@ -30,6 +37,9 @@ struct PlyElement {
     std::string name;
     std::uint64_t count = 0;
     std::vector<PlyProperty> properties;
+
+    bool isVertex() const { return name == "vertex"; }
+    bool isFace() const { return name == "face"; }
 };
 
 // A cursor over the bytes of a PLY file: the header line by line, then numbers.
@@ -48,9 +58,8 @@ public:
             if (!element.properties.empty() && element.count > bytes_.size() - at_)
                 fail("it ends early: expected " + std::to_string(element.count) + " of element " + element.name
                      + ", got " + std::to_string(bytes_.size() - at_) + " bytes");
-            const bool isVertex = element.name == "vertex", isFace = element.name == "face";
             for (std::uint64_t row = 0; row < element.count && !element.properties.empty(); ++row)
-                readRow(element, row, mesh, isVertex, isFace);
+                readRow(element, row, mesh);
         }
         if (format_ == Format::Ascii)
             skipSpace();
@@ -63,23 +72,7 @@ public:
         return mesh;
     }
 
-private:
-    enum class Format { Ascii, LittleEndian, BigEndian };
-
-    [[noreturn]] void fail(const std::string& why) const { throw std::runtime_error(name_ + ": " + why); }
-
-    std::vector<std::string> headerLine()
-    {
-        const std::size_t end = bytes_.find('\n', at_);
-        if (end == std::string_view::npos)
-            fail("the header ends without end_header");
-        std::istringstream line{std::string(bytes_.substr(at_, end - at_))};
-        at_ = end + 1;
-        std::vector<std::string> words;
-        for (std::string word; line >> word;)
-            words.push_back(word);
-        return words;
-    }
+    // ---- for who reads rows of several ranges: the header, then some rows at a time
 
     void readHeader()
     {
@@ -128,6 +121,122 @@ private:
         if (!hasFormat)
             fail("the header names no format");
         checkElements();
+        for (const PlyElement& element : elements_)
+            vertexCount_ = element.isVertex() ? element.count : vertexCount_;
+    }
+
+    void readRow(const PlyElement& element, std::uint64_t row, Mesh& mesh)
+    {
+        const bool isVertex = element.isVertex(), isFace = element.isFace();
+        Vec3 p, color;
+        unsigned channels = 0; // a bit for each
+        for (const PlyProperty& property : element.properties) {
+            if (!property.isList) {
+                const double value = number(property.type, element, row);
+                if (isVertex && property.name.size() == 1 && property.name[0] >= 'x' && property.name[0] <= 'z')
+                    component(p, property.name[0] - 'x') = static_cast<float>(value);
+                if (isVertex && property.channel >= 0) {
+                    component(color, property.channel) = static_cast<float>(value / largestOf(property.type));
+                    channels |= 1u << property.channel;
+                }
+                continue;
+            }
+            const double count = number(property.countType, element, row);
+            if (!(count >= 0 && count <= static_cast<double>(bytes_.size() - at_)) || count != std::floor(count))
+                fail("it ends early, or has a bad list, in " + element.name + ' ' + std::to_string(row));
+            polygon_.clear();
+            for (std::int64_t i = 0; i < static_cast<std::int64_t>(count); ++i) {
+                const double index = number(property.type, element, row);
+                const bool canBe = index >= 0 && index < 4294967296.0 && index == std::floor(index);
+                polygon_.push_back(canBe ? static_cast<std::int64_t>(index) : -1);
+            }
+            if (isFace && isIndexList(property))
+                addPolygon(mesh, polygon_, vertexCount_, [&] { return name_ + ": face " + std::to_string(row); });
+        }
+        if (isVertex)
+            addVertex(mesh, p, [&] { return name_ + ": vertex " + std::to_string(row); });
+        if (channels == 7)
+            mesh.colors.push_back(color);
+    }
+
+    void skipSpace()
+    {
+        while (at_ < bytes_.size() && (bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r')))
+            ++at_;
+    }
+
+    const std::vector<PlyElement>& elements() const { return elements_; }
+    bool isAscii() const { return format_ == Format::Ascii; }
+    std::size_t position() const { return at_; }
+    double number(PlyType type, const PlyElement& element, std::uint64_t row)
+    {
+        const auto where = [&] {
+            return " in " + element.name + ' ' + std::to_string(row) + " of " + std::to_string(element.count);
+        };
+        if (format_ == Format::Ascii) {
+            skipSpace();
+            if (at_ == bytes_.size())
+                fail("it ends early," + where());
+            double value = 0;
+            std::string_view rest = bytes_.substr(at_);
+            const bool isNumber = takeNumber(rest, value);
+            at_ = bytes_.size() - rest.size();
+            const bool ended =
+                at_ == bytes_.size() || bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
+            if (!isNumber || !ended)
+                fail("expected a number," + where());
+            return value;
+        }
+        const std::size_t size = plyBytes(type);
+        if (bytes_.size() - at_ < size)
+            fail("it ends early," + where());
+        std::uint64_t bits = 0;
+        for (std::size_t i = 0; i < size; ++i) {
+            const std::size_t shift = format_ == Format::LittleEndian ? i : size - 1 - i;
+            bits |= static_cast<std::uint64_t>(static_cast<unsigned char>(bytes_[at_ + i])) << (8 * shift);
+        }
+        at_ += size;
+        switch (type) {
+        case PlyType::Int8: return static_cast<std::int8_t>(bits);
+        case PlyType::Int16: return static_cast<std::int16_t>(bits);
+        case PlyType::Int32: return static_cast<std::int32_t>(bits);
+        case PlyType::Float32: {
+            const std::uint32_t low = static_cast<std::uint32_t>(bits);
+            float value;
+            std::memcpy(&value, &low, sizeof value);
+            return static_cast<double>(value);
+        }
+        case PlyType::Float64: {
+            double value;
+            std::memcpy(&value, &bits, sizeof value);
+            return value;
+        }
+        default: return static_cast<double>(bits);
+        }
+    }
+
+    void setBytes(std::string_view bytes)
+    {
+        bytes_ = bytes;
+        at_ = 0;
+    }
+
+private:
+    enum class Format { Ascii, LittleEndian, BigEndian };
+
+    [[noreturn]] void fail(const std::string& why) const { throw std::runtime_error(name_ + ": " + why); }
+
+    std::vector<std::string> headerLine()
+    {
+        const std::size_t end = bytes_.find('\n', at_);
+        if (end == std::string_view::npos)
+            fail("the header ends without end_header");
+        std::istringstream line{std::string(bytes_.substr(at_, end - at_))};
+        at_ = end + 1;
+        std::vector<std::string> words;
+        for (std::string word; line >> word;)
+            words.push_back(word);
+        return words;
     }
 
     void checkElements() const
@@ -181,98 +290,11 @@ private:
         fail("unknown type '" + word + "'");
     }
 
-    void readRow(const PlyElement& element, std::uint64_t row, Mesh& mesh, bool isVertex, bool isFace)
-    {
-        Vec3 p, color;
-        unsigned channels = 0; // a bit for each
-        for (const PlyProperty& property : element.properties) {
-            if (!property.isList) {
-                const double value = number(property.type, element, row);
-                if (isVertex && property.name.size() == 1 && property.name[0] >= 'x' && property.name[0] <= 'z')
-                    component(p, property.name[0] - 'x') = static_cast<float>(value);
-                if (isVertex && property.channel >= 0) {
-                    component(color, property.channel) = static_cast<float>(value / largestOf(property.type));
-                    channels |= 1u << property.channel;
-                }
-                continue;
-            }
-            const double count = number(property.countType, element, row);
-            if (!(count >= 0 && count <= static_cast<double>(bytes_.size() - at_)) || count != std::floor(count))
-                fail("it ends early, or has a bad list, in " + element.name + ' ' + std::to_string(row));
-            polygon_.clear();
-            for (std::int64_t i = 0; i < static_cast<std::int64_t>(count); ++i) {
-                const double index = number(property.type, element, row);
-                const bool canBe = index >= 0 && index < 4294967296.0 && index == std::floor(index);
-                polygon_.push_back(canBe ? static_cast<std::int64_t>(index) : -1);
-            }
-            if (isFace && isIndexList(property))
-                addPolygon(mesh, polygon_, [&] { return name_ + ": face " + std::to_string(row); });
-        }
-        if (isVertex)
-            addVertex(mesh, p, [&] { return name_ + ": vertex " + std::to_string(row); });
-        if (channels == 7)
-            mesh.colors.push_back(color);
-    }
-
     // Which value of a channel is all of it.
     static double largestOf(PlyType type)
     {
         static const std::array<double, 8> all{127, 255, 32767, 65535, 255, 255, 1, 1}; // wide integers as of bytes
         return all[static_cast<std::size_t>(type)];
-    }
-
-    void skipSpace()
-    {
-        while (at_ < bytes_.size() && (bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r')))
-            ++at_;
-    }
-
-    double number(PlyType type, const PlyElement& element, std::uint64_t row)
-    {
-        const auto where = [&] {
-            return " in " + element.name + ' ' + std::to_string(row) + " of " + std::to_string(element.count);
-        };
-        if (format_ == Format::Ascii) {
-            skipSpace();
-            if (at_ == bytes_.size())
-                fail("it ends early," + where());
-            double value = 0;
-            std::string_view rest = bytes_.substr(at_);
-            const bool isNumber = takeNumber(rest, value);
-            at_ = bytes_.size() - rest.size();
-            const bool ended =
-                at_ == bytes_.size() || bytes_[at_] == ' ' || (bytes_[at_] >= '\t' && bytes_[at_] <= '\r');
-            if (!isNumber || !ended)
-                fail("expected a number," + where());
-            return value;
-        }
-        static const std::array<std::size_t, 8> sizes{1, 1, 2, 2, 4, 4, 4, 8};
-        const std::size_t size = sizes[static_cast<std::size_t>(type)];
-        if (bytes_.size() - at_ < size)
-            fail("it ends early," + where());
-        std::uint64_t bits = 0;
-        for (std::size_t i = 0; i < size; ++i) {
-            const std::size_t shift = format_ == Format::LittleEndian ? i : size - 1 - i;
-            bits |= static_cast<std::uint64_t>(static_cast<unsigned char>(bytes_[at_ + i])) << (8 * shift);
-        }
-        at_ += size;
-        switch (type) {
-        case PlyType::Int8: return static_cast<std::int8_t>(bits);
-        case PlyType::Int16: return static_cast<std::int16_t>(bits);
-        case PlyType::Int32: return static_cast<std::int32_t>(bits);
-        case PlyType::Float32: {
-            const std::uint32_t low = static_cast<std::uint32_t>(bits);
-            float value;
-            std::memcpy(&value, &low, sizeof value);
-            return static_cast<double>(value);
-        }
-        case PlyType::Float64: {
-            double value;
-            std::memcpy(&value, &bits, sizeof value);
-            return value;
-        }
-        default: return static_cast<double>(bits);
-        }
     }
 
     std::string_view bytes_;
@@ -281,6 +303,7 @@ private:
     std::size_t at_ = 0;
     Format format_ = Format::Ascii;
     std::vector<PlyElement> elements_;
+    std::uint64_t vertexCount_ = 0;
     std::vector<std::int64_t> polygon_;
 };
 

@@ -268,8 +268,9 @@ private:
 
     void load()
     {
-        const Loaders loaders(fb_->rank(), fb_->size(),
-                              [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); });
+        const Loaders loaders(
+            fb_->rank(), fb_->size(), [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); },
+            [this](const std::vector<std::int64_t>& values) { return fb_->allReduce(values, Reduce::Sum); });
         scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
         bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
     }

@@ -2,10 +2,15 @@
 #pragma once
 
 #include "auto_look.hpp"
+#include "brick_exchange.hpp"
 #include "content_cut.hpp"
 #include "generated.hpp"
 #include "options.hpp"
 #include "renderer.hpp"
+#include "scene_files.hpp"
+
+#include <algorithm>
+#include <iterator>
 
 namespace example {
 
@@ -38,8 +43,14 @@ inline Scene makeScene(const Options& options, int brickCount, const Loaders& lo
     if (options.scene.front() == "demo")
         return demoScene(options.seed, look);
     Scene scene;
+    const auto vec = [](const std::array<float, 3>& v) { return Vec3{v[0], v[1], v[2]}; };
+    VoxelGrid grid;
+    if (options.spacing)
+        grid.spacing = vec(*options.spacing);
+    if (options.origin)
+        grid.origin = vec(*options.origin);
     for (const SceneFile& file : options.files)
-        addFile(scene, file.path, options.fit, options.xyzFrame, loaders, file.look,
+        addFile(scene, file, options.fit, options.xyzFrame, loaders, grid,
                 [&](const VolumeSource& source) { return lookOf(source, file.look, loaders); });
     return scene;
 }
@@ -81,7 +92,7 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const int rank = loaders.rank(), rankCount = loaders.size();
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
-    const Scene scene = makeScene(options, sceneBricks, loaders);
+    Scene scene = makeScene(options, sceneBricks, loaders);
     const RenderSettings settings = renderSettings(options);
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
     if (scene.volumes.empty())
@@ -97,15 +108,23 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
     frameCamera(result.info, settings, 0); // throws if there is none
     const float ghosts = ghostReach(result.info, settings);
     std::vector<Box> cells{scene.bounds};
-    if (!isImage)
-        cells = cutsByContent(options, scene)
-                    ? loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
-                          return loaders.rank() > 0
-                                     ? std::vector<Box>()
-                                     : ContentCut(scene, result.info, settings).cells(brickCount * options.interleave);
-                      })
-                    : cutScene(scene, brickCount * options.interleave);
+    if (!isImage && cutsByContent(options, scene)) {
+        const ContentCut cut(scene, result.info, settings, loaders);
+        cells = loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
+            return rank > 0 ? std::vector<Box>() : cut.cells(brickCount * options.interleave);
+        });
+    } else if (!isImage) {
+        cells = cutScene(scene, brickCount * options.interleave);
+    }
     const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
+    std::vector<Holders> holders;
+    std::vector<Box> reaches;
+    for (std::size_t c = 0; c < cells.size(); ++c) {
+        const int brick = static_cast<int>(c) % brickCount;
+        holders.push_back(isImage ? Holders{0, rankCount} : Holders{rankOfBrick(brick, brickCount, rankCount), copies});
+        reaches.push_back(reachOf(scene, cells[c], ghosts));
+    }
+    std::vector<CellSurfaces> surfaces = exchangeBricks(scene, holders, reaches, loaders);
     for (int brick = 0; brick < brickCount; ++brick) {
         Box bounds;
         for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
@@ -118,8 +137,13 @@ inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
         result.brickIds.push_back(id);
         result.renderers.emplace_back();
         for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
-             c += static_cast<std::size_t>(brickCount))
-            result.renderers.back().emplace_back(loadBrick(scene, id, cells[c], ghosts), result.info, settings);
+             c += static_cast<std::size_t>(brickCount)) {
+            Brick loaded = loadBrick(scene, id, cells[c], ghosts);
+            std::move(surfaces[c].meshes.begin(), surfaces[c].meshes.end(), std::back_inserter(loaded.meshes));
+            std::move(surfaces[c].spheres.begin(), surfaces[c].spheres.end(), std::back_inserter(loaded.spheres));
+            surfaces[c] = CellSurfaces();
+            result.renderers.back().emplace_back(std::move(loaded), result.info, settings);
+        }
     }
     return result;
 }

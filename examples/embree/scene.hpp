@@ -1,16 +1,14 @@
 // Scene: what there is to render, and the bricks that it is cut into.
 //
-// World space: each file is scaled and centred to fill the unit cube, unless told not to. A brick is a half-open
-// cell of the scene's bounds with all that can be seen in it: the voxels (with ghosts), and each primitive that
-// touches it, under its index in the whole scene. Cells are a pure function of the bounds and their number, so every
-// rank knows all of them, and two cells that share a face have the same number for it.
+// World space: each file is scaled and centred to fill the unit cube, unless told not to. Cells are a pure function of
+// the bounds and their number, so every rank knows all of them, and two cells that share a face have the same number
+// for it.
 #pragma once
 
 #include "clip.hpp"
 #include "file_look.hpp"
 #include "loaders.hpp"
-#include "obj.hpp"
-#include "ply.hpp"
+#include "mesh_share.hpp"
 #include "spheres.hpp"
 #include "volume.hpp"
 
@@ -26,18 +24,24 @@ namespace example {
 // itself, with z backwards.
 struct VolumeObject {
     VolumeSource source;
-    Placement placement;
+    Placement placement;        // of voxels by their index
     Box shown;                  // in voxels; what is outside is clipped away
     std::uint32_t geometry = 0; // if it has isosurfaces
 
-    // Throws std::runtime_error, which names the file, if nothing of it is left. It cannot be rotated.
+    // Throws std::runtime_error, which names the file, if floats have too few digits to tell the volume's voxels apart,
+    // or nothing of it is left. It cannot be rotated.
     VolumeObject(VolumeSource volume, bool fit, const FileLook& look = {}) : source(std::move(volume))
     {
         const Index3& d = source.info.dims;
+        const Vec3 &origin = source.info.origin, &spacing = source.info.spacing;
         const Vec3 last{static_cast<float>(d[0] - 1), static_cast<float>(d[1] - 1), static_cast<float>(d[2] - 1)};
         shown.lo = {0, 0, 0};
         shown.hi = last;
-        placement = fitToUnitCube(bounds(), fit);
+        placement.scale = spacing;
+        placement.offset = fit ? Vec3() : origin; // it is centred
+        const Placement fitted = fitToUnitCube(bounds(), fit);
+        placement.offset = fitted.toWorld(placement.offset);
+        placement.scale = placement.scale * fitted.size();
         const Vec3 sum = bounds().lo + bounds().hi;
         placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
         placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
@@ -46,12 +50,27 @@ struct VolumeObject {
             placement.scale = placement.scale * look.scale;
             placement.offset = center + (placement.offset - center) * look.scale + look.translate;
         }
-        if (look.clip) {
-            shown = intersection(shown, *look.clip);
-            if (!(shown.lo.x < shown.hi.x && shown.lo.y < shown.hi.y && shown.lo.z < shown.hi.z))
-                throw std::runtime_error(source.name + ": the clip box leaves nothing of it; it goes from 0,0,0 to "
-                                         + textOf(last));
+        for (int axis = 0; axis < 3; ++axis)
+            if (!(std::max(std::fabs(component(bounds().lo, axis)), std::fabs(component(bounds().hi, axis)))
+                  <= 131072 * std::fabs(component(placement.scale, axis)))) // what addVolume() allows for rounding
+                throw std::runtime_error(source.name + ": its voxels are too small beside "
+                                         + (fit ? "its extent" : "the distance from 0 to its end")
+                                         + ", which can be 131072 of their sides at most");
+        if (!look.clip)
+            return;
+        const Placement inFile{spacing, origin};
+        Box part;
+        for (int axis = 0; axis < 3; ++axis) {
+            const auto voxel = [&](const Vec3& p) {
+                return (component(p, axis) - component(origin, axis)) / component(spacing, axis);
+            };
+            component(part.lo, axis) = voxel(look.clip->lo);
+            component(part.hi, axis) = voxel(look.clip->hi);
         }
+        shown = intersection(shown, part);
+        if (!(shown.lo.x < shown.hi.x && shown.lo.y < shown.hi.y && shown.lo.z < shown.hi.z))
+            throw std::runtime_error(source.name + ": the clip box leaves nothing of it; it goes from "
+                                     + textOf(inFile.toWorld({0, 0, 0})) + " to " + textOf(inFile.toWorld(last)));
     }
 
     // What is shown of the domain, which is between the centres of the outer voxels.
@@ -64,6 +83,7 @@ struct VolumeObject {
     }
 };
 
+// A mesh, or a run of its triangles where several ranks have loaded it together.
 struct MeshObject {
     std::uint32_t geometry = 0; // number among the meshes and sphere sets of the scene
     Mesh mesh;                  // in world space
@@ -71,6 +91,8 @@ struct MeshObject {
     Vec3 color;                   // where vertices have none of their own
     std::optional<float> opacity; // none: that of the run
     std::optional<Clip> clip;
+    std::uint32_t firstPrimitive = 0; // number of the first triangle in the whole mesh
+    bool isPart = false;              // the other ranks have the rest
 };
 
 struct SphereObject {
@@ -78,6 +100,8 @@ struct SphereObject {
     std::vector<Sphere> spheres; // in world space
     std::optional<float> opacity;
     std::optional<Clip> clip;
+    std::uint32_t firstPrimitive = 0;
+    bool isPart = false;
 };
 
 struct Scene {
@@ -96,7 +120,7 @@ struct Scene {
             object.geometry = nextGeometry_++;
         grow(object.bounds());
         const VisibleVoxels visible = object.source.visible ? *object.source.visible : visibleVoxels(object.source);
-        const float slack = static_cast<float>(visible.slack) * object.placement.size();
+        const float slack = static_cast<float>(visible.slack) * object.placement.largest();
         lookAt([&](const auto& take) {
             bool isEmpty = true;
             for (const Vec3& p : visible.points)
@@ -116,65 +140,59 @@ struct Scene {
     }
     void add(Mesh mesh, bool fit, const FileLook& look = {}, const std::string& name = {})
     {
-        Box box;
-        for (const Triangle& triangle : mesh.triangles) // a file may hold vertices that nothing uses
-            for (const std::uint32_t index : triangle)
-                box.grow(mesh.positions[index]);
-        const FileToWorld place(fitToUnitCube(box, fit), box, look);
-        static const Vec3 palette[] = {
-            {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
-        MeshObject object;
-        object.geometry = nextGeometry_++;
-        object.color = look.color.value_or(palette[meshes.size() % 4]);
-        object.opacity = look.opacity;
-        object.clip = clipOf(look, place);
-        if (look.color)
-            mesh.colors.clear();
-        const Box seen = lookAt([&](const auto& take) {
-            for (const Triangle& triangle : mesh.triangles)
-                if (!look.clip) {
-                    for (const std::uint32_t index : triangle)
-                        take(place.toWorld(mesh.positions[index]), 0);
-                } else {
-                    Box part;
-                    for (const std::uint32_t index : triangle)
-                        part.grow(mesh.positions[index]);
-                    takeCorners(intersection(part, *look.clip), place, take);
-                }
-        });
-        requireAnyOf(seen, name, box);
-        for (Vec3& p : mesh.positions)
-            p = place.toWorld(p);
+        MeshObject object = placed(mesh, fit, look, name);
+        object.normals = vertexNormals(mesh);
         object.mesh = std::move(mesh);
-        object.normals = vertexNormals(object.mesh);
-        grow(seen);
         meshes.push_back(std::move(object));
     }
     void add(std::vector<Sphere> set, bool fit, const FileLook& look = {}, const std::string& name = {})
     {
+        add(SphereShare{std::move(set), 0}, fit, {}, look, name);
+    }
+
+    // Collective: of a mesh, or of spheres, this rank's share. They throw the same on all ranks.
+    void add(MeshShare share, bool fit, const Loaders& loaders, const FileLook& look = {}, const std::string& name = {})
+    {
+        const std::vector<std::uint32_t> vertices = verticesOf(share);
+        const VertexLookup lookup(vertices, share.vertexBegins, loaders);
+        MeshPart part = partOf(share, lookup, vertices);
+        MeshObject object = placed(part.mesh, fit, look, name, loaders);
+        object.normals = normalsOf(part, share.vertexBegins, lookup, loaders);
+        object.firstPrimitive = part.firstTriangle;
+        object.isPart = loaders.size() > 1;
+        object.mesh = std::move(part.mesh);
+        meshes.push_back(std::move(object));
+    }
+    void add(SphereShare share, bool fit, const Loaders& loaders, const FileLook& look = {},
+             const std::string& name = {})
+    {
         Box box;
-        for (const Sphere& sphere : set)
+        for (const Sphere& sphere : share.spheres)
             box.grow(sphere.center, sphere.radius);
+        box = unionOf(box, loaders);
         const FileToWorld place(fitToUnitCube(box, fit), box, look);
-        const Box seen = lookAt([&](const auto& take) {
-            for (const Sphere& sphere : set)
-                if (!look.clip) {
-                    take(place.toWorld(sphere.center), sphere.radius * place.size());
-                } else {
-                    Box part;
-                    part.grow(sphere.center, sphere.radius);
-                    takeCorners(intersection(part, *look.clip), place, take);
-                }
-        });
+        const Box seen = lookAt(
+            [&](const auto& take) {
+                for (const Sphere& sphere : share.spheres)
+                    if (!look.clip) {
+                        take(place.toWorld(sphere.center), sphere.radius * place.size());
+                    } else {
+                        Box part;
+                        part.grow(sphere.center, sphere.radius);
+                        takeCorners(intersection(part, *look.clip), place, take);
+                    }
+            },
+            loaders);
         requireAnyOf(seen, name, box);
-        for (Sphere& sphere : set) {
+        for (Sphere& sphere : share.spheres) {
             sphere.center = place.toWorld(sphere.center);
             sphere.radius *= place.size();
             if (look.color)
                 sphere.color = *look.color;
         }
         grow(seen);
-        spheres.push_back({nextGeometry_++, std::move(set), look.opacity, clipOf(look, place)});
+        spheres.push_back({nextGeometry_++, std::move(share.spheres), look.opacity, clipOf(look, place),
+                           static_cast<std::uint32_t>(share.first), loaders.size() > 1});
     }
 
     // The visible part of the scene, for the camera.
@@ -187,10 +205,65 @@ struct Scene {
     }
 
 private:
+    // Of what the triangles use: a file may hold vertices that nothing does.
+    static Box boxOf(const Mesh& mesh)
+    {
+        Box box;
+        for (const Triangle& triangle : mesh.triangles)
+            for (const std::uint32_t index : triangle)
+                box.grow(mesh.positions[index]);
+        return box;
+    }
+    // Collective.
+    static Box unionOf(const Box& own, const Loaders& loaders)
+    {
+        Box all;
+        for (const Box& box : loaders.gatherOf<Box>([&] { return std::vector<Box>{own}; }))
+            all.grow(box);
+        return all;
+    }
+
+    // Collective: brings a mesh, or this rank's part of one, from its file's coordinates to the world, where the camera
+    // is to see it. Of the result only mesh, normals and number are missing.
+    MeshObject placed(Mesh& mesh, bool fit, const FileLook& look, const std::string& name, const Loaders& loaders = {})
+    {
+        static const Vec3 palette[] = {
+            {0.72f, 0.50f, 0.22f}, {0.16f, 0.42f, 0.62f}, {0.26f, 0.52f, 0.22f}, {0.62f, 0.20f, 0.18f}};
+        const Box box = unionOf(boxOf(mesh), loaders);
+        const FileToWorld place(fitToUnitCube(box, fit), box, look);
+        MeshObject object;
+        object.geometry = nextGeometry_++;
+        object.color = look.color.value_or(palette[meshes.size() % 4]);
+        object.opacity = look.opacity;
+        object.clip = clipOf(look, place);
+        if (look.color)
+            mesh.colors.clear();
+        const Box seen = lookAt(
+            [&](const auto& take) {
+                for (const Triangle& triangle : mesh.triangles)
+                    if (!look.clip) {
+                        for (const std::uint32_t index : triangle)
+                            take(place.toWorld(mesh.positions[index]), 0);
+                    } else {
+                        Box part;
+                        for (const std::uint32_t index : triangle)
+                            part.grow(mesh.positions[index]);
+                        takeCorners(intersection(part, *look.clip), place, take);
+                    }
+            },
+            loaders);
+        requireAnyOf(seen, name, box);
+        for (Vec3& p : mesh.positions)
+            p = place.toWorld(p);
+        grow(seen);
+        return object;
+    }
+
     // `mayBeEmpty`: nothing was seen at a glance.
     void noteOn(const VolumeSource& source, bool mayBeEmpty)
     {
         const VolumeInfo& info = source.info;
+        notes.insert(notes.end(), source.notes.begin(), source.notes.end());
         if (info.notFinite > 0)
             notes.push_back(source.name + ": voxels that are not finite: " + std::to_string(info.notFinite)
                             + "; they count as " + textOf(info.minimum));
@@ -221,15 +294,19 @@ private:
                  0);
     }
 
-    // `forEach` calls its argument with the centre and radius of all spheres of one object. Returns the box of these.
+    // `forEach` calls its argument with the centre and radius of all spheres of one object, or on each rank of its
+    // part. Returns the box of these. Collective over the loaders.
     template <class ForEach>
-    Box lookAt(const ForEach& forEach)
+    Box lookAt(const ForEach& forEach, const Loaders& loaders = {})
     {
         Box box;
         forEach([&](const Vec3& center, float radius) { box.grow(center, radius); });
+        box = unionOf(box, loaders);
         const Vec3 middle = box.center();
         float reach = 0;
         forEach([&](const Vec3& center, float radius) { reach = std::max(reach, length(center - middle) + radius); });
+        for (const float other : loaders.gatherOf<float>([&] { return std::vector<float>{reach}; }))
+            reach = std::max(reach, other);
         if (!box.empty()) {
             seen_.grow(box);
             balls_.emplace_back(middle, reach);
@@ -251,40 +328,6 @@ private:
     std::vector<std::pair<Vec3, float>> balls_; // of each object, around all there is to see of it
     std::uint32_t nextGeometry_ = 0;
 };
-
-// Collective: adds a file, by its ending. Of a volume a rank reads its bricks later, in loadBrick(), and here its share
-// of what all must know. A mesh or a set of spheres is read and parsed by rank 0 alone, which sends it to the others:
-// texts cannot be cut into parts, and many ranks that read one file at once slow each other down. Each rank has the
-// whole of it until its bricks are loaded. `xyzFrame` as for parseXyz(), `lookOf` as for openVolume(). Throws
-// std::runtime_error that names the file, the same on all ranks.
-inline void addFile(Scene& scene, const std::string& path, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
-                    const FileLook& look = {}, const LookOf& lookOf = {})
-{
-    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
-    const auto bytes = [&] {
-        std::string all = readFile(path);
-        *loaders.readCounter() += all.size();
-        return all;
-    };
-    const auto parsed = [&](auto kind, const auto& parse) {
-        Notes notes;
-        auto object = loaders.fromFirst<decltype(kind)>([&] { return parse(&notes); });
-        for (std::string& note : loaders.linesOfFirst(notes))
-            scene.notes.push_back(std::move(note));
-        return object;
-    };
-    if (ending == ".raw")
-        scene.add(openVolume(path, loaders, lookOf), fit, look);
-    else if (ending == ".ply")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parsePly(bytes(), path, notes); }), fit, look, path);
-    else if (ending == ".obj")
-        scene.add(parsed(Mesh(), [&](Notes* notes) { return parseObj(bytes(), path, notes); }), fit, look, path);
-    else if (ending == ".xyz")
-        scene.add(parsed(std::vector<Sphere>(), [&](Notes* notes) { return parseXyz(bytes(), path, xyzFrame, notes); }),
-                  fit, look, path);
-    else
-        throw std::runtime_error(path + ": unknown type '" + ending + "', expected .raw, .ply, .obj or .xyz");
-}
 
 // ---- cutting ---------------------------------------------------------------------------------------------------
 
@@ -354,144 +397,6 @@ inline std::vector<Box> cutScene(const Scene& scene, int count)
 inline int rankOfBrick(int brick, int brickCount, int rankCount)
 {
     return static_cast<int>(static_cast<std::int64_t>(brick) * rankCount / brickCount);
-}
-
-// ---- bricks ----------------------------------------------------------------------------------------------------
-
-struct BrickVolume {
-    VoxelBlock block;
-    Placement placement;
-    VolumeLook look;
-    Box shown; // in voxels
-    std::uint32_t geometry = 0;
-};
-
-struct BrickMesh {
-    std::uint32_t geometry = 0;
-    Mesh mesh;
-    std::vector<Vec3> normals;
-    std::vector<std::uint32_t> primitives; // index of each triangle in the whole mesh
-    Vec3 color;
-    std::optional<float> opacity; // none: that of the run
-    std::optional<Clip> clip;
-};
-
-struct BrickSpheres {
-    std::uint32_t geometry = 0;
-    std::vector<Sphere> spheres;
-    std::vector<std::uint32_t> primitives;
-    std::optional<float> opacity;
-    std::optional<Clip> clip;
-};
-
-struct Brick {
-    std::uint32_t id = 0;
-    Box cell; // half-open
-    std::vector<BrickVolume> volumes;
-    std::vector<BrickMesh> meshes;
-    std::vector<BrickSpheres> spheres;
-};
-
-namespace detail {
-
-inline void addVolume(Brick& brick, const VolumeObject& object)
-{
-    const Box part = intersection(brick.cell, object.bounds().padded(1e-5f * object.bounds().largestExtent()));
-    if (part.empty())
-        return;
-    Index3 lo, hi;
-    for (int i = 0; i < 3; ++i) {
-        const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
-        const std::size_t axis = static_cast<std::size_t>(i);
-        const float low = component(part.lo, i), high = component(part.hi, i);
-        const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
-        const int last = object.source.info.dims[axis] - 1;
-        // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
-        const auto voxel = [&](float world, float slack) {
-            return static_cast<int>(
-                std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
-        };
-        lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
-        hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
-    }
-    brick.volumes.push_back(
-        {VoxelBlock(object.source, lo, hi), object.placement, object.source.look, object.shown, object.geometry});
-}
-
-inline void addMesh(Brick& brick, const MeshObject& object, const Box& reach)
-{
-    BrickMesh part;
-    const std::uint32_t none = ~std::uint32_t{0};
-    std::vector<std::uint32_t> newIndex(object.mesh.positions.size(), none);
-    for (std::size_t i = 0; i < object.mesh.triangles.size(); ++i) {
-        const Triangle& triangle = object.mesh.triangles[i];
-        Box box;
-        for (const std::uint32_t index : triangle)
-            box.grow(object.mesh.positions[index]);
-        if (!box.overlaps(reach))
-            continue;
-        Triangle renamed;
-        for (std::size_t k = 0; k < 3; ++k) {
-            std::uint32_t& index = newIndex[triangle[k]];
-            if (index == none) {
-                index = static_cast<std::uint32_t>(part.mesh.positions.size());
-                part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
-                part.normals.push_back(object.normals[triangle[k]]);
-                if (!object.mesh.colors.empty())
-                    part.mesh.colors.push_back(object.mesh.colors[triangle[k]]);
-            }
-            renamed[k] = index;
-        }
-        part.mesh.triangles.push_back(renamed);
-        part.primitives.push_back(static_cast<std::uint32_t>(i));
-    }
-    part.geometry = object.geometry;
-    part.color = object.color;
-    part.opacity = object.opacity;
-    part.clip = object.clip;
-    if (!part.primitives.empty())
-        brick.meshes.push_back(std::move(part));
-}
-
-inline void addSpheres(Brick& brick, const SphereObject& object, const Box& reach)
-{
-    BrickSpheres part;
-    part.geometry = object.geometry;
-    part.opacity = object.opacity;
-    part.clip = object.clip;
-    for (std::size_t i = 0; i < object.spheres.size(); ++i) {
-        Box box;
-        box.grow(object.spheres[i].center, object.spheres[i].radius);
-        if (box.overlaps(reach)) {
-            part.spheres.push_back(object.spheres[i]);
-            part.primitives.push_back(static_cast<std::uint32_t>(i));
-        }
-    }
-    if (!part.primitives.empty())
-        brick.spheres.push_back(std::move(part));
-}
-
-} // namespace detail
-
-// Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
-// the scene itself can go when all bricks are loaded. Meshes and spheres are kept up to `ghosts` beyond the cell, for
-// secondary rays.
-inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
-{
-    Brick brick;
-    brick.id = id;
-    brick.cell = cell;
-    // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
-    const Box reach = cell.padded(
-        ghosts
-        + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
-    for (const VolumeObject& object : scene.volumes)
-        detail::addVolume(brick, object);
-    for (const MeshObject& object : scene.meshes)
-        detail::addMesh(brick, object, reach);
-    for (const SphereObject& object : scene.spheres)
-        detail::addSpheres(brick, object, reach);
-    return brick;
 }
 
 } // namespace example

@@ -4,7 +4,7 @@
 // so that it does not depend on what else is in the brick.
 #pragma once
 
-#include "scene.hpp"
+#include "bricks.hpp"
 #include "shading.hpp"
 
 #if __has_include(<embree4/rtcore.h>)

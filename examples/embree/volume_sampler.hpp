@@ -2,7 +2,7 @@
 // nothing. All coordinates are voxel indices in the whole volume, so that neighbouring bricks compute the same bits.
 #pragma once
 
-#include "scene.hpp"
+#include "bricks.hpp"
 #include "shading.hpp"
 
 namespace example {
@@ -14,11 +14,7 @@ class VolumeSampler {
     template <class Function>
     auto dispatch(Function&& function) const
     {
-        switch (info().type) {
-        case VoxelType::UInt8: return function(volume_.block.data<std::uint8_t>());
-        case VoxelType::UInt16: return function(volume_.block.data<std::uint16_t>());
-        default: return function(volume_.block.data<float>());
-        }
+        return withVoxelType(info().type, [&](auto voxel) { return function(volume_.block.data<decltype(voxel)>()); });
     }
 
 public:
@@ -28,12 +24,12 @@ public:
                                                     1 / volume_.placement.scale.z},
           shift_{-volume_.placement.offset.x * inverseScale_.x, -volume_.placement.offset.y * inverseScale_.y,
                  -volume_.placement.offset.z * inverseScale_.z},
-          transferFunction_(256 * step / volume_.placement.size() / static_cast<float>(largestIndex()),
-                            volume_.look.points),
-          valueScale_(volume_.look.scale())
+          transferFunction_(stepIn256ths(step), volume_.look.points), valueScale_(volume_.look.scale())
     {
         for (int i = 0; i < 3; ++i)
-            component(slopeScale_, i) = std::copysign(0.5f * valueScale_, component(inverseScale_, i));
+            component(slopeScale_, i) = std::copysign(
+                0.5f * valueScale_ * (volume_.placement.size() / std::fabs(component(volume_.placement.scale, i))),
+                component(inverseScale_, i));
         dispatch([this](const auto* voxels) { buildSkipGrid(voxels); });
     }
 
@@ -125,7 +121,15 @@ private:
     static_assert(cellWidth == skipWidth);
 
     float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
-    int largestIndex() const { return std::max({info().dims[0], info().dims[1], info().dims[2]}) - 1; }
+    // In units of 1/256 of the volume's largest extent.
+    float stepIn256ths(float step) const
+    {
+        int largest = 0;
+        const auto side = [this](int axis) { return std::fabs(component(volume_.placement.scale, axis)); };
+        for (const int axis : {1, 2})
+            largest = last(axis) * side(axis) > last(largest) * side(largest) ? axis : largest;
+        return 256 * step / side(largest) / last(largest);
+    }
 
     static float lerp(float a, float b, float f) { return mulAdd(f, b - a, a); }
 
@@ -268,7 +272,8 @@ private:
     Vec3 shift_;
     TransferFunction transferFunction_;
     float valueScale_;
-    Vec3 slopeScale_;           // from differences of voxels to a gradient along the world's axes, in values per voxel
+    // From differences of voxels to a gradient along the world's axes, in values per least side of a voxel.
+    Vec3 slopeScale_;
     Index3 cells0_{}, cells_{}; // first cell and number of cells
     std::vector<std::uint8_t> distances_;
 };

@@ -2,7 +2,8 @@
 #include "support.hpp"
 #include "together.hpp"
 
-#include <scene.hpp>
+#include <bricks.hpp>
+#include <scene_files.hpp>
 
 #include <cmath>
 #include <cstring>
@@ -41,8 +42,6 @@ std::string describe(const VolumeSource& source)
     return text;
 }
 
-const char* const plainObj = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\nf 1 2 3\nf 1 2 4\n";
-
 } // namespace
 
 TEST_CASE("Shares are equal runs that are all of it", "[loading]")
@@ -52,7 +51,7 @@ TEST_CASE("Shares are equal runs that are all of it", "[loading]")
              {std::uint64_t{0}, std::uint64_t{1}, std::uint64_t{5}, std::uint64_t{7000}, std::uint64_t{1} << 60}) {
             std::uint64_t next = 0;
             for (int rank = 0; rank < size; ++rank) {
-                const auto [begin, end] = Loaders(rank, size, {}).shareOf(count);
+                const auto [begin, end] = Loaders::shareOf(count, rank, size);
                 CHECK(begin == next);
                 CHECK(end - begin >= count / static_cast<std::uint64_t>(size));
                 CHECK(end - begin <= count / static_cast<std::uint64_t>(size) + 1);
@@ -120,41 +119,6 @@ TEST_CASE("A volume is the same for any number of ranks, and none reads more tha
     }
 }
 
-TEST_CASE("Meshes and spheres are read by one rank alone", "[loading]")
-{
-    const test::TemporaryFolder folder;
-    std::string atoms = "160000\n\n";
-    for (int i = 0; i < 160000; ++i) // of more than one message
-        atoms += (i % 3 == 0 ? "C " : "O ") + std::to_string(i % 1009) + ' ' + std::to_string(i % 887) + " 0.5\n";
-    const std::vector<std::string> files{folder.write("m.obj", plainObj), folder.write("s.xyz", atoms)};
-    Scene alone;
-    for (const std::string& file : files)
-        addFile(alone, file, true);
-    for (const int ranks : {2, 3}) {
-        std::vector<std::uint64_t> read(static_cast<std::size_t>(ranks));
-        const auto scenes = ofRanks<Scene>(ranks, [&](const Loaders& loaders) {
-            Scene scene;
-            for (const std::string& file : files)
-                addFile(scene, file, true, 0, loaders);
-            read[static_cast<std::size_t>(loaders.rank())] = loaders.bytesRead();
-            return scene;
-        });
-        CHECK(read.front() == atoms.size() + std::string(plainObj).size());
-        CHECK(read.back() == 0);
-        for (const Scene& scene : scenes) {
-            REQUIRE(scene.meshes.size() == 1);
-            CHECK(scene.meshes[0].mesh.triangles == alone.meshes[0].mesh.triangles);
-            const auto same = [](const auto& a, const auto& b) {
-                return a.size() == b.size() && std::memcmp(a.data(), b.data(), a.size() * sizeof a[0]) == 0;
-            };
-            CHECK(same(scene.meshes[0].mesh.positions, alone.meshes[0].mesh.positions));
-            CHECK(same(scene.meshes[0].normals, alone.meshes[0].normals));
-            REQUIRE(scene.spheres.size() == 1);
-            CHECK(same(scene.spheres[0].spheres, alone.spheres[0].spheres));
-        }
-    }
-}
-
 TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
 {
     const test::TemporaryFolder folder;
@@ -172,7 +136,7 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
         for (const std::string& error : errors)
             CHECK(error == missing + ": cannot be opened");
     }
-    // Of a file that rank 0 alone reads.
+    // Of a file of primitives.
     const std::string mesh = folder.write("m.obj", "v 0 0 0\nf 1 2 3\n");
     for (const std::string& file : {mesh, folder / "none.ply", folder / "none.xyz"}) {
         const std::string alone = errorOf([&] {
@@ -188,6 +152,17 @@ TEST_CASE("What one rank cannot read is the same error on all", "[loading]")
              }))
             CHECK(error == alone);
     }
+    // Where the others have no such file rank 0 reads it alone.
+    const std::string tetrahedron = folder.write("t.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n");
+    for (const std::string& error : ofRanks<std::string>(3, [&](const Loaders& loaders) {
+             return errorOf([&] {
+                 Scene scene;
+                 addFile(scene, loaders.rank() == 0 ? tetrahedron : folder / "none.obj", true, 0, loaders);
+                 if (scene.bounds.empty() || scene.bounds.extent().x < 1)
+                     throw std::runtime_error("another scene");
+             });
+         }))
+        CHECK(error.empty());
     // No voxel is finite, on any rank.
     const std::vector<float> nan(24, std::numeric_limits<float>::quiet_NaN());
     const std::string none = folder.write("n_2x3x4_float32.raw", bytesOf(nan));

@@ -4,9 +4,9 @@
 
 #include <obj.hpp>
 #include <ply.hpp>
-#include <scene.hpp>
-#include <spheres.hpp>
-#include <volume.hpp>
+#include <scene_files.hpp>
+#include <voxel_block.hpp>
+#include <xyz.hpp>
 
 #include <cstdint>
 #include <cstring>
@@ -36,15 +36,18 @@ std::string bytesOf(const std::vector<T>& values)
 VolumeInfo describe(const std::string& name, const std::string& bytes)
 {
     std::istringstream stream(bytes);
-    return describeVolume(stream, name);
+    VolumeFile file = parseVolumeName(name);
+    return describeVolume(stream, file);
 }
 
 VolumeSource sourceOf(const std::string& name, const std::string& bytes)
 {
     VolumeSource source;
-    source.info = describe(name, bytes);
-    source.open = [name, bytes, info = source.info] {
-        return rowReader(std::make_shared<std::istringstream>(bytes), name, info);
+    std::istringstream stream(bytes);
+    VolumeFile file = parseVolumeName(name);
+    source.info = describeVolume(stream, file);
+    source.open = [bytes, file, info = source.info] {
+        return rowReader(std::make_shared<std::istringstream>(bytes), file, info);
     };
     return source;
 }
@@ -228,9 +231,12 @@ std::string replaced(std::string text, const std::string& from, const std::strin
 TEST_CASE("The name of a volume tells its dimensions and type", "[readers]")
 {
     CHECK(parseVolumeName("a_2x3x4_uint8.raw").dims == Index3{2, 3, 4});
-    CHECK(parseVolumeName("a_2x3x4_uint8.raw").type == VoxelType::UInt8);
-    CHECK(parseVolumeName("a_2x3x4_uint16.raw").type == VoxelType::UInt16);
-    CHECK(parseVolumeName("a_2x3x4_float32.raw").type == VoxelType::Float32);
+    for (const auto& [word, type] : fileTypes()) {
+        CHECK(parseVolumeName("a_2x3x4_" + word + ".raw").format.type == type);
+        CHECK_FALSE(parseVolumeName("a_2x3x4_" + word + ".raw").format.isBigEndian);
+        CHECK(parseVolumeName("a_2x3x4_" + word + "be.raw").format.type == type);
+        CHECK(parseVolumeName("a_2x3x4_" + word + "be.raw").format.isBigEndian);
+    }
     CHECK(parseVolumeName("/some_where/9x9x9_x/two_words_65536x2x100_float32.raw").dims == Index3{65536, 2, 100});
     CHECK(parseVolumeName("_2x2x2_uint8.raw").dims == Index3{2, 2, 2});
 
@@ -255,9 +261,10 @@ TEST_CASE("The name of a volume tells its dimensions and type", "[readers]")
                                    "a_xx_uint8.raw",
                                    "a_2x3x_uint8.raw",
                                    "a_2.5x3x4_uint8.raw",
-                                   "a_2x3x4_int8.raw",
-                                   "a_2x3x4_float64.raw",
+                                   "a_2x3x4_int64.raw",
+                                   "a_2x3x4_float16.raw",
                                    "a_2x3x4_UINT8.raw",
+                                   "a_2x3x4_be.raw",
                                    "a_2x3x4_.raw",
                                    "a_2x3x4_uint8_.raw"}) {
         INFO(name);
@@ -325,6 +332,7 @@ TEST_CASE("A part of a volume equals that part of the whole", "[readers]")
     checkBlocks<std::uint8_t>("uint8");
     checkBlocks<std::uint16_t>("uint16");
     checkBlocks<float>("float32");
+    checkBlocks<std::int16_t>("int16");
 }
 
 TEST_CASE("PLY: ASCII and binary, with all else in the file skipped", "[readers]")

@@ -4,6 +4,8 @@
 #include <loaders.hpp>
 
 #include <condition_variable>
+#include <cstdint>
+#include <cstring>
 #include <functional>
 #include <mutex>
 #include <thread>
@@ -47,7 +49,18 @@ inline void together(int size, const std::function<void(const example::Loaders&)
     for (int rank = 0; rank < size; ++rank)
         threads.emplace_back([&, rank] {
             const auto gather = [&, rank](const example::Loaders::Bytes& own) { return exchange.gather(rank, own); };
-            function(example::Loaders(rank, size, gather));
+            const auto sum = [&gather](const std::vector<std::int64_t>& values) {
+                const auto* first = reinterpret_cast<const std::byte*>(values.data());
+                std::vector<std::int64_t> sums(values.size());
+                for (const example::Loaders::Bytes& bytes : gather({first, first + values.size() * sizeof values[0]}))
+                    for (std::size_t i = 0; i < sums.size(); ++i) {
+                        std::int64_t value = 0;
+                        std::memcpy(&value, bytes.data() + i * sizeof value, sizeof value);
+                        sums[i] += value;
+                    }
+                return sums;
+            };
+            function(example::Loaders(rank, size, gather, sum));
         });
     for (std::thread& thread : threads)
         thread.join();

@@ -1,14 +1,14 @@
 // The readers of dfb_render: what they take is a mesh, atoms or a volume that the renderer can use, and is the same
 // when it is written and read once more; what they refuse is refused with std::runtime_error that begins with the name.
 //
-// An input: a byte that picks the reader and the frame, then the file; of a volume its name up to a line break before.
+// An input: a byte that picks the reader and the frame, then the file; of a volume without header its name up to a line
+// break before. A volume with a header has it and the voxels in one file.
 #include "fuzz.hpp"
 
+#include <bricks.hpp>
 #include <obj.hpp>
 #include <ply.hpp>
-#include <scene.hpp>
-#include <spheres.hpp>
-#include <volume.hpp>
+#include <xyz.hpp>
 
 #include <cmath>
 #include <sstream>
@@ -18,7 +18,7 @@ namespace {
 
 using namespace example;
 
-enum Reader : std::uint8_t { Ply, Obj, Xyz, Raw, readers };
+enum Reader : std::uint8_t { Ply, Obj, Xyz, Raw, Nrrd, Meta, readers };
 const std::string name = "the.file";
 
 std::string textOf(float value)
@@ -106,6 +106,31 @@ void checkSpheres(const std::vector<Sphere>& spheres)
     sceneWith(spheres);
 }
 
+void useVolume(VolumeSource& source, const VolumeFile& file, const std::string& bytes)
+{
+    const VolumeInfo& info = source.info;
+    const Index3& d = info.dims;
+    fuzz::require(d[0] >= 2 && d[1] >= 2 && d[2] >= 2
+                      && static_cast<std::size_t>(d[0]) * static_cast<std::size_t>(d[1])
+                                 * static_cast<std::size_t>(d[2]) * file.format.bytes()
+                             == bytes.size() - static_cast<std::size_t>(file.begin),
+                  "a volume has as many voxels as its name says");
+    fuzz::require(std::isfinite(info.minimum) && std::isfinite(info.maximum) && info.minimum < info.maximum,
+                  "the range of a volume is finite and not empty");
+    source.open = [&] { return rowReader(std::make_shared<std::istringstream>(bytes), file, info); };
+    const VoxelBlock block(source, {-1, -1, -1}, {d[0] + 2, d[1] + 2, d[2] + 2});
+    for (int z = -1; z < d[2] + 2; ++z)
+        for (int x = -1; x < d[0] + 2; ++x)
+            fuzz::require(info.type != VoxelType::Float32 || std::isfinite(block.data<float>()[block.index(x, 0, z)]),
+                          "voxels are finite");
+    try {
+        sceneWith(source);
+    } catch (const std::runtime_error&) { // of a spacing that floats are too coarse for
+        fuzz::require(info.spacing.x != info.spacing.y || info.spacing.x != info.spacing.z,
+                      "cubic voxels can be told apart");
+    }
+}
+
 void checkVolume(const std::string& bytes)
 {
     const std::size_t end = std::min(bytes.find('\n'), bytes.size());
@@ -113,29 +138,39 @@ void checkVolume(const std::string& bytes)
     if (file.find('\0') != std::string::npos)
         return; // no path can have it
     VolumeSource source;
+    VolumeFile described;
     try {
+        described = parseVolumeName(file);
         std::istringstream stream(voxels);
-        source.info = describeVolume(stream, file);
+        source.info = describeVolume(stream, described);
     } catch (const std::runtime_error& e) {
         fuzz::require(std::string(e.what()).compare(0, file.size() + 2, file + ": ") == 0, "the error names the file");
         return;
     }
-    const VolumeInfo& info = source.info;
-    const Index3& d = info.dims;
-    fuzz::require(d[0] >= 2 && d[1] >= 2 && d[2] >= 2
-                      && static_cast<std::size_t>(d[0]) * static_cast<std::size_t>(d[1])
-                                 * static_cast<std::size_t>(d[2]) * voxelBytes(info.type)
-                             == voxels.size(),
-                  "a volume has as many voxels as its name says");
-    fuzz::require(std::isfinite(info.minimum) && std::isfinite(info.maximum) && info.minimum < info.maximum,
-                  "the range of a volume is finite and not empty");
-    source.open = [&] { return rowReader(std::make_shared<std::istringstream>(voxels), file, info); };
-    const VoxelBlock block(source, {-1, -1, -1}, {d[0] + 2, d[1] + 2, d[2] + 2});
-    for (int z = -1; z < d[2] + 2; ++z)
-        for (int x = -1; x < d[0] + 2; ++x)
-            fuzz::require(info.type != VoxelType::Float32 || std::isfinite(block.data<float>()[block.index(x, 0, z)]),
-                          "voxels are finite");
-    sceneWith(source);
+    useVolume(source, described, voxels);
+}
+
+// Of a header whose voxels are behind it, or in another file, which is not looked for.
+void checkHeader(const std::string& bytes, VolumeFile (*parse)(std::istream&, const std::string&))
+{
+    VolumeSource source;
+    VolumeFile described;
+    try {
+        std::istringstream stream(bytes);
+        described = parse(stream, name);
+        fuzz::require(isUsable(described.spacing) && described.spacing.x > 0, "a spacing is usable");
+        if (described.data != name)
+            return;
+        std::istringstream whole(bytes);
+        source.info = describeVolume(whole, described);
+    } catch (const std::runtime_error& e) {
+        fuzz::require(std::string(e.what()).compare(0, name.size() + 2, name + ": ") == 0, "the error names the file");
+        return;
+    }
+    source.name = name;
+    for (const std::string& note : described.notes)
+        fuzz::require(note.compare(0, name.size() + 2, name + ": ") == 0, "a note names the file");
+    useVolume(source, described, bytes);
 }
 
 } // namespace
@@ -145,10 +180,12 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
     fuzz::Input in(data, size);
     const int pick = in.take<std::uint8_t>(), reader = pick % readers, frame = pick / readers % 4;
     const std::string bytes = in.rest();
-    if (reader == Raw) {
+    if (reader == Raw)
         checkVolume(bytes);
+    else if (reader == Nrrd || reader == Meta)
+        checkHeader(bytes, reader == Nrrd ? parseNrrd : parseMetaImage);
+    if (reader >= Raw)
         return 0;
-    }
     std::vector<Sphere> spheres;
     Mesh mesh;
     Notes notes;
@@ -236,6 +273,17 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("ply_tiny_far", Ply,
         header("ascii", plain) + "0 1e14 0\n1e-38 1e14 0\n1e-38 1e14 0\n0 1e14 0\n4 0 1 2 3\n3 3 1 0\n");
     add("ply_denormal", Ply, header("ascii", plain) + "0 0 0\n1e-42 0 0\n1e-42 1e-41 0\n0 0 0\n4 0 1 2 3\n3 3 1 0\n");
+    const std::string nrrd = "NRRD0004\n# a comment\ntype: short\ndimension: 3\nsizes: 2 2 2\nendian: big\n"
+                             "encoding: raw\nspace directions: (1,0,0) (0,1,0) (0,0,-2.5)\nspace origin: (1,2,3)\n"
+                             "key:=value\n\n";
+    add("nrrd", Nrrd, nrrd + "abcdefghijklmnop");
+    add("nrrd_detached", Nrrd,
+        "NRRD0001\r\ntype: double\r\ndimension: 3\r\nsizes: 2 2 2\r\nendian: little\r\nencoding: raw\r\n"
+        "spacings: 1 nan 2\r\nbyte skip: -1\r\ndata file: no.raw\r\n");
+    add("meta", Meta,
+        "ObjectType = Image\nNDims = 3\nDimSize = 2 2 2\nElementSpacing = 1 1 2\nOffset = 1 2 3\n"
+        "TransformMatrix = 1 0 0 0 0 1 0 -1 0\nElementByteOrderMSB = True\nElementType = MET_INT\n"
+        "ElementDataFile = LOCAL\nabcdefghijklmnopqrstuvwxyzABCDEF");
     add("raw_uint16", Raw, "a_2x2x2_uint16.raw\n" + shorts.bytes());
     add("raw_float32", Raw, "some/where_2x2x2_float32.raw\n" + floats.bytes());
     return all;

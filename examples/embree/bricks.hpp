@@ -1,0 +1,171 @@
+// Brick: a half-open cell of the scene's bounds with all that can be seen in it: the voxels (with ghosts), and each
+// primitive that touches it, under its index in the whole scene.
+#pragma once
+
+#include "scene.hpp"
+#include "voxel_block.hpp"
+
+#include <cstdint>
+#include <optional>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+struct BrickVolume {
+    VoxelBlock block;
+    Placement placement;
+    VolumeLook look;
+    Box shown; // in voxels
+    std::uint32_t geometry = 0;
+};
+
+struct BrickMesh {
+    std::uint32_t geometry = 0;
+    Mesh mesh;
+    std::vector<Vec3> normals;
+    std::vector<std::uint32_t> primitives; // index of each triangle in the whole mesh
+    Vec3 color;
+    std::optional<float> opacity; // none: that of the run
+    std::optional<Clip> clip;
+};
+
+struct BrickSpheres {
+    std::uint32_t geometry = 0;
+    std::vector<Sphere> spheres;
+    std::vector<std::uint32_t> primitives;
+    std::optional<float> opacity;
+    std::optional<Clip> clip;
+};
+
+struct Brick {
+    std::uint32_t id = 0;
+    Box cell; // half-open
+    std::vector<BrickVolume> volumes;
+    std::vector<BrickMesh> meshes;
+    std::vector<BrickSpheres> spheres;
+};
+
+namespace detail {
+
+inline void addVolume(Brick& brick, const VolumeObject& object)
+{
+    const Box part = intersection(brick.cell, object.bounds().padded(1e-5f * object.bounds().largestExtent()));
+    if (part.empty())
+        return;
+    Index3 lo, hi;
+    for (int i = 0; i < 3; ++i) {
+        const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
+        const std::size_t axis = static_cast<std::size_t>(i);
+        const float low = component(part.lo, i), high = component(part.hi, i);
+        const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
+        const int last = object.source.info.dims[axis] - 1;
+        // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
+        const auto voxel = [&](float world, float slack) {
+            return static_cast<int>(
+                std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
+        };
+        lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
+        hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
+    }
+    brick.volumes.push_back(
+        {VoxelBlock(object.source, lo, hi), object.placement, object.source.look, object.shown, object.geometry});
+}
+
+// A part of an object without its primitives.
+inline BrickMesh emptyPartOf(const MeshObject& object)
+{
+    BrickMesh part;
+    part.geometry = object.geometry;
+    part.color = object.color;
+    part.opacity = object.opacity;
+    part.clip = object.clip;
+    return part;
+}
+inline BrickSpheres emptyPartOf(const SphereObject& object)
+{
+    BrickSpheres part;
+    part.geometry = object.geometry;
+    part.opacity = object.opacity;
+    part.clip = object.clip;
+    return part;
+}
+
+inline void addMesh(std::vector<BrickMesh>& meshes, const MeshObject& object, const Box& reach)
+{
+    BrickMesh part = emptyPartOf(object);
+    const std::uint32_t none = ~std::uint32_t{0};
+    std::vector<std::uint32_t> newIndex(object.mesh.positions.size(), none);
+    for (std::size_t i = 0; i < object.mesh.triangles.size(); ++i) {
+        const Triangle& triangle = object.mesh.triangles[i];
+        Box box;
+        for (const std::uint32_t index : triangle)
+            box.grow(object.mesh.positions[index]);
+        if (!box.overlaps(reach))
+            continue;
+        Triangle renamed;
+        for (std::size_t k = 0; k < 3; ++k) {
+            std::uint32_t& index = newIndex[triangle[k]];
+            if (index == none) {
+                index = static_cast<std::uint32_t>(part.mesh.positions.size());
+                part.mesh.positions.push_back(object.mesh.positions[triangle[k]]);
+                part.normals.push_back(object.normals[triangle[k]]);
+                if (!object.mesh.colors.empty())
+                    part.mesh.colors.push_back(object.mesh.colors[triangle[k]]);
+            }
+            renamed[k] = index;
+        }
+        part.mesh.triangles.push_back(renamed);
+        part.primitives.push_back(object.firstPrimitive + static_cast<std::uint32_t>(i));
+    }
+    if (!part.primitives.empty())
+        meshes.push_back(std::move(part));
+}
+
+inline void addSpheres(std::vector<BrickSpheres>& spheres, const SphereObject& object, const Box& reach)
+{
+    BrickSpheres part = emptyPartOf(object);
+    for (std::size_t i = 0; i < object.spheres.size(); ++i) {
+        Box box;
+        box.grow(object.spheres[i].center, object.spheres[i].radius);
+        if (box.overlaps(reach)) {
+            part.spheres.push_back(object.spheres[i]);
+            part.primitives.push_back(object.firstPrimitive + static_cast<std::uint32_t>(i));
+        }
+    }
+    if (!part.primitives.empty())
+        spheres.push_back(std::move(part));
+}
+
+} // namespace detail
+
+// Up to where a brick holds primitives: by `ghosts` beyond its cell, for secondary rays.
+inline Box reachOf(const Scene& scene, const Box& cell, float ghosts)
+{
+    // More than the rounding of a hit point, so that a hit in the cell has its primitive in the brick.
+    return cell.padded(
+        ghosts
+        + 1e-5f * std::max(scene.bounds.largestExtent(), std::max(length(scene.bounds.lo), length(scene.bounds.hi))));
+}
+
+// Loads a rank's part of the scene for one cell. Volumes are read from their source here, and only as far as needed;
+// the scene itself can go when all bricks are loaded. Of meshes and spheres that several ranks have, exchangeBricks()
+// brings the rest.
+inline Brick loadBrick(const Scene& scene, std::uint32_t id, const Box& cell, float ghosts = 0)
+{
+    Brick brick;
+    brick.id = id;
+    brick.cell = cell;
+    const Box reach = reachOf(scene, cell, ghosts);
+    for (const VolumeObject& object : scene.volumes)
+        detail::addVolume(brick, object);
+    for (const MeshObject& object : scene.meshes)
+        if (!object.isPart)
+            detail::addMesh(brick.meshes, object, reach);
+    for (const SphereObject& object : scene.spheres)
+        if (!object.isPart)
+            detail::addSpheres(brick.spheres, object, reach);
+    return brick;
+}
+
+} // namespace example

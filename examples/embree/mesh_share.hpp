@@ -1,0 +1,260 @@
+// MeshShare: a rank's part of a mesh that several ranks have read together, as it is read: a run of the vertices and a
+// run of the triangles, whose vertices other ranks may have.
+//
+// MeshPart: the same triangles with all that they need: their vertices, and normals as of the whole mesh.
+#pragma once
+
+#include "loaders.hpp"
+#include "mesh.hpp"
+
+#include <algorithm>
+#include <cstdint>
+#include <optional>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+struct MeshShare {
+    Mesh mesh;                               // triangles have the numbers that vertices have in the whole mesh
+    std::vector<std::uint64_t> vertexBegins; // where the vertices of each rank begin in the whole mesh, and the end
+    std::uint64_t firstTriangle = 0;         // its number in the whole mesh
+};
+
+struct MeshPart {
+    Mesh mesh;
+    std::vector<std::uint32_t> vertices; // the number of each in the whole mesh, ascending
+    std::uint32_t firstTriangle = 0;
+};
+
+// Collective: shares of the mesh that rank 0 has; those of others are not looked at.
+inline MeshShare dealMesh(Mesh whole, const Loaders& loaders)
+{
+    const int ranks = loaders.size();
+    std::vector<Loaders::Bytes> parts(static_cast<std::size_t>(ranks) + 1);
+    const auto begins = [&](std::uint64_t count) {
+        std::vector<std::uint64_t> all;
+        for (int rank = 0; rank < ranks; ++rank)
+            all.push_back(Loaders::shareOf(count, rank, ranks).first);
+        all.push_back(count);
+        return all;
+    };
+    loaders.gatherOf<char>([&] {
+        const auto vertices = begins(whole.positions.size()), triangles = begins(whole.triangles.size());
+        for (std::size_t r = 0; r + 1 < parts.size() && loaders.rank() == 0; ++r) {
+            const auto pack = [&](const auto& array, const std::vector<std::uint64_t>& from) {
+                using T = typename std::decay_t<decltype(array)>::value_type;
+                const bool isThere = !array.empty();
+                Loaders::pack(std::vector<T>(array.begin() + static_cast<std::ptrdiff_t>(isThere ? from[r] : 0),
+                                             array.begin() + static_cast<std::ptrdiff_t>(isThere ? from[r + 1] : 0)),
+                              parts[r]);
+            };
+            pack(whole.positions, vertices);
+            pack(whole.colors, vertices);
+            pack(whole.triangles, triangles);
+        }
+        whole = Mesh();
+        return std::vector<char>();
+    });
+    const std::vector<Loaders::Bytes> received = loaders.exchange(std::move(parts));
+    MeshShare share;
+    const std::byte* at = received[0].data();
+    Loaders::unpack(at, share.mesh.positions);
+    Loaders::unpack(at, share.mesh.colors);
+    Loaders::unpack(at, share.mesh.triangles);
+    share.vertexBegins = loaders.beginsOf(share.mesh.positions.size());
+    share.firstTriangle = loaders.beginsOf(share.mesh.triangles.size())[static_cast<std::size_t>(loaders.rank())];
+    return share;
+}
+
+// Asks the ranks that have vertices for what they have of them, as often as one likes. Collective, all of it.
+class VertexLookup {
+public:
+    // `wanted`: ascending. `begins`: as MeshShare has them.
+    VertexLookup(const std::vector<std::uint32_t>& wanted, const std::vector<std::uint64_t>& begins,
+                 const Loaders& loaders)
+        : begins_(begins), loaders_(loaders)
+    {
+        std::vector<Loaders::Bytes> parts(begins.size());
+        auto from = wanted.begin();
+        for (std::size_t r = 0; r + 1 < begins.size(); ++r) {
+            const auto to = std::lower_bound(from, wanted.end(), begins[r + 1]);
+            Loaders::pack(std::vector<std::uint32_t>(from, to), parts[r]);
+            from = to;
+        }
+        for (const Loaders::Bytes& bytes : loaders.exchange(std::move(parts))) {
+            const std::byte* at = bytes.data();
+            asked_.emplace_back();
+            Loaders::unpack(at, asked_.back());
+        }
+    }
+
+    // What the others have of the vertices that this rank wants. `own`: what it has of its own run.
+    template <class T>
+    std::vector<T> of(const std::vector<T>& own) const
+    {
+        std::vector<Loaders::Bytes> parts(begins_.size());
+        const std::uint64_t first = begins_[static_cast<std::size_t>(loaders_.rank())];
+        for (std::size_t r = 0; r < asked_.size(); ++r) {
+            std::vector<T> answer;
+            answer.reserve(asked_[r].size());
+            for (std::size_t i = 0; i < asked_[r].size() && !own.empty(); ++i) // there may be no colours
+                answer.push_back(own[static_cast<std::size_t>(asked_[r][i] - first)]);
+            Loaders::pack(answer, parts[r]);
+        }
+        std::vector<T> all;
+        for (const Loaders::Bytes& bytes : loaders_.exchange(std::move(parts))) { // by rank, and so ascending
+            const std::byte* at = bytes.data();
+            std::vector<T> answer;
+            Loaders::unpack(at, answer);
+            all.insert(all.end(), answer.begin(), answer.end());
+        }
+        return all;
+    }
+
+private:
+    const std::vector<std::uint64_t>& begins_;
+    const Loaders& loaders_;
+    std::vector<std::vector<std::uint32_t>> asked_; // of this rank, by each
+};
+
+// The triangles of a share with their vertices. Collective.
+inline MeshPart partOf(MeshShare& share, const VertexLookup& lookup, std::vector<std::uint32_t> vertices)
+{
+    MeshPart part;
+    part.vertices = std::move(vertices);
+    part.firstTriangle = static_cast<std::uint32_t>(share.firstTriangle);
+    part.mesh.positions = lookup.of(share.mesh.positions);
+    part.mesh.colors = lookup.of(share.mesh.colors);
+    part.mesh.triangles = std::move(share.mesh.triangles);
+    for (Triangle& triangle : part.mesh.triangles)
+        for (std::uint32_t& index : triangle)
+            index = static_cast<std::uint32_t>(std::lower_bound(part.vertices.begin(), part.vertices.end(), index)
+                                               - part.vertices.begin());
+    return part;
+}
+
+// The vertices that the triangles of a share have, ascending.
+inline std::vector<std::uint32_t> verticesOf(const MeshShare& share)
+{
+    std::vector<std::uint32_t> vertices;
+    vertices.reserve(3 * share.mesh.triangles.size());
+    for (const Triangle& triangle : share.mesh.triangles)
+        vertices.insert(vertices.end(), triangle.begin(), triangle.end());
+    std::sort(vertices.begin(), vertices.end());
+    vertices.erase(std::unique(vertices.begin(), vertices.end()), vertices.end());
+    vertices.shrink_to_fit();
+    return vertices;
+}
+
+// Collective: what vertexNormals() of the whole mesh has for the vertices of each part, to the bit: the rank that has a
+// vertex adds its triangles in their order.
+inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::uint64_t>& begins,
+                                   const VertexLookup& lookup, const Loaders& loaders)
+{
+    const std::size_t ranks = begins.size() - 1, rank = static_cast<std::size_t>(loaders.rank());
+    const auto forEachCorner = [&part](const auto& function) { // of the triangles, in order
+        for (const Triangle& t : part.mesh.triangles) {
+            const Vec3d normal = weightedNormal(part.mesh, t);
+            for (const std::uint32_t index : t)
+                function(part.vertices[index], normal);
+        }
+    };
+    struct ForOne {
+        std::vector<std::uint32_t> vertices;
+        std::vector<Vec3d> normals;
+    };
+    std::vector<ForOne> forOthers(ranks);
+    forEachCorner([&](std::uint32_t vertex, const Vec3d& normal) {
+        if (vertex >= begins[rank] && vertex < begins[rank + 1])
+            return;
+        const auto behind = std::upper_bound(begins.begin(), begins.end(), vertex); // also where a rank has none
+        ForOne& other = forOthers[static_cast<std::size_t>(behind - begins.begin()) - 1];
+        other.vertices.push_back(vertex);
+        other.normals.push_back(normal);
+    });
+    std::vector<Loaders::Bytes> parts(ranks + 1);
+    for (std::size_t r = 0; r < ranks; ++r) {
+        Loaders::pack(forOthers[r].vertices, parts[r]);
+        Loaders::pack(forOthers[r].normals, parts[r]);
+        forOthers[r] = ForOne();
+    }
+    const std::vector<Loaders::Bytes> received = loaders.exchange(std::move(parts));
+    std::vector<Vec3d> sums(static_cast<std::size_t>(begins[rank + 1] - begins[rank]));
+    const auto add = [&](std::uint32_t vertex, const Vec3d& normal) {
+        Vec3d& sum = sums[static_cast<std::size_t>(vertex - begins[rank])];
+        sum = sum + normal;
+    };
+    for (std::size_t r = 0; r < ranks; ++r) {
+        if (r == rank)
+            forEachCorner([&](std::uint32_t vertex, const Vec3d& normal) {
+                if (vertex >= begins[rank] && vertex < begins[rank + 1])
+                    add(vertex, normal);
+            });
+        const std::byte* at = received[r].data();
+        ForOne own;
+        Loaders::unpack(at, own.vertices);
+        Loaders::unpack(at, own.normals);
+        for (std::size_t i = 0; i < own.vertices.size(); ++i)
+            add(own.vertices[i], own.normals[i]);
+    }
+    std::vector<Vec3> normals;
+    normals.reserve(sums.size());
+    for (const Vec3d& sum : sums)
+        normals.push_back(rounded(unit(sum)));
+    return lookup.of(normals);
+}
+
+// Collective: gives each rank as many of the triangles, in the same order. Ranks that have read equal parts of a text
+// may have only vertices, or only triangles. `begins`: where the triangles of each rank begin, and the end.
+inline void evenOut(std::vector<Triangle>& triangles, std::vector<std::uint64_t>& begins, const Loaders& loaders)
+{
+    const std::uint64_t all = begins.back(), ranks = begins.size() - 1;
+    bool isEven = true;
+    for (std::size_t r = 0; r < ranks; ++r)
+        isEven = isEven && begins[r + 1] - begins[r] <= all / ranks + all / (8 * ranks) + 1;
+    if (isEven)
+        return;
+    std::vector<Loaders::Bytes> parts(begins.size());
+    const std::uint64_t first = begins[static_cast<std::size_t>(loaders.rank())];
+    for (std::size_t r = 0; r < ranks; ++r) {
+        const auto [from, to] = Loaders::shareOf(all, static_cast<int>(r), loaders.size());
+        const auto at = [&](std::uint64_t i) {
+            return triangles.begin()
+                   + static_cast<std::ptrdiff_t>(std::clamp<std::uint64_t>(i, first, first + triangles.size()) - first);
+        };
+        Loaders::pack(std::vector<Triangle>(at(from), at(to)), parts[r]);
+        begins[r] = from;
+    }
+    triangles = {};
+    for (const Loaders::Bytes& bytes : loaders.exchange(std::move(parts))) {
+        const std::byte* at = bytes.data();
+        std::vector<Triangle> more;
+        Loaders::unpack(at, more);
+        triangles.insert(triangles.end(), more.begin(), more.end());
+    }
+}
+
+// Collective: a share whose triangles and colours are as each rank has read them. Nothing, on all ranks, if there are
+// no triangles or too many.
+inline std::optional<MeshShare> finished(MeshShare share, const std::string& name, const Loaders& loaders, Notes* notes)
+{
+    const std::uint64_t most = std::uint64_t{1} << 32;
+    std::vector<std::uint64_t> begins = loaders.beginsOf(share.mesh.triangles.size());
+    if (begins.back() == 0 || begins.back() >= most || share.vertexBegins.back() >= most)
+        return std::nullopt;
+    evenOut(share.mesh.triangles, begins, loaders);
+    share.firstTriangle = begins[static_cast<std::size_t>(loaders.rank())];
+    // Colours are used if all vertices have one.
+    const std::vector<Vec3>& colors = share.mesh.colors;
+    const auto sums = loaders.sumOf(
+        {static_cast<std::int64_t>(colors.size()), std::count_if(colors.begin(), colors.end(), detail::isColor)});
+    const auto all = static_cast<std::int64_t>(share.vertexBegins.back());
+    if (sums[0] > 0 && (sums[0] != all || sums[1] != all))
+        share.mesh.colors.assign(1, Vec3{-1, 0, 0}); // no colour: so they are left out on all ranks
+    detail::finishColors(share.mesh, name, notes);
+    return share;
+}
+
+} // namespace example

@@ -1,0 +1,94 @@
+// The files of a scene: who reads them, and how they come into it.
+#pragma once
+
+#include "obj.hpp"
+#include "ply_share.hpp"
+#include "scene.hpp"
+#include "xyz_share.hpp"
+
+#include <string>
+#include <utility>
+
+namespace example {
+
+namespace detail {
+
+// Of a mesh file.
+struct MeshReader {
+    Mesh (*parse)(std::string_view bytes, const std::string& name, Notes* notes);
+    std::optional<MeshShare> (*readShare)(const std::string& path, const Loaders& loaders, Notes* notes);
+};
+
+inline std::string readCounted(const std::string& path, const Loaders& loaders)
+{
+    std::string bytes = readFile(path);
+    *loaders.readCounter() += bytes.size();
+    return bytes;
+}
+
+inline void addMesh(Scene& scene, const SceneFile& file, bool fit, const MeshReader& reader, const Loaders& loaders,
+                    Notes& notes)
+{
+    const std::string& path = file.path;
+    if (loaders.size() == 1)
+        return scene.add(reader.parse(readCounted(path, loaders), path, &notes), fit, file.look, path);
+    std::optional<MeshShare> share = reader.readShare(path, loaders, &notes);
+    if (!share) {
+        Mesh whole;
+        loaders.gatherOf<char>([&] {
+            if (loaders.rank() == 0)
+                whole = reader.parse(readCounted(path, loaders), path, &notes);
+            return std::vector<char>();
+        });
+        share = dealMesh(std::move(whole), loaders);
+    }
+    scene.add(std::move(*share), fit, loaders, file.look, path);
+}
+
+inline void addSpheres(Scene& scene, const SceneFile& file, bool fit, int frame, const Loaders& loaders, Notes& notes)
+{
+    const std::string& path = file.path;
+    if (loaders.size() == 1)
+        return scene.add(parseXyz(readCounted(path, loaders), path, frame, &notes), fit, file.look, path);
+    std::optional<SphereShare> share = readXyzShare(path, frame, loaders, &notes);
+    if (!share) { // rank 0 has all of them
+        share.emplace();
+        loaders.gatherOf<char>([&] {
+            if (loaders.rank() == 0)
+                share->spheres = parseXyz(readCounted(path, loaders), path, frame, &notes);
+            return std::vector<char>();
+        });
+        share->first = loaders.beginsOf(share->spheres.size())[static_cast<std::size_t>(loaders.rank())];
+    }
+    scene.add(std::move(*share), fit, loaders, file.look, path);
+}
+
+} // namespace detail
+
+// Collective: adds a file, by its ending. Each rank reads a share of it: of a volume here what all must know, and its
+// bricks later, in loadBrick(); of a mesh or of spheres a run of the primitives, which go to the bricks in
+// exchangeBricks(). Where a file of primitives cannot be shared out, as its rows are not all alike, or it is wrong,
+// rank 0 reads it alone. `xyzFrame` as for parseXyz(), `grid` and `lookOf` for volumes. Throws std::runtime_error that
+// names the file, the same on all ranks.
+inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame = 0, const Loaders& loaders = {},
+                    const VoxelGrid& grid = {}, const LookOf& lookOf = {})
+{
+    const std::string& path = file.path;
+    const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
+    Notes notes;
+    if (isVolumeEnding(ending))
+        scene.add(openVolume(path, loaders, grid, lookOf), fit, file.look);
+    else if (ending == ".ply")
+        detail::addMesh(scene, file, fit, {parsePly, readPlyShare}, loaders, notes);
+    else if (ending == ".obj")
+        detail::addMesh(scene, file, fit, {parseObj, readObjShare}, loaders, notes);
+    else if (ending == ".xyz")
+        detail::addSpheres(scene, file, fit, xyzFrame, loaders, notes);
+    else
+        throw std::runtime_error(path + ": unknown type '" + ending
+                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .ply, .obj or .xyz");
+    for (std::string& note : loaders.linesOfFirst(notes))
+        scene.notes.push_back(std::move(note));
+}
+
+} // namespace example
