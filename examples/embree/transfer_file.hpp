@@ -25,13 +25,6 @@ struct TransferFile {
     std::vector<float> range; // of the data; empty: "auto". Points then have values from 0 to 1, else any
 };
 
-// For Loaders::fromFirst().
-template <class Function>
-void arraysOf(TransferFile& file, const Function& function)
-{
-    function(file.points, file.range);
-}
-
 // Throws std::runtime_error that names the file and what is wrong.
 inline TransferFile parseTransfer(const std::string& text, const std::string& path)
 {

@@ -21,13 +21,6 @@ struct TransferPoint {
 // Ascending by value, two or more.
 using TransferPoints = std::vector<TransferPoint>;
 
-// For Loaders::fromFirst().
-template <class Function>
-void arraysOf(TransferPoints& points, const Function& function)
-{
-    function(points);
-}
-
 // The look of generated volumes: a blue haze, embers in it.
 inline const TransferPoints& emberPoints()
 {

@@ -269,7 +269,7 @@ TEST_CASE("The default look is the same on any number of ranks, and hides the no
         choice.transfer = name;
         const auto describe = [&](const Loaders& loaders) {
             const VolumeLook look =
-                openVolume(file, loaders, [&](const VolumeSource& s) { return lookOf(s, choice, loaders); }).look;
+                openVolume(file, loaders, {}, [&](const VolumeSource& s) { return lookOf(s, choice, loaders); }).look;
             std::string text = std::to_string(look.lo) + ' ' + std::to_string(look.hi);
             for (const TransferPoint& p : look.points)
                 text += ' ' + std::to_string(p.opacity) + ' ' + std::to_string(p.r);
