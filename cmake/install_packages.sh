@@ -1,9 +1,9 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site and the examples of other
-# people's programs need: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1. Quick when
-# nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
+# people's programs and those in Fortran need: on Debian and Ubuntu with apt-get; elsewhere says what is missing and
+# exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -29,6 +29,9 @@ tools() {
     fi
     if [ "$with" = tests ] && ! have doxygen; then
         echo doxygen doxygen-awesome-css
+    fi
+    if [ "$with" = tests ] && ! have gfortran; then
+        echo gfortran
     fi
 }
 
