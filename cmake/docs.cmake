@@ -13,7 +13,8 @@ endif()
 
 # A page for each example that is one file, or the main file of its folder
 file(GLOB examples CONFIGURE_DEPENDS ${PROJECT_SOURCE_DIR}/examples/*.cpp ${PROJECT_SOURCE_DIR}/examples/tachyon/*.cpp
-  ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp)
+  ${PROJECT_SOURCE_DIR}/examples/vtk/*.cpp ${PROJECT_SOURCE_DIR}/examples/adapters/c/minimal.c
+  ${PROJECT_SOURCE_DIR}/examples/adapters/c/heat.f90)
 set(pages "")
 foreach(example IN LISTS examples)
   get_filename_component(example ${example} NAME)

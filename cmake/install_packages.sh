@@ -2,8 +2,8 @@
 # sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
 # sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
-# people's programs, and pictures as EXR and plots need: on Debian and Ubuntu with apt-get; elsewhere says what is missing
-# and exits with 1. Quick when nothing is missing.
+# people's programs and those in Fortran, and pictures as EXR and plots need: on Debian and Ubuntu with apt-get; elsewhere
+# says what is missing and exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -29,6 +29,9 @@ tools() {
     fi
     if [ "$with" = tests ] && ! have doxygen; then
         echo doxygen doxygen-awesome-css
+    fi
+    if [ "$with" = tests ] && ! have gfortran; then
+        echo gfortran
     fi
 }
 

@@ -41,7 +41,7 @@ function reference(link,    hash, page)
     page = hash == 1 ? self : normal(folder (hash ? substr(link, 1, hash - 1) : link))
     if (page !~ /\.md$/) {
         sub(/^.*\//, "", page)
-        return page ~ /\.cpp$/ ? "@ref " page : page
+        return page ~ /\.(cpp|c|f90)$/ ? "@ref " page : page
     }
     return "@ref " pageName(page) (hash ? "_" substr(link, hash + 1) : "")
 }

@@ -3,18 +3,26 @@
 //   mpirun -n 3 test_icet_client moves       tiles that change their size and rank, frame by frame
 //   mpirun -n 2 test_icet_client differs     ranks that have set different tiles
 //   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1)
-//   mpirun -n 2 test_icet_client finalised   a context that outlives MPI
+//   mpirun -n 3 test_icet_client stopped     a rank that hangs and goes on later (DFB_ICET_TIMEOUT=1)
+//   mpirun -n 3 test_icet_client killed      a rank that dies; prints "all were told", then the launcher may end the
+//   job mpirun -n 2 test_icet_client finalised   a context that outlives MPI
 // With "multiple" as the second word at MPI_THREAD_MULTIPLE, else at MPI_THREAD_SINGLE. Returns 0 if all is well.
 #include <IceT.h>
 #include <mpi.h>
 
 #include <algorithm>
 #include <chrono>
+#include <csignal>
 #include <cstdint>
 #include <cstdio>
 #include <stdexcept>
 #include <string>
 #include <vector>
+
+#include <sys/prctl.h>
+#include <sys/types.h>
+#include <sys/wait.h>
+#include <unistd.h>
 
 extern "C" {
 IceTCommunicator icetCreateMPICommunicator(MPI_Comm comm);
@@ -289,6 +297,49 @@ void tryAbsence()
     icetDestroyContext(context);
 }
 
+// The others are told in time, whether the lost rank comes back or not. `launched`: the process that the launcher sees.
+void tryLoss(int signal, int launched)
+{
+    IceTContext context = makeContext();
+    icetAddTile(0, 0, 40, 30, 0);
+    expectGoodFrame("nothing");
+    const int victim = ranks - 1;
+    int process = signal == SIGKILL ? launched : getpid();
+    MPI_Bcast(&process, 1, MPI_INT, victim, MPI_COMM_WORLD);
+    MPI_Comm others;
+    MPI_Comm_split(MPI_COMM_WORLD, rank == victim ? MPI_UNDEFINED : 0, rank, &others);
+    if (rank == victim) {
+        raise(signal); // the rest is for one that comes back
+    } else {
+        const auto before = std::chrono::steady_clock::now();
+        expect(icetImageIsNull(Picture(40, 30).composite()), "a picture without the lost rank");
+        expectError(ICET_INVALID_OPERATION, "a lost rank");
+        expect(std::chrono::steady_clock::now() - before < std::chrono::seconds(15), "it takes long");
+        MPI_Barrier(others);
+    }
+    if (signal == SIGKILL) { // no end of MPI is orderly any more
+        if (rank == 0) {
+            int all = failures, own = failures;
+            MPI_Reduce(&own, &all, 1, MPI_INT, MPI_SUM, 0, others);
+            std::printf(all == 0 ? "all were told\n" : "not all were told\n");
+            std::fflush(stdout);
+            kill(process, SIGKILL);
+        } else {
+            MPI_Reduce(&failures, nullptr, 1, MPI_INT, MPI_SUM, 0, others);
+        }
+        pause(); // until the launcher ends the job
+    }
+    if (rank == 0)
+        kill(process, SIGCONT);
+    expect(icetImageIsNull(Picture(40, 30).composite()), "a picture in a context that has failed");
+    expectError(ICET_INVALID_OPERATION, "a context that has failed");
+    icetDestroyContext(context);
+    makeContext();
+    icetAddTile(0, 0, 40, 30, 0);
+    expectGoodFrame("a lost rank, in a new context,");
+    icetDestroyContext(icetGetContext());
+}
+
 void tryFinalised()
 {
     IceTContext context = makeContext();
@@ -309,6 +360,16 @@ int main(int count, char** words)
 {
     const std::string what = count > 1 ? words[1] : "";
     const bool isMultiple = count > 2 && words[2] == std::string("multiple");
+    // Launchers end a job as soon as a process dies. Here the rank is another process than the one that they see.
+    const int launched = getpid();
+    if (what == "killed") {
+        int status = 0;
+        if (const pid_t child = fork(); child != 0) {
+            waitpid(child, &status, 0);
+            return pause();
+        }
+        prctl(PR_SET_PDEATHSIG, SIGKILL);
+    }
     int level = 0;
     MPI_Init_thread(&count, &words, isMultiple ? MPI_THREAD_MULTIPLE : MPI_THREAD_SINGLE, &level);
     MPI_Comm_rank(MPI_COMM_WORLD, &rank);
@@ -321,6 +382,10 @@ int main(int count, char** words)
         tryDifferences();
     else if (what == "absent")
         tryAbsence();
+    else if (what == "stopped")
+        tryLoss(SIGSTOP, launched);
+    else if (what == "killed")
+        tryLoss(SIGKILL, launched);
     else if (what == "finalised")
         tryFinalised();
     else

@@ -306,12 +306,12 @@ inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const Fragment
     const std::size_t payload = format.bodyBytes(h.shape), stored = h.shape.stored();
     if (h.rawPayloadBytes != payload)
         failMalformed("wrong payload size", static_cast<std::int64_t>(payload), h.rawPayloadBytes);
-    if (h.codec != 0 && (!codec || codec->id() != h.codec))
-        failMalformed("compressed by a codec that this rank does not have", codec ? codec->id() : 0, h.codec);
     if ((h.codec != 0) != (h.shape.isSplit != 0))
         failMalformed("split and not compressed, or the other way round", h.codec, h.shape.isSplit);
     std::size_t offset = fragmentPrefix;
     if (h.codec != 0) {
+        if (!codec || codec->id() != h.codec)
+            failMalformed("compressed by a codec that this rank does not have", codec ? codec->id() : 0, h.codec);
         Buffer raw = pool.acquire(payload);
         if (!codec->decompress(message.data() + fragmentPrefix, message.size() - fragmentPrefix, raw.data(), payload))
             failMalformed("the payload does not decompress to its size", static_cast<std::int64_t>(payload), -1);

@@ -1,0 +1,26 @@
+# C and Fortran, for programs that use examples/adapters/c, where there are compilers: targets in several folders are
+# compiled with them, so they are enabled here, above all of these.
+if(NOT TARGET dfb::mpi)
+  return()
+endif()
+include(CheckLanguage)
+foreach(_language C Fortran)
+  check_language(${_language})
+  if(CMAKE_${_language}_COMPILER)
+    enable_language(${_language})
+  endif()
+endforeach()
+
+# MPI's compilers for them, beside that for C++: `mpicc.openmpi` for `mpicxx.openmpi`.
+foreach(_name mpicc mpifort)
+  string(REGEX REPLACE "mpi(cxx|c\\+\\+|CC)([^/]*)$" "${_name}\\2" DFB_${_name} "${MPI_CXX_COMPILER}")
+  if(DFB_${_name} STREQUAL MPI_CXX_COMPILER OR NOT EXISTS ${DFB_${_name}})
+    set(DFB_${_name} "")
+  endif()
+endforeach()
+if(CMAKE_Fortran_COMPILER_LOADED)
+  if(DFB_mpifort AND NOT MPI_Fortran_COMPILER)
+    set(MPI_Fortran_COMPILER ${DFB_mpifort} CACHE FILEPATH "MPI compiler for Fortran")
+  endif()
+  find_package(MPI 3.1 QUIET COMPONENTS Fortran)
+endif()

@@ -1,0 +1,502 @@
+// The functions of dfb.h, on dfb::ImageCompositor and dfb::DataParallelLoop.
+#include "dfb.h"
+
+#include <dfb/dfb.hpp>
+
+#include <algorithm>
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstring>
+#include <exception>
+#include <limits>
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+namespace {
+
+// ---- errors
+
+thread_local char lastError[1024] = ""; // not a string: there may be no memory for one
+
+int failed(int status, const char* text) noexcept
+{
+    std::snprintf(lastError, sizeof lastError, "%s", text);
+    return status;
+}
+
+// Calls body(). An exception becomes a status, and its text the last error.
+template <class Body>
+int guarded(const Body& body) noexcept
+{
+    try {
+        body();
+        return DFB_OK;
+    } catch (const dfb::InvalidArgument& e) {
+        return failed(DFB_INVALID_ARGUMENT, e.what());
+    } catch (const dfb::FrameError& e) {
+        return failed(DFB_FRAME_FAILED, e.what());
+    } catch (const dfb::TransportError& e) {
+        return failed(DFB_TRANSPORT_FAILED, e.what());
+    } catch (const std::bad_alloc& e) {
+        return failed(DFB_OUT_OF_MEMORY, e.what());
+    } catch (const std::exception& e) {
+        return failed(DFB_FAILED, e.what());
+    } catch (...) {
+        return failed(DFB_FAILED, "an exception of an unknown type");
+    }
+}
+
+[[noreturn]] void refuse(const std::string& text) { throw dfb::InvalidArgument(text); }
+
+// A struct of the program; throws InvalidArgument unless it is of the dfb.h that this was compiled with.
+template <class Struct>
+const Struct& checked(const Struct* given, const char* name)
+{
+    if (!given)
+        refuse(std::string("a null ") + name);
+    if (given->struct_size != sizeof(Struct))
+        refuse(std::string("a ") + name + " of " + std::to_string(given->struct_size) + " bytes, where version "
+               + dfb_version() + " has " + std::to_string(sizeof(Struct)) + ": fill it by " + name
+               + "_init(), and compile with the dfb.h of this library");
+    return *given;
+}
+
+// ---- what the program gives, as the library has it
+
+dfb::FrameBufferConfig configOf(const dfb_config& given)
+{
+    const auto format = [&] {
+        switch (given.format) {
+        case DFB_RGBA8: return dfb::OutputFormat::RGBA8;
+        case DFB_SRGBA8: return dfb::OutputFormat::SRGBA8;
+        case DFB_RGBA32F: return dfb::OutputFormat::RGBA32F;
+        default: refuse("there is no dfb_format " + std::to_string(given.format));
+        }
+    };
+    dfb::FrameBufferConfig config(given.width, given.height, format(), given.depth != 0);
+    config.image.displayRank = given.display_rank;
+    return config;
+}
+
+dfb::ImageBlend blendOf(const dfb_config& given)
+{
+    switch (given.blend) {
+    case DFB_NEAREST: return dfb::ImageBlend::Nearest;
+    case DFB_BY_DEPTH: return dfb::ImageBlend::ByDepth;
+    case DFB_IN_ORDER: return dfb::ImageBlend::InOrder;
+    default: refuse("there is no dfb_blend " + std::to_string(given.blend));
+    }
+}
+
+std::shared_ptr<dfb::Executor> executorOf(const dfb_config& given, const dfb::Connection& connection)
+{
+    if (given.threads < 0)
+        refuse(std::to_string(given.threads) + " threads");
+    if (given.threads == 1)
+        return std::make_shared<dfb::CallerExecutor>();
+    return std::make_shared<dfb::ThreadExecutor>(given.threads == 0 ? connection.threadShare() : given.threads);
+}
+
+dfb::Region regionOf(const int (&given)[4]) { return {given[0], given[1], given[2], given[3]}; }
+
+dfb::InputImage imageOf(const dfb_input& given)
+{
+    dfb::InputImage image;
+    image.rgba8 = given.rgba8;
+    image.rgba32f = given.rgba32f;
+    image.depth = given.depth;
+    image.rowPixels = given.row_pixels;
+    image.bottomUp = given.bottom_up != 0;
+    image.isBgra = given.is_bgra != 0;
+    image.hasStraightAlpha = given.has_straight_alpha != 0;
+    image.farDepth = given.far_depth;
+    image.region = regionOf(given.region);
+    image.valid = regionOf(given.valid);
+    return image;
+}
+
+dfb::MatrixCamera cameraOf(const double* view, const double* projection)
+{
+    if (!view || !projection)
+        refuse("a null matrix");
+    float viewMatrix[16], projectionMatrix[16];
+    for (int i = 0; i < 16; ++i) {
+        viewMatrix[i] = static_cast<float>(view[i]);
+        projectionMatrix[i] = static_cast<float>(projection[i]);
+    }
+    return dfb::MatrixCamera(viewMatrix, projectionMatrix);
+}
+
+// The bricks and the renderer of this rank. `world` has the bricks in the order of the program's array.
+struct Scene {
+    Scene(const dfb_brick* given, int count, dfb_render_brick renderer, void* userData)
+        : bricks(given), render(renderer), user(userData)
+    {
+        if (count < 0)
+            refuse(std::to_string(count) + " bricks");
+        if (count > 0 && !given)
+            refuse("a null array of bricks");
+        if (!renderer)
+            refuse("a null renderer");
+        for (int i = 0; i < count; ++i) {
+            const auto pointOf = [](const float(&p)[3]) { return dfb::Vec3{p[0], p[1], p[2]}; };
+            world.add({given[i].id, {pointOf(given[i].lower), pointOf(given[i].upper)}});
+        }
+    }
+
+    template <class Tile>
+    void operator()(const dfb::Brick& brick, Tile& tile, const dfb::TileLayout& layout) const
+    {
+        const dfb::Region& r = tile.region;
+        const dfb_tile pixels{r.x0,       r.y0,       r.x1,      r.y1, layout.width(), layout.height(),
+                              Tile::size, tile.color, tile.depth};
+        if (const int code = render(bricks + (&brick - world.bricks().data()), &pixels, user); code != 0)
+            throw std::runtime_error("the renderer of brick " + std::to_string(brick.id) + " returned "
+                                     + std::to_string(code));
+    }
+
+    dfb::World world;
+    const dfb_brick* bricks;
+    dfb_render_brick render;
+    void* user;
+};
+
+// ---- pictures of bricks
+
+// A framebuffer of any operation. The members are collective.
+class BrickPicture {
+public:
+    virtual ~BrickPicture() = default;
+    virtual dfb::FrameReport render(const Scene& scene, const dfb::MatrixCamera& camera,
+                                    const dfb::FrameConfig& frame) = 0;
+    // In place of render(), on a rank that cannot: fails the picture on all ranks.
+    virtual dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame) = 0;
+    virtual const dfb::Image& image() const = 0;
+    virtual dfb::Image imageOnAllRanks() = 0;
+};
+
+template <class TileOp>
+class BrickPictureOf final : public BrickPicture {
+public:
+    BrickPictureOf(std::shared_ptr<dfb::Connection> connection, dfb::FrameBufferConfig config)
+        : fb_(std::move(connection), std::move(config))
+    {
+    }
+
+    dfb::FrameReport render(const Scene& scene, const dfb::MatrixCamera& camera, const dfb::FrameConfig& frame) override
+    {
+        dfb::DataParallelLoop loop(fb_, scene.world);
+        return loop.render(
+            camera, [&](const dfb::Brick& brick, auto& tile) { scene(brick, tile, fb_.layout()); }, frame);
+    }
+    dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame) override
+    {
+        frame.declared = true; // as in the loop that the other ranks are in
+        auto open = fb_.begin(frame);
+        open.abort(why);
+        return open.end();
+    }
+    const dfb::Image& image() const override { return fb_.image(); }
+    dfb::Image imageOnAllRanks() override { return fb_.imageOnAllRanks(); }
+
+private:
+    dfb::DistributedFrameBuffer<TileOp> fb_;
+};
+
+std::unique_ptr<BrickPicture> makeBrickPicture(dfb::ImageBlend blend,
+                                               const std::shared_ptr<dfb::Connection>& connection,
+                                               const dfb::FrameBufferConfig& config)
+{
+    if (blend == dfb::ImageBlend::Nearest)
+        return std::make_unique<BrickPictureOf<dfb::DepthComposite>>(connection, config);
+    return std::make_unique<BrickPictureOf<dfb::AlphaBlend>>(connection, config);
+}
+
+} // namespace
+
+// One connection for pictures of images and of bricks. The first kind is made at once, which compares the
+// configurations of the ranks; the second when it is needed.
+struct dfb_framebuffer {
+    // Collective. `given` may be wrong, on any rank: all throw InvalidArgument then. So they do if one rank has no
+    // place to store the result at.
+    dfb_framebuffer(std::shared_ptr<dfb::Connection> ranks, const dfb_config* given, bool hasPlace)
+        : connection(std::move(ranks))
+    {
+        try {
+            if (!hasPlace)
+                refuse("a null pointer to store the framebuffer at");
+            const dfb_config& config = checked(given, "dfb_config");
+            blend = blendOf(config);
+            frameBufferConfig = configOf(config);
+            frameBufferConfig.executor = executorOf(config, *connection);
+            std::copy_n(config.background, 4, frame.background.begin());
+        } catch (const std::exception& e) {
+            // The library tells all ranks what an owner map has thrown on one.
+            frameBufferConfig = dfb::FrameBufferConfig(1, 1);
+            frameBufferConfig.image.ownerMap = [text = reasonOf(e)](int, const dfb::TileLayout&, int) -> int {
+                throw std::invalid_argument(text);
+            };
+        }
+        images = std::make_unique<dfb::ImageCompositor>(connection, blend, frameBufferConfig);
+    }
+
+    static std::string reasonOf(const std::exception& e)
+    {
+        const auto* error = dynamic_cast<const dfb::Error*>(&e);
+        return error ? error->info().message : e.what();
+    }
+
+    const dfb::Image& image() const
+    {
+        if (!everywhere.empty())
+            return everywhere;
+        return showsBricks ? bricks->image() : images->image();
+    }
+
+    std::shared_ptr<dfb::Connection> connection;
+    dfb::ImageBlend blend = dfb::ImageBlend::Nearest;
+    dfb::FrameBufferConfig frameBufferConfig;
+    dfb::FrameConfig frame;
+    std::unique_ptr<dfb::ImageCompositor> images;
+    std::unique_ptr<BrickPicture> bricks;
+    bool showsBricks = false; // the last picture
+    dfb::Image everywhere;    // the last picture, if this rank has asked for a copy
+    std::optional<dfb::FrameReport> report;
+    bool isBusy = false;
+};
+
+namespace {
+
+// Calls body(framebuffer), which nothing may do while it is in another call, such as a renderer.
+template <class Body>
+int inFramebuffer(dfb_framebuffer* framebuffer, const Body& body) noexcept
+{
+    return guarded([&] {
+        if (!framebuffer)
+            refuse("a null dfb_framebuffer");
+        if (framebuffer->isBusy)
+            refuse("this framebuffer is in another call: a renderer cannot call functions on it");
+        framebuffer->isBusy = true;
+        struct Done {
+            bool& isBusy;
+            ~Done() { isBusy = false; }
+        } done{framebuffer->isBusy};
+        body(*framebuffer);
+    });
+}
+
+void newPicture(dfb_framebuffer& fb, bool showsBricks)
+{
+    fb.everywhere = {};
+    fb.showsBricks = showsBricks;
+}
+
+// The picture that functions for one of its planes show; null if there is none.
+const dfb::Image* shownImage(const dfb_framebuffer* framebuffer)
+{
+    if (!framebuffer || framebuffer->isBusy || framebuffer->image().empty())
+        return nullptr;
+    return &framebuffer->image();
+}
+
+template <class Struct>
+void store(const Struct& from, Struct* to, std::size_t structSize)
+{
+    static_assert(std::is_trivially_copyable_v<Struct>);
+    if (to)
+        std::memcpy(to, &from, std::min(sizeof from, structSize));
+}
+
+int create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
+{
+    // They end after an exception that all ranks get, in order.
+    std::shared_ptr<dfb::Connection> connection;
+    std::unique_ptr<dfb_framebuffer> made;
+    const int status = guarded([&] {
+        if (communicator == MPI_COMM_NULL)
+            refuse("the communicator is MPI_COMM_NULL");
+        connection = dfb::connect(communicator);
+        made = std::make_unique<dfb_framebuffer>(connection, config, framebuffer != nullptr);
+    });
+    if (framebuffer)
+        *framebuffer = made.release();
+    return status;
+}
+
+} // namespace
+
+extern "C" {
+
+void dfb_config_init_sized(dfb_config* config, size_t struct_size, int width, int height)
+{
+    dfb_config all{};
+    all.struct_size = struct_size;
+    all.width = width;
+    all.height = height;
+    all.blend = DFB_BY_DEPTH;
+    all.format = DFB_SRGBA8;
+    all.threads = 1;
+    store(all, config, struct_size);
+}
+
+int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
+{
+    return create(communicator, config, framebuffer);
+}
+
+int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
+{
+    int isInitialized = 0; // else the handle cannot be converted, and MPI_COMM_WORLD gets the error that says so
+    MPI_Initialized(&isInitialized);
+    return create(isInitialized ? MPI_Comm_f2c(communicator) : MPI_COMM_WORLD, config, framebuffer);
+}
+
+void dfb_destroy(dfb_framebuffer* framebuffer) { delete framebuffer; }
+
+int dfb_resize(dfb_framebuffer* framebuffer, int width, int height)
+{
+    return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
+        fb.images->resize(width, height);
+        fb.frameBufferConfig.image.width = width;
+        fb.frameBufferConfig.image.height = height;
+        newPicture(fb, false);
+        fb.bricks.reset(); // is made anew when it is needed
+    });
+}
+
+int dfb_rank(const dfb_framebuffer* framebuffer) { return framebuffer ? framebuffer->connection->rank() : -1; }
+
+int dfb_size(const dfb_framebuffer* framebuffer) { return framebuffer ? framebuffer->connection->size() : -1; }
+
+int dfb_is_display_rank(const dfb_framebuffer* framebuffer)
+{
+    return framebuffer && framebuffer->images->isDisplayRank() ? 1 : 0;
+}
+
+int dfb_width(const dfb_framebuffer* framebuffer)
+{
+    return framebuffer ? framebuffer->frameBufferConfig.image.width : 0;
+}
+
+int dfb_height(const dfb_framebuffer* framebuffer)
+{
+    return framebuffer ? framebuffer->frameBufferConfig.image.height : 0;
+}
+
+void dfb_input_init_sized(dfb_input* input, size_t struct_size)
+{
+    dfb_input all{};
+    all.struct_size = struct_size;
+    all.far_depth = std::numeric_limits<float>::infinity();
+    all.valid[2] = all.valid[3] = std::numeric_limits<int>::max();
+    store(all, input, struct_size);
+}
+
+int dfb_composite(dfb_framebuffer* framebuffer, const dfb_input* input, int place)
+{
+    return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
+        newPicture(fb, false);
+        dfb::InputImage image;
+        std::exception_ptr wrong;
+        try {
+            image = imageOf(checked(input, "dfb_input"));
+        } catch (...) {
+            wrong = std::current_exception();
+        }
+        if (wrong)
+            fb.images->startFailed(wrong, fb.frame);
+        fb.report = wrong ? fb.images->end() : fb.images->composite(image, place, fb.frame);
+    });
+}
+
+int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count, const double view[16],
+               const double projection[16], dfb_render_brick render_brick, void* user)
+{
+    return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
+        if (fb.blend == dfb::ImageBlend::InOrder)
+            refuse("bricks are blended by depth, not in an order of the ranks");
+        if (!fb.bricks)
+            fb.bricks = makeBrickPicture(fb.blend, fb.connection, fb.frameBufferConfig);
+        newPicture(fb, true);
+        std::optional<Scene> scene;
+        std::optional<dfb::MatrixCamera> camera;
+        std::exception_ptr wrong;
+        try {
+            scene.emplace(bricks, count, render_brick, user);
+            camera.emplace(cameraOf(view, projection));
+        } catch (...) {
+            wrong = std::current_exception();
+        }
+        fb.report = wrong ? fb.bricks->fail(wrong, fb.frame) : fb.bricks->render(*scene, *camera, fb.frame);
+    });
+}
+
+const uint8_t* dfb_image_rgba8(const dfb_framebuffer* framebuffer)
+{
+    const dfb::Image* image = shownImage(framebuffer);
+    return image && image->format() != dfb::OutputFormat::RGBA32F ? image->rgba8() : nullptr;
+}
+
+const float* dfb_image_rgba32f(const dfb_framebuffer* framebuffer)
+{
+    const dfb::Image* image = shownImage(framebuffer);
+    return image && image->format() == dfb::OutputFormat::RGBA32F ? image->rgba32f() : nullptr;
+}
+
+const float* dfb_image_depth(const dfb_framebuffer* framebuffer)
+{
+    const dfb::Image* image = shownImage(framebuffer);
+    return image && image->hasDepth() ? image->depth() : nullptr;
+}
+
+int dfb_image_on_all_ranks(dfb_framebuffer* framebuffer)
+{
+    return inFramebuffer(framebuffer, [](dfb_framebuffer& fb) {
+        fb.everywhere = fb.showsBricks ? fb.bricks->imageOnAllRanks() : fb.images->imageOnAllRanks();
+    });
+}
+
+int dfb_get_report_sized(const dfb_framebuffer* framebuffer, dfb_report* report, size_t struct_size)
+{
+    return guarded([&] {
+        if (!framebuffer || !report)
+            refuse(framebuffer ? "a null dfb_report" : "a null dfb_framebuffer");
+        if (!framebuffer->report)
+            refuse("there has been no picture yet");
+        const dfb::FrameReport& from = *framebuffer->report;
+        dfb_report all{};
+        all.frame = from.frame;
+        all.total_ms = from.totalMs;
+        all.render_ms = from.renderMs;
+        all.compositing_overhead_ms = from.compositingOverheadMs;
+        all.render_ms_max = from.renderMsMax;
+        all.bytes_sent = from.bytesSent;
+        all.messages_sent = from.messagesSent;
+        all.tiles_total = from.tilesTotal;
+        all.tiles_touched = from.tilesTouched;
+        all.non_finite_pixels = from.nonFinitePixels;
+        all.alpha_outside_pixels = from.alphaOutsidePixels;
+        all.order_undefined_pixels = from.orderUndefinedPixels;
+        all.peak_memory_bytes = from.peakMemoryBytes;
+        all.threads = from.threads;
+        store(all, report, struct_size);
+    });
+}
+
+const char* dfb_last_error(void) { return lastError; }
+
+const char* dfb_version(void)
+{
+#define DFB_C_TEXT_OF(number) #number
+#define DFB_C_TEXT(number) DFB_C_TEXT_OF(number)
+    return DFB_C_TEXT(DFB_VERSION_MAJOR) "." DFB_C_TEXT(DFB_VERSION_MINOR) "." DFB_C_TEXT(DFB_VERSION_PATCH);
+}
+
+} // extern "C"
