@@ -19,7 +19,8 @@ struct View {
     float azimuth = 30;            // around the y axis, from +z towards +x
     float elevation = 20;          // above the xz plane
     float fieldOfView = 35;        // full vertical angle
-    std::optional<float> distance; // from the centre of what there is to see; none: so that all of it is in the image
+    std::optional<float> distance; // from the target; none: so that all there is to see is in the image
+    std::optional<Vec3> target;    // what the camera looks at, in the world; none: the centre of what there is to see
     CameraKind kind = CameraKind::Perspective;
     float aperture = 0.05f;  // radius of the lens
     float focus = 0;         // distance of what is sharp; 0: the centre
@@ -32,7 +33,10 @@ namespace detail {
 inline constexpr double degree = 3.14159265358979323846 / 180.0;
 }
 
-// From the centre of the focus to the camera, in world space.
+// What the camera looks at.
+inline Vec3 targetOf(const Focus& focus, const View& view) { return view.target ? *view.target : focus.box.center(); }
+
+// From the target to the camera, in world space.
 inline double cameraDistance(const Focus& focus, const View& view, int width, int height)
 {
     const double unit = static_cast<double>(focus.box.largestExtent());
@@ -40,7 +44,7 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
         return static_cast<double>(*view.distance) * unit;
     // The ball touches the sides of the smaller angle of view, but for a margin.
     double angle = 0.5 * static_cast<double>(view.fieldOfView) * detail::degree;
-    double radius = static_cast<double>(focus.radius);
+    double radius = static_cast<double>(focus.radius + length(targetOf(focus, view) - focus.box.center()));
     const auto narrowTo = [&](double aspect) { angle = std::atan(std::tan(angle) * std::min(1.0, aspect)); };
     const double aspect = static_cast<double>(width) / height;
     switch (view.kind) {
@@ -102,7 +106,7 @@ private:
         const double elevation = std::clamp(static_cast<double>(view.elevation), -89.9, 89.9) * degree;
         const Vec3d outward(std::cos(elevation) * std::sin(azimuth), std::sin(elevation),
                             std::cos(elevation) * std::cos(azimuth));
-        const Vec3 eye = rounded(Vec3d(focus.box.center()) + outward * cameraDistance(focus, view, width, height));
+        const Vec3 eye = rounded(Vec3d(targetOf(focus, view)) + outward * cameraDistance(focus, view, width, height));
         return dfb::PerspectiveCamera::along(eye, rounded(outward * -1.0), {0, 1, 0}, view.fieldOfView);
     }
 
@@ -118,7 +122,7 @@ private:
         case CameraKind::DepthOfField:
             return dfb::ThinLensCamera(eye, forward, up, view.fieldOfView, view.aperture * unit, sharp);
         case CameraKind::MotionBlur:
-            return dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, focus.box.center(), {0, 1, 0},
+            return dfb::OrbitBlurCamera(eye, forward, up, view.fieldOfView, targetOf(focus, view), {0, 1, 0},
                                         view.shutter);
         case CameraKind::Stereo:
             return dfb::StereoCamera(eye, forward, up, view.fieldOfView, view.separation * unit, sharp);

@@ -72,6 +72,8 @@ struct Options {
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
     bool dither = false;
 
+    std::optional<int> live; // the port of a live view, -1: any; none: there is none
+
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
@@ -201,6 +203,36 @@ inline std::array<float, 3> parseColor(const std::string& name, const std::strin
         begin = end + 1;
     }
     return color;
+}
+
+// X,Y,Z
+inline Vec3 parsePoint(const std::string& name, const std::string& text)
+{
+    Vec3 point;
+    std::size_t begin = 0;
+    for (int i = 0; i < 3; ++i) {
+        const std::size_t end = i < 2 ? text.find(',', begin) : text.size();
+        std::string part = end == std::string::npos ? "" : text.substr(begin, end - begin);
+        if (part.empty() || part[0] == ' ' || !number(-1e12, 1e12)(part).empty())
+            throw CLI::ValidationError(name, "'" + text + "' is not X,Y,Z with three numbers");
+        component(point, i) = std::strtof(part.c_str(), nullptr);
+        begin = end + 1;
+    }
+    return point;
+}
+
+// The arguments in the order that CLI11 takes, from the last on. --live gets its port: what follows it may be a scene.
+inline std::vector<std::string> withPort(int argc, const char* const* argv)
+{
+    std::vector<std::string> words;
+    for (int i = argc - 1; i > 0; --i) {
+        const std::string next = i + 1 < argc ? argv[i + 1] : "";
+        const bool isNumber = !next.empty() && next.find_first_not_of("0123456789") == std::string::npos;
+        words.push_back(argv[i]);
+        if (words.back() == "--live" && !isNumber)
+            words.back() = "--live=-1";
+    }
+    return words;
 }
 
 // All options as they count, for the record; without those that have no value.
@@ -477,6 +509,22 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--dither", options.dither, "Dither the colour of a .png, so that gradients have no bands")
         ->group(picture);
 
+    std::string target;
+    app.add_option(
+           "--target", target,
+           "The point that the camera looks at, in the world: files fill the cube from 0,0,0 to 1,1,1; default: "
+           "the centre of what there is to see")
+        ->option_text("X,Y,Z")
+        ->group(picture);
+
+    app.add_option(
+           "--live", options.live,
+           "Show it in a browser on this machine, where it can be turned: prints the address; port 0: any that is "
+           "free; default, without PORT: 8080, or any if that is taken")
+        ->check(detail::number(-1, 65535))
+        ->option_text("[PORT]")
+        ->group(picture);
+
     const char* files = "Files to write";
     app.add_option("--output", options.output,
                    "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
@@ -521,7 +569,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. Of an option that is given twice "
                "the last counts.");
     try {
-        app.parse(argc, argv);
+        app.parse(detail::withPort(argc, argv));
         options.fit = !noFit;
         if (options.interleave > 1 && app.count("--deep") == 0)
             options.deep = options.interleave; // as many pieces as a brick can have on a ray
@@ -532,10 +580,18 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             detail::parseSize("--wall", wall, 64, options.wallColumns, options.wallRows);
         if (app.count("--background") > 0)
             options.background = detail::parseColor("--background", background);
+        if (app.count("--target") > 0)
+            options.view.target = detail::parsePoint("--target", target);
+        if (options.live && app.count("--spp") == 0)
+            options.spp = 16; // while the camera rests
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
         };
+        for (const char* other : {"--frames", "--output", "--alpha", "--depth", "--aux", "--stats", "--wall",
+                                  "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
+            refuse(options.live.has_value(), other, "does not go with --live");
+        refuse(options.live && options.blend != Blending::Sort, "--blend", "order or nearest does not go with --live");
         const bool isData = options.mode == Mode::Data;
         refuse(options.mode == Mode::Image, "--blend", "does not go with --mode image");
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
