@@ -6,6 +6,7 @@
 #include <interrupt.hpp>
 #include <live_view.hpp>
 
+#include <charconv>
 #include <chrono>
 #include <cstdio>
 #include <cstring>
@@ -39,7 +40,7 @@ public:
         const Interrupt interrupt;
         const auto listen = [&] {
             if (fb_.isDisplayRank())
-                view_ = std::make_unique<LiveView>("dfb_render " + o_.scene.front(), *o_.live, false);
+                view_ = std::make_unique<LiveView>(titleOf(o_.scene), *o_.live, false);
         };
         if (!onAllRanks(fb_, listen) || !onAllRanks(fb_, [&] { load(); }))
             return exitFailed;
@@ -58,13 +59,23 @@ private:
         Superseded() : std::runtime_error(text) {}
     };
 
+    // The scene's name, or those of its files without their folders.
+    static std::string titleOf(const std::vector<std::string>& scene)
+    {
+        std::string title;
+        for (const std::string& path : scene)
+            title += (title.empty() ? "" : ", ") + path.substr(path.rfind('/') + 1);
+        return title;
+    }
+
     void load()
     {
         const Loaders loaders(fb_.rank(), fb_.size(),
                               [this](const Loaders::Bytes& bytes) { return fb_.allGather(bytes); });
-        scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
+        Options fromAllSides = o_; // bricks are cut for a camera that goes around
+        fromAllSides.frames = 36;
+        scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
         settings_ = renderSettings(o_);
-        settings_.frames = 1;
         world_ = worldOf(*scene_, settings_);
         params_.maxLayers = static_cast<int>(scene_->bounds.size());
         const std::array<float, 3> behind = o_.background.value_or(std::array<float, 3>{0, 0, 0});
@@ -244,10 +255,9 @@ private:
     std::string words(int samples) const
     {
         const View& view = settings_.view;
-        const auto number = [](float value) {
+        const auto number = [](float value) { // the shortest text that is read as this number again
             char text[32];
-            std::snprintf(text, sizeof text, "%.9g", static_cast<double>(value));
-            return std::string(text);
+            return std::string(text, std::to_chars(text, text + sizeof text, value).ptr);
         };
         std::string text = "--azimuth " + number(view.azimuth) + " --elevation " + number(view.elevation);
         if (view.distance)

@@ -75,10 +75,12 @@ public:
             volumes_.emplace_back(std::move(volume), scene.step);
     }
 
-    // Takes view, image size and passes of `settings` for the tiles that are rendered from now on. Not while one is.
+    // Takes view, frames of a turn, image size and passes of `settings` for the tiles that are rendered from now on.
+    // Not while one is.
     void look(const RenderSettings& settings)
     {
         settings_.view = settings.view;
+        settings_.frames = settings.frames;
         settings_.width = settings.width;
         settings_.height = settings.height;
         settings_.passes = settings.passes;

@@ -179,7 +179,7 @@ public:
             isOver_ = true;
             changed_.notify_all();
         }
-        http_.hangUp(std::chrono::milliseconds(250), std::chrono::seconds(2));
+        http_.hangUp(std::chrono::milliseconds(400), std::chrono::seconds(2));
         http_.stop();
         listener_.join();
     }
@@ -308,14 +308,15 @@ private:
             http_.Post(path, [this, answer](const Request&, Response& response, const httplib::ContentReader& read) {
                 guarded(response, [&] {
                     std::string body;
+                    bool isTooLong = false;
                     const bool isWhole = read([&](const char* data, std::size_t size) {
-                        if (body.size() + size > mostBody)
-                            return false;
-                        body.append(data, size);
-                        return true;
+                        isTooLong = body.size() + size > mostBody;
+                        if (!isTooLong)
+                            body.append(data, size);
+                        return !isTooLong;
                     });
                     if (!isWhole) {
-                        if (response.status < 400)
+                        if (isTooLong || response.status < 400)
                             response.status = 413;
                         response.set_header("Connection", "close");
                         return;

@@ -37,7 +37,6 @@ struct LiveWishes {
     std::int32_t isPaused = 0;
     std::int64_t steps = 0; // how often a single step was asked for
     std::int32_t ends = 0;  // the job is to end: somebody has pressed the button, or Interrupt::happened()
-    std::int32_t reserved = 0;
 };
 static_assert(std::is_trivially_copyable_v<LiveWishes>);
 

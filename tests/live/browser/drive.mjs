@@ -1,6 +1,6 @@
 // Drives the page of the live view in Chromium, as its users do: node drive.mjs OUTPUT_FOLDER; see browser.sh.
 import {spawn, spawnSync} from "node:child_process";
-import {mkdtempSync, readFileSync, readdirSync, rmSync} from "node:fs";
+import {mkdtempSync, readFileSync, readdirSync, rmSync, writeFileSync} from "node:fs";
 import {createRequire} from "node:module";
 import {tmpdir} from "node:os";
 import {join} from "node:path";
@@ -10,7 +10,26 @@ const env = process.env, output = process.argv[2];
 const puppeteer = createRequire(join(env.DFB_LIVE_NODE_MODULES, "index.js"))("puppeteer-core");
 const mpiexec = env.DFB_MPIEXEC.split(";");
 const scratch = mkdtempSync(join(tmpdir(), "dfb_live_"));
-const scene = ["demo", "--opacity", "1"];
+
+// A mesh and a volume that take little time. Cut by content, bricks would depend on the camera.
+const scene = [join(scratch, "torus.ply"), join(scratch, "cloud_12x12x12_uint8.raw"), "--opacity", "1", "--cut", "volume"];
+{
+  const around = 96, across = 48, vertices = [], faces = [];
+  for (let i = 0; i < around; ++i)
+    for (let j = 0; j < across; ++j) {
+      const a = 2 * Math.PI * i / around, b = 2 * Math.PI * j / across, r = 3 + Math.cos(b);
+      vertices.push([r * Math.cos(a), Math.sin(b) + 0.4 * Math.sin(3 * a), r * Math.sin(a)].map(x => x.toFixed(4)).join(" "));
+      const at = (k, l) => (k % around) * across + l % across;
+      faces.push(`4 ${at(i, j)} ${at(i, j + 1)} ${at(i + 1, j + 1)} ${at(i + 1, j)}`);
+    }
+  writeFileSync(scene[0], `ply\nformat ascii 1.0\nelement vertex ${vertices.length}\nproperty float x\nproperty float y\n` +
+    `property float z\nelement face ${faces.length}\nproperty list uchar int vertex_indices\nend_header\n` +
+    vertices.concat(faces).join("\n") + "\n");
+  writeFileSync(scene[1], Uint8Array.from({length: 12 ** 3}, (_, i) => {
+    const [x, y, z] = [i % 12, Math.floor(i / 12) % 12, Math.floor(i / 144)].map(n => (n - 5.5) / 5.5);
+    return Math.max(0, 255 * (0.9 - Math.hypot(x, 1.6 * y, z) + 0.2 * Math.sin(5 * x) * Math.cos(4 * z)));
+  }));
+}
 
 function check(isRight, text) {
   if (!isRight)
@@ -57,10 +76,10 @@ const until = (page, condition, ...args) => page.waitForFunction(condition, {tim
 const look = (page, what, ...args) => page.evaluate(what, ...args);
 const shows = (page, width, height) =>
   until(page, (w, h) => liveView.state === "shows" && liveView.width === w && liveView.height === h, width, height);
-// The picture of the newest wishes, with all samples, and its statistics.
+// The picture of what this page has asked for last, with all samples, and its statistics.
 const refined = page => until(page, () => {
   const now = liveView.stats;
-  return now && now.frame && now.frame.wishes === now.wishes.number && now.frame.samples >= now.wishes.samples
+  return !liveView.isAsking && now && now.frame && now.frame.wishes >= liveView.asked && now.frame.wishes === now.wishes.number && now.frame.samples >= now.wishes.samples
          && liveView.frame === now.frame.number && now.times[now.times.length - 1][0] === now.frame.number;
 });
 async function drag(page, from, to, steps, options = {}) {
@@ -158,8 +177,9 @@ try {
   await look(page, () => { liveView.latencies.length = 0; });
   await page.mouse.move(400, 400);
   await page.mouse.down();
-  for (let i = 0; await look(page, n => liveView.pictures - n, count) < 100 && i < 5000; ++i) {
+  for (let i = 0; await look(page, n => liveView.pictures - n, count) < 100 && performance.now() - begin < 120000; ++i) {
     await page.mouse.move(400 + 150 * Math.sin(0.05 * i), 400 + 60 * Math.sin(0.031 * i));
+    await look(page, () => new Promise(requestAnimationFrame)); // a mouse has as many events as a screen has pictures
   }
   await page.mouse.up();
   const seconds = (performance.now() - begin) / 1000;
