@@ -1,9 +1,10 @@
 #!/bin/sh
-# sh cmake/install_packages.sh [clang|bench|tests]
+# sh cmake/install_packages.sh [clang|bench|tests|browser]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
 # sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
-# people's programs and those in Fortran, and pictures as EXR and plots need: on Debian and Ubuntu with apt-get; elsewhere
-# says what is missing and exits with 1. Quick when nothing is missing.
+# people's programs and those in Fortran, and pictures as EXR and plots need, with "browser" what drives the page of the
+# live view: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1, but for the live view,
+# which is left out then. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -20,6 +21,7 @@ tools() {
     have c++ || have g++ || have clang++ || echo g++
     have cmake || echo cmake
     have ninja || echo ninja-build
+    have pkg-config || echo pkg-config
     # Any MPI will do; two of them side by side get in each other's way.
     if ! have mpiexec || ! have mpicxx; then
         echo mpich libmpich-dev
@@ -33,9 +35,15 @@ tools() {
     if [ "$with" = tests ] && ! have gfortran; then
         echo gfortran
     fi
+    if [ "$with" = browser ]; then
+        have chromium || echo chromium
+        have node || echo nodejs
+        have npm || echo npm
+    fi
 }
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
+libraries="$libraries libcpp-httplib-dev libturbojpeg0-dev" # the live view
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
 [ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib"
 

@@ -1,7 +1,8 @@
 #!/bin/sh
-# sh examples/demo.sh [SCENE FILE...]
+# sh examples/demo.sh [--live] [SCENE FILE...]
 # Installs what is missing, builds dfb_render (preset "release", in build/release) and renders the files, or a made-up
-# scene, on 4 MPI ranks, each of which has a part of the data. Writes demo.png into the current folder.
+# scene, on 4 MPI ranks, each of which has a part of the data. Writes demo.png into the current folder; with --live shows
+# it in a browser, where it can be turned, until the job is ended there or by Ctrl-C.
 set -eu
 
 ranks=4
@@ -12,10 +13,15 @@ say() {
     echo "demo.sh: $*"
 }
 
+live=
+if [ "${1:-}" = --live ]; then
+    live=--live
+    shift
+fi
 for argument in "$@"; do
     case $argument in
     -*)
-        echo "usage: sh examples/demo.sh [SCENE FILE...]" >&2
+        echo "usage: sh examples/demo.sh [--live] [SCENE FILE...]" >&2
         echo "scene files: NAME_XxYxZ_TYPE.raw volumes, .ply and .obj meshes, .xyz particles; several make one scene" >&2
         exit 2
         ;;
@@ -50,6 +56,10 @@ if [ $# -eq 0 ]; then
     set -- demo
 fi
 say "rendering $* on $ranks ranks"
+if [ -n "$live" ]; then
+    # shellcheck disable=SC2086 # one word per flag
+    exec "$mpiexec" -n $ranks $flags "$build/examples/embree/dfb_render" "$@" --mode data --live
+fi
 rm -f "$picture"
 started=$(date +%s)
 # shellcheck disable=SC2086 # one word per flag

@@ -2,6 +2,9 @@
 // on a periodic grid. The grid is cut in slabs, whose number has nothing to do with that of the ranks: each rank holds
 // a run of them, or none. Every so many steps the slabs are rendered where they lie and become one picture.
 //   mpirun -n 4 in_situ        writes in_situ_0000.ppm and so on; in_situ --help has the options
+//   mpirun -n 4 in_situ --live        shows them in a browser, where they can be turned and the simulation be stopped
+#include "live/interrupt.hpp"
+#include "live/live_view.hpp"
 #include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
@@ -16,6 +19,8 @@
 #include <cstdio>
 #include <iostream>
 #include <map>
+#include <memory>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <system_error>
@@ -162,7 +167,8 @@ private:
 
 // ---- the renderer: one slab into one tile, nothing of MPI ------------------------------------------------------
 
-constexpr int width = 640, height = 480; // of the pictures
+constexpr int width = 640, height = 480; // of the pictures, unless viewers want another size
+constexpr float fieldOfView = 32;        // vertical, in degrees
 constexpr float visible = 0.1f;          // values of v above this are
 constexpr float rayStep = 0.5f;          // voxels from sample to sample
 
@@ -211,12 +217,12 @@ void addSample(float u, float v, const Vec3& gradient, const Vec3& way, const Ve
 
 template <class Tile>
 void renderSlab(const GrayScott& fields, const dfb::PerspectiveCamera& camera, const Vec3& light, const dfb::Box3& box,
-                Tile& tile)
+                const dfb::TileLayout& image, Tile& tile)
 {
     const Vec3 eye = camera.eye(), &lower = box.lower, &upper = box.upper;
     const std::ptrdiff_t dx = 1, dy = fields.v().n, dz = dy * dy;
     tile.forEachPixel([&](int column, int line, float* rgba, float& depth) {
-        const Vec3 way = camera.direction(column + 0.5, line + 0.5, width, height);
+        const Vec3 way = camera.direction(column + 0.5, line + 0.5, image.width(), image.height());
         float enter = 0, leave = 1e6f;
         const auto clip = [&](float a, float b) { // in this order a NaN changes nothing
             enter = std::max(enter, std::min(a, b));
@@ -259,22 +265,28 @@ void renderSlab(const GrayScott& fields, const dfb::PerspectiveCamera& camera, c
 // ---- both together ---------------------------------------------------------------------------------------------
 
 struct Options {
-    int size = 96, steps = 1600, every = 80, slabs = 8;
-    std::string out = "in_situ";
+    int size = 96, steps = 0, every = 80, slabs = 8;
+    std::string out; // empty: no pictures are written
+    std::optional<int> live;
 };
 
-constexpr const char* usage = "usage: in_situ [OPTION VALUE]...\n"
-                              "  --size N      voxels along each side of the grid (96)\n"
-                              "  --steps N     of the simulation (1600)\n"
-                              "  --every N     steps from one picture to the next (80)\n"
-                              "  --slabs N     parts of the grid, which are dealt to the ranks (8)\n"
-                              "  --out PREFIX  of the pictures: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ)\n"
-                              "Exit code: 0: done, 1: the run failed, 2: the command line is wrong.\n";
+constexpr const char* usage =
+    "usage: in_situ [OPTION VALUE]...\n"
+    "  --size N      voxels along each side of the grid (96)\n"
+    "  --steps N     of the simulation (1600; with --live: until it is ended)\n"
+    "  --every N     steps from one picture to the next (80)\n"
+    "  --slabs N     parts of the grid, which are dealt to the ranks (8)\n"
+    "  --out PREFIX  of the pictures: PREFIX_0000.ppm, PREFIX_0001.ppm ... (in_situ; with --live: none)\n"
+    "  --live [PORT] show them in a browser on this machine (port 8080, or one that is free)\n"
+    "Exit code: 0: done, 1: the run failed, 2: the command line is wrong.\n";
 
 // Throws std::invalid_argument.
 Options parse(int argc, char** argv)
 {
     Options options;
+    const auto isNumber = [](const std::string& text) {
+        return !text.empty() && text.find_first_not_of("0123456789") == std::string::npos;
+    };
     const std::map<std::string, int*> numbers = {{"--size", &options.size},
                                                  {"--steps", &options.steps},
                                                  {"--every", &options.every},
@@ -282,7 +294,13 @@ Options parse(int argc, char** argv)
     for (int i = 1; i < argc; i += 2) {
         const std::string name = argv[i], value = i + 1 < argc ? argv[i + 1] : "";
         const auto number = numbers.find(name);
-        if (number != numbers.end()) {
+        if (name == "--live") {
+            options.live = -1;
+            if (!isNumber(value))
+                --i; // the next option
+            else if (value.size() > 5 || (options.live = std::stoi(value)) > 65535)
+                throw std::invalid_argument("--live takes a port from 0 to 65535, not '" + value + "'");
+        } else if (number != numbers.end()) {
             const auto [end, error] = std::from_chars(value.data(), value.data() + value.size(), *number->second);
             if (error != std::errc() || *end || *number->second < 1)
                 throw std::invalid_argument(name + " takes a whole number above 0, not '" + value + "'");
@@ -292,6 +310,10 @@ Options parse(int argc, char** argv)
             throw std::invalid_argument("there is no '" + name + ' ' + value + "'; --help lists the options");
         }
     }
+    if (!options.live && options.steps == 0)
+        options.steps = 1600;
+    if (!options.live && options.out.empty())
+        options.out = "in_situ";
     if (options.size < 8 || options.size > 1024)
         throw std::invalid_argument("--size must be 8 to 1024");
     if (options.slabs > options.size / 2) // ghosts come from the next slab alone
@@ -299,11 +321,144 @@ Options parse(int argc, char** argv)
     return options;
 }
 
-// Returns what went wrong, on all ranks the same.
+using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
+
+// Where a picture is seen from, and where its light comes from: from above, to the left.
+struct Sight {
+    dfb::PerspectiveCamera camera;
+    Vec3 light;
+
+    // `outward`: from what is looked at to the eye.
+    Sight(const Vec3& target, const Vec3& outward, float distance, float c, float s)
+        : camera(dfb::PerspectiveCamera::along(target + distance * outward, -1 * outward, {0, 1, 0}, fieldOfView)),
+          light(dfb::normalize(outward + Vec3{0.6f * s, 0.7f, -0.6f * c}))
+    {
+    }
+};
+
+// From a slow orbit around a grid of n^3 voxels.
+Sight orbit(int n, int step)
+{
+    const float angle = 0.6f + 6e-4f * float(step), c = std::cos(angle), s = std::sin(angle);
+    return {0.5f * float(n - 1) * Vec3{1, 1, 1}, dfb::normalize(Vec3{c, 0.5f, s}), 2.4f * float(n), c, s};
+}
+
+// As the viewers want it.
+Sight wished(int n, const example::LiveCamera& camera)
+{
+    constexpr double degree = 3.14159265358979323846 / 180;
+    const double elevation = std::clamp(camera.elevation, -89.9, 89.9) * degree;
+    const float c = float(std::sin(camera.azimuth * degree)), s = float(std::cos(camera.azimuth * degree)),
+                flat = float(std::cos(elevation));
+    const Vec3 target{float(camera.target[0]), float(camera.target[1]), float(camera.target[2])};
+    return {target, {flat * c, float(std::sin(elevation)), flat * s}, float(camera.distance) * float(n), c, s};
+}
+
+// What the viewers of a live view have to say, on all ranks; nobody says anything if there is none.
+class Viewers {
+public:
+    Viewers(FrameBuffer& fb, const Options& options) : fb_(fb), isLive_(options.live.has_value()) {}
+
+    // Returns why there can be no live view, on all ranks; nothing if there is one or need be none. Collective.
+    std::string open(const Options& options)
+    {
+        if (!isLive_)
+            return {};
+        interrupt_.emplace();
+        std::string error;
+        try {
+            if (fb_.isDisplayRank())
+                view_ = std::make_unique<example::LiveView>("in_situ", *options.live, true);
+        } catch (const std::runtime_error& e) {
+            error = e.what();
+        }
+        if (fb_.allReduce({error.empty()}, FrameBuffer::Reduce::Min)[0] == 0)
+            return error.empty() ? "the display rank cannot listen" : error;
+        const double middle = 0.5 * (options.size - 1);
+        wishes_.camera = {55, 26, 2.4, {middle, middle, middle}};
+        wishes_.width = width;
+        wishes_.height = height;
+        if (!view_)
+            return {};
+        example::LiveScene scene;
+        scene.unit = options.size;
+        scene.fieldOfView = double(fieldOfView);
+        scene.ranks = fb_.size();
+        view_->open(scene, wishes_);
+        std::printf("look at it in a browser on this machine: %s\n", view_->url().c_str());
+        std::fflush(stdout);
+        return {};
+    }
+
+    // Listens, and calls show() where they want another picture of the same step. Returns when the simulation may go
+    // on: at once, or when they have paused it, not before they want that. Returns false if the job is to end.
+    // Collective, outside frames.
+    template <class Show>
+    bool mayGoOn(bool isBetweenPictures, const Show& show)
+    {
+        if (!isLive_)
+            return true;
+        for (;;) {
+            const bool waits = wishes_.isPaused && stepsTaken_ >= wishes_.steps && !isBetweenPictures;
+            const std::uint64_t look = wishes_.look;
+            wishes_ = example::shareWishes(fb_, heard(waits));
+            if (wishes_.ends)
+                return false;
+            if (!wishes_.isPaused)
+                stepsTaken_ = wishes_.steps;
+            if (wishes_.look != look)
+                show();
+            if (!wishes_.isPaused || isBetweenPictures)
+                return true;
+            if (stepsTaken_ < wishes_.steps) {
+                ++stepsTaken_;
+                return true;
+            }
+        }
+    }
+
+    bool isLive() const { return isLive_; }
+    const example::LiveWishes& wishes() const { return wishes_; }
+
+    void show(const dfb::FrameReport& report, int step)
+    {
+        if (!view_)
+            return;
+        example::LivePicture picture;
+        picture.wishes = wishes_;
+        picture.distance = wishes_.camera.distance;
+        picture.step = step;
+        example::tellTiles(fb_, picture);
+        view_->show(fb_.image().rgba8(), fb_.image().width(), fb_.image().height(), report, std::move(picture));
+    }
+
+private:
+    example::LiveWishes heard(bool waits) const
+    {
+        if (view_)
+            return view_->waitForChange(wishes_.number,
+                                        waits ? std::chrono::milliseconds::max() : std::chrono::milliseconds(0));
+        example::LiveWishes mine;
+        mine.ends = example::Interrupt::happened();
+        return mine;
+    }
+
+    FrameBuffer& fb_;
+    bool isLive_;
+    std::optional<example::Interrupt> interrupt_;
+    std::unique_ptr<example::LiveView> view_; // on the display rank
+    example::LiveWishes wishes_;
+    std::int64_t stepsTaken_ = 0;
+};
+
+// Returns what went wrong, on all ranks; rank 0 has the best words for it.
 std::string run(MPI_Comm comm, const Options& options)
 {
-    using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
     FrameBuffer fb(comm, {width, height, dfb::OutputFormat::SRGBA8});
+    Viewers viewers(fb, options);
+    const std::string refused = viewers.open(options);
+    if (!refused.empty())
+        return refused;
 
     const int n = options.size, slabs = options.slabs, ranks = fb.size();
     const auto firstLayer = [=](int slab) { return slab * n / slabs; };
@@ -314,17 +469,7 @@ std::string run(MPI_Comm comm, const Options& options)
 
     dfb::World world; // what there is to be seen of this rank's slabs
     dfb::DataParallelLoop loop(fb, world);
-    double simulationTime = 0, renderingTime = 0;
-    int frames = 0;
-    std::string name;
-    for (int step = 1; step <= options.steps; ++step) {
-        const double started = MPI_Wtime();
-        simulation.advance(fb.executor());
-        const double advanced = MPI_Wtime();
-        simulationTime += advanced - started;
-        if (step % options.every != 0)
-            continue;
-
+    const auto render = [&](const Sight& sight, int step) {
         simulation.prepareRendering();
         world = {};
         for (int slab = begin; slab < end; ++slab) {
@@ -332,27 +477,51 @@ std::string run(MPI_Comm comm, const Options& options)
             if (box.lower.z < box.upper.z)
                 world.add({std::uint32_t(slab), box}); // under the same number on whatever rank it is
         }
-        const float angle = 0.6f + 6e-4f * float(step), c = std::cos(angle), s = std::sin(angle);
-        const Vec3 middle = 0.5f * float(n - 1) * Vec3{1, 1, 1}, outward = dfb::normalize(Vec3{c, 0.5f, s});
-        const dfb::PerspectiveCamera camera(middle + 2.4f * float(n) * outward, middle, {0, 1, 0}, 32);
-        const Vec3 light = dfb::normalize(outward + Vec3{0.6f * s, 0.7f, -0.6f * c}); // from above, to the left
         dfb::FrameConfig params;
         params.background = {0.004f, 0.006f, 0.012f, 1};
         const auto renderBrick = [&](const dfb::Brick& brick, FrameBuffer::Tile& tile) {
-            renderSlab(simulation, camera, light, brick.bounds, tile);
+            renderSlab(simulation, sight.camera, sight.light, brick.bounds, fb.layout(), tile);
         };
-        loop.render(camera, renderBrick, params);
+        viewers.show(loop.render(sight.camera, renderBrick, params), step);
+    };
+    const auto renderAsWished = [&](int step) {
+        const example::LiveWishes& wishes = viewers.wishes();
+        if (wishes.width != fb.layout().width() || wishes.height != fb.layout().height())
+            fb.resize(wishes.width, wishes.height);
+        render(wished(n, wishes.camera), step);
+    };
 
-        char number[16];
-        std::snprintf(number, sizeof number, "_%04d.ppm", frames++);
-        name = options.out + number;
+    double simulationTime = 0, renderingTime = 0;
+    int frames = 0, step = 0;
+    std::string name;
+    while (options.steps == 0 || step < options.steps) {
+        if (!viewers.mayGoOn(step % options.every != 0, [&] { renderAsWished(step); }))
+            break;
+        ++step;
+        const double started = MPI_Wtime();
+        simulation.advance(fb.executor());
+        const double advanced = MPI_Wtime();
+        simulationTime += advanced - started;
+        if (step % options.every != 0)
+            continue;
+
+        if (viewers.isLive())
+            renderAsWished(step);
+        else
+            render(orbit(n, step), step);
         bool isWritten = true;
-        try {
-            if (fb.isDisplayRank())
-                example::writePpm(name, fb.image());
-        } catch (const std::runtime_error&) {
-            isWritten = false;
+        if (!options.out.empty()) {
+            char number[16];
+            std::snprintf(number, sizeof number, "_%04d.ppm", frames);
+            name = options.out + number;
+            try {
+                if (fb.isDisplayRank())
+                    example::writePpm(name, fb.image());
+            } catch (const std::runtime_error&) {
+                isWritten = false;
+            }
         }
+        ++frames;
         if (fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 0) // the others cannot see it
             return name + " cannot be written";
         renderingTime += MPI_Wtime() - advanced;
@@ -363,11 +532,11 @@ std::string run(MPI_Comm comm, const Options& options)
     const double simulated = 1e-6 * double(longest[0]), rendered = 1e-6 * double(longest[1]);
     if (fb.isDisplayRank()) {
         std::printf("%d ranks: %d steps of %d^3 voxels in %.3f s, %d pictures in %.3f s, %.1f %% of the run\n", ranks,
-                    options.steps, n, simulated, frames, rendered, 100 * rendered / (simulated + rendered));
+                    step, n, simulated, frames, rendered, 100 * rendered / (simulated + rendered));
         std::uint64_t hash = 14695981039346656037u; // FNV-1a
         for (std::size_t i = 0; i < 4 * fb.image().pixelCount(); ++i)
             hash = (hash ^ fb.image().rgba8()[i]) * 1099511628211u;
-        if (frames > 0)
+        if (!name.empty())
             std::printf("%s: hash %016" PRIx64 "\n", name.c_str(), hash);
     }
     return {};

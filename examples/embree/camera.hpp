@@ -35,6 +35,28 @@ struct View {
 
 namespace detail {
 inline constexpr double degree = 3.14159265358979323846 / 180.0;
+
+// The axes of the orbit: up, and at right angles to it where azimuth 0 and azimuth 90 are.
+struct OrbitAxes {
+    Vec3d up, front, side;
+
+    explicit OrbitAxes(const View& view) : up(unit(Vec3d(view.up)))
+    {
+        const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, -1, 0) : Vec3d(0, 0, 1);
+        front = unit(towards - up * dot(towards, up));
+        side = cross(up, front);
+    }
+};
+} // namespace detail
+
+// The full vertical angle of the image, in degrees.
+inline float shownAngle(const View& view)
+{
+    if (view.zoom == 1)
+        return view.fieldOfView;
+    const double half =
+        std::tan(0.5 * static_cast<double>(view.fieldOfView) * detail::degree) / static_cast<double>(view.zoom);
+    return static_cast<float>(2 * std::atan(half) / detail::degree);
 }
 
 // What the camera looks at.
@@ -72,6 +94,23 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
     return std::min(1.02 * radius / std::sin(angle), 1000 * unit); // farther away distances have too few digits
 }
 
+// The same view with azimuth, elevation and distance in place of the eye.
+inline View withoutEye(const Focus& focus, View view)
+{
+    if (!view.eye)
+        return view;
+    const detail::OrbitAxes axes(view);
+    const Vec3d arm = Vec3d(*view.eye) - Vec3d(targetOf(focus, view));
+    const double far = length(arm);
+    if (far > 0) {
+        view.elevation = static_cast<float>(std::asin(std::clamp(dot(arm, axes.up) / far, -1.0, 1.0)) / detail::degree);
+        view.azimuth = static_cast<float>(std::atan2(dot(arm, axes.side), dot(arm, axes.front)) / detail::degree);
+    }
+    view.distance = static_cast<float>(far / static_cast<double>(focus.box.largestExtent()));
+    view.eye.reset();
+    return view;
+}
+
 // A camera of any kind at one frame: its rays, and for the library, where boxes project to.
 class FrameCamera {
 public:
@@ -106,26 +145,14 @@ private:
     {
     }
 
-    // The axes of the orbit: up, and at right angles to it where azimuth 0 and azimuth 90 are.
-    struct Axes {
-        Vec3d up, front, side;
-
-        explicit Axes(const View& view) : up(unit(Vec3d(view.up)))
-        {
-            const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, -1, 0) : Vec3d(0, 0, 1);
-            front = unit(towards - up * dot(towards, up));
-            side = cross(up, front);
-        }
-    };
-
     static dfb::PerspectiveCamera orbit(const Focus& focus, const View& view, int frame, int frameCount, int width,
                                         int height)
     {
         using detail::degree;
-        const Axes axes(view);
+        const detail::OrbitAxes axes(view);
         const Vec3d target(targetOf(focus, view));
         const double turn = 360.0 * frame / std::max(1, frameCount);
-        const float angle = view.zoom == 1 ? view.fieldOfView : zoomed(view.fieldOfView, view.zoom);
+        const float angle = shownAngle(view);
         if (view.eye) {
             const Vec3d arm = Vec3d(*view.eye) - target, along = axes.up * dot(arm, axes.up);
             const Vec3d outward =
@@ -143,13 +170,6 @@ private:
         return dfb::PerspectiveCamera::along(eye, rounded(outward * -1.0), rounded(axes.up), angle);
     }
 
-    static float zoomed(float degrees, float zoom)
-    {
-        using detail::degree;
-        const double half = std::tan(0.5 * static_cast<double>(degrees) * degree) / static_cast<double>(zoom);
-        return static_cast<float>(2 * std::atan(half) / degree);
-    }
-
     static AnyCamera cameraOf(const Focus& focus, const View& view, const dfb::PerspectiveCamera& pinhole,
                               double distance)
     {
@@ -157,7 +177,7 @@ private:
         const auto orOne = [](float v) { return v > 0 ? v : 1.0f; }; // of a scene without extent
         const float sharp = orOne(view.focus > 0 ? view.focus * unit : static_cast<float>(distance));
         const Vec3 eye = pinhole.eye(), forward = pinhole.forward(), up = pinhole.up();
-        const float angle = view.zoom == 1 ? view.fieldOfView : zoomed(view.fieldOfView, view.zoom);
+        const float angle = shownAngle(view);
         switch (view.kind) {
         case CameraKind::Perspective: break;
         case CameraKind::DepthOfField: return dfb::ThinLensCamera(eye, forward, up, angle, view.aperture * unit, sharp);

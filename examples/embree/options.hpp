@@ -81,6 +81,8 @@ struct Options : OutputFiles {
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
     bool dither = false;
 
+    std::optional<int> live; // the port of a live view, -1: any; none: there is none
+
     int wallColumns = 0, wallRows = 0; // 0: no wall
     int bezel = 0;
 
@@ -102,6 +104,20 @@ struct ParsedOptions {
 };
 
 namespace detail {
+
+// The arguments in the order that CLI11 takes, from the last on. --live gets its port: what follows it may be a scene.
+inline std::vector<std::string> withPort(int argc, const char* const* argv)
+{
+    std::vector<std::string> words;
+    for (int i = argc - 1; i > 0; --i) {
+        const std::string next = i + 1 < argc ? argv[i + 1] : "";
+        const bool isNumber = !next.empty() && next.find_first_not_of("0123456789") == std::string::npos;
+        words.push_back(argv[i]);
+        if (words.back() == "--live" && !isNumber)
+            words.back() = "--live=-1";
+    }
+    return words;
+}
 
 // All options as they count, for the record; without those that have no value.
 inline std::vector<std::pair<std::string, std::string>>
@@ -397,6 +413,14 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_flag("--dither", options.dither, "Dither the colour of a .png, so that gradients have no bands")
         ->group(picture);
 
+    app.add_option(
+           "--live", options.live,
+           "Show it in a browser on this machine, where it can be turned: prints the address; port 0: any that is "
+           "free; default, without PORT: 8080, or any if that is taken")
+        ->check(detail::number(-1, 65535))
+        ->option_text("[PORT]")
+        ->group(picture);
+
     OutputOptions outputOptions(app, options);
     app.config_formatter(std::make_shared<OptionsFile>());
     app.allow_config_extras(CLI::config_extras_mode::error);
@@ -418,7 +442,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. Of an option that is given twice "
                "the last counts.");
     try {
-        app.parse(argc, argv);
+        app.parse(detail::withPort(argc, argv));
         options.fit = !noFit;
         if (options.interleave > 1 && app.count("--deep") == 0)
             options.deep = options.interleave; // as many pieces as a brick can have on a ray
@@ -438,10 +462,16 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
         if (app.count("--origin") > 0)
             options.origin =
                 detail::parseThree("--origin", origin, -1e12, 1e12, "X,Y,Z with three numbers of at most 1e12");
+        if (options.live && app.count("--spp") == 0)
+            options.spp = 16; // while the camera rests
         const auto refuse = [&app](bool wrong, const char* option, const char* why) {
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
         };
+        for (const char* other : {"--frames", "--output", "--alpha", "--depth", "--aux", "--stats", "--wall",
+                                  "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
+            refuse(options.live.has_value(), other, "does not go with --live");
+        refuse(options.live && options.blend != Blending::Sort, "--blend", "order or nearest does not go with --live");
         const bool isData = options.mode == Mode::Data;
         refuse(options.mode == Mode::Image, "--blend", "does not go with --mode image");
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})

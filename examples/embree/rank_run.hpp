@@ -67,7 +67,7 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.image.width = o.width;
     config.image.height = o.height;
     config.image.format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F
-                          : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify
+                          : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify || o.live
                               ? dfb::OutputFormat::SRGBA8
                               : dfb::OutputFormat::None;
     config.image.dither = o.dither;
@@ -169,6 +169,24 @@ inline void writeImage(const std::string& path, const dfb::Image& image, bool is
     }
 }
 
+// Runs `step` on every rank. If it throws on any, the lowest of those says why, and all return false.
+template <class FrameBuffer, class Step>
+bool onAllRanks(FrameBuffer& fb, const Step& step)
+{
+    std::string error;
+    bool failed = false;
+    try {
+        step();
+    } catch (const std::exception& e) {
+        error = e.what();
+        failed = true;
+    }
+    const auto lowest = fb.allReduce({failed ? fb.rank() : fb.size()}, FrameBuffer::Reduce::Min).front();
+    if (lowest == fb.rank())
+        std::fprintf(stderr, "dfb_render: %s\n", error.c_str());
+    return lowest == fb.size();
+}
+
 template <class TileOp, class PixelOp>
 class RankRun {
     // It is made over a connection, whatever the transport of that is.
@@ -247,30 +265,22 @@ private:
     // Of Frame::addFigure(), for that. No brick and tile have it.
     static constexpr std::uint64_t cannotWriteKey = ~std::uint64_t{0};
 
-    // Runs `step` on every rank. If it throws on any, the lowest of those says why, and all return false.
+    // As the function of that name; its end counts as compositing: waiting for others.
     template <class Step>
     bool onAllRanks(const Step& step)
     {
-        std::string error;
-        bool failed = false;
-        try {
+        return example::onAllRanks(*fb_, [&] {
+            struct AtEnd {
+                PhaseClock& clock;
+                ~AtEnd() { clock.enter(Phase::Compositing); }
+            } const atEnd{clock_};
             step();
-        } catch (const std::exception& e) {
-            error = e.what();
-            failed = true;
-        }
-        clock_.enter(Phase::Compositing); // waiting for others
-        const auto lowest = fb_->allReduce({failed ? fb_->rank() : fb_->size()}, Reduce::Min).front();
-        if (lowest == fb_->rank())
-            std::fprintf(stderr, "dfb_render: %s\n", error.c_str());
-        return lowest == fb_->size();
+        });
     }
 
     void load()
     {
-        const Loaders loaders(
-            fb_->rank(), fb_->size(), [this](const Loaders::Bytes& bytes) { return fb_->allGather(bytes); },
-            [this](const std::vector<std::int64_t>& values) { return fb_->allReduce(values, Reduce::Sum); });
+        const Loaders loaders = loadersOf(*fb_);
         scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
         bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
     }

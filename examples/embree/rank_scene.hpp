@@ -32,6 +32,15 @@ inline RenderSettings renderSettings(const Options& options)
     return settings;
 }
 
+// The ranks of a framebuffer, which outlives them. No frame may be open while they load.
+template <class FrameBuffer>
+Loaders loadersOf(FrameBuffer& fb)
+{
+    return Loaders(
+        fb.rank(), fb.size(), [&fb](const Loaders::Bytes& bytes) { return fb.allGather(bytes); },
+        [&fb](const std::vector<std::int64_t>& values) { return fb.allReduce(values, dfb::Reduce::Sum); });
+}
+
 // Collective. Throws std::runtime_error that names the file, the same on all ranks.
 inline Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
 {

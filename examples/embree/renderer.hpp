@@ -78,6 +78,17 @@ public:
             hasIsosurfaces_ |= !volume.look().isovalues.empty();
     }
 
+    // Takes view, frames of a turn, image size and passes of `settings` for the tiles that are rendered from now on.
+    // Not while one is.
+    void look(const RenderSettings& settings)
+    {
+        settings_.view = settings.view;
+        settings_.frames = settings.frames;
+        settings_.width = settings.width;
+        settings_.height = settings.height;
+        settings_.passes = settings.passes;
+    }
+
     // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and
     // pixels where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and
     // one for each camera ray that comes near. From any number of threads.

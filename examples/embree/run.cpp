@@ -15,6 +15,8 @@ bool isImageParallel(const Options& o)
 // Picks the operations that the options ask for.
 int runOver(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
 {
+    if (o.live)
+        return runLive(std::move(connection), o, threads);
     if (isImageParallel(o))
         return runImageParallel(std::move(connection), transport, o, threads);
     const auto run = [&](auto tileOp, auto pixelOp) {

@@ -17,5 +17,7 @@ int runMpi(MPI_Comm communicator, const Options& options, int threads);
 // Of either; where every rank has the whole scene.
 int runImageParallel(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& options,
                      int threads);
+// Of either; with --live.
+int runLive(std::shared_ptr<dfb::Connection> connection, const Options& options, int threads);
 
 } // namespace example

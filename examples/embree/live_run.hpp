@@ -1,0 +1,294 @@
+// LiveRun: renders what the viewers of a live view want to see, until they end the job.
+#pragma once
+
+#include "rank_run.hpp"
+
+#include <interrupt.hpp>
+#include <live_view.hpp>
+
+#include <charconv>
+#include <chrono>
+#include <cstdio>
+#include <cstring>
+#include <memory>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+namespace example {
+
+// Frames accumulate while the camera rests.
+using LiveBlend = dfb::Progressive<Blend>;
+using LiveSingle = dfb::Progressive<Single>;
+
+template <class TileOp>
+class LiveRun {
+    using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, dfb::InprocTransport>;
+    static constexpr bool isSingle = std::is_same_v<TileOp, LiveSingle>;
+
+public:
+    LiveRun(std::shared_ptr<dfb::Connection> connection, const Options& o, int threads)
+        : o_(o), fb_(connection, configOf(o, threads > 0 ? threads : connection->threadShare()))
+    {
+    }
+
+    // The exit code, the same on all ranks. Throws as FrameBuffer::Frame::end() does.
+    int run()
+    {
+        const Interrupt interrupt;
+        const auto listen = [&] {
+            if (fb_.isDisplayRank())
+                view_ = std::make_unique<LiveView>(titleOf(o_.scene), *o_.live, false);
+        };
+        if (!onAllRanks(fb_, listen) || !onAllRanks(fb_, [&] { load(); }))
+            return exitFailed;
+        open();
+        while (agree())
+            renderNext();
+        if (fb_.isDisplayRank())
+            std::printf("ended after %lld frames\n", static_cast<long long>(frames_));
+        return 0;
+    }
+
+private:
+    // What a renderer throws when nobody wants the frame any more. The text is how ranks know the error.
+    struct Superseded : std::runtime_error {
+        static constexpr const char* text = "the viewers want another picture";
+        Superseded() : std::runtime_error(text) {}
+    };
+
+    // The scene's name, or those of its files without their folders.
+    static std::string titleOf(const std::vector<std::string>& scene)
+    {
+        std::string title;
+        for (const std::string& path : scene)
+            title += (title.empty() ? "" : ", ") + path.substr(path.rfind('/') + 1);
+        return title;
+    }
+
+    void load()
+    {
+        const Loaders loaders = loadersOf(fb_);
+        Options fromAllSides = o_; // bricks are cut for a camera that goes around
+        fromAllSides.frames = 36;
+        scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
+        o_.view = withoutEye(scene_->info.focus, o_.view);
+        settings_ = renderSettings(o_);
+        world_ = worldOf(*scene_, settings_);
+        params_.maxLayers = static_cast<int>(scene_->bounds.size());
+        const std::array<float, 3> behind = o_.background.value_or(std::array<float, 3>{0, 0, 0});
+        params_.background = {behind[0], behind[1], behind[2], 1};
+    }
+
+    void open()
+    {
+        if (o_.mode == Mode::Mixed)
+            shared_.emplace(fb_, world_);
+        if (!fb_.isDisplayRank())
+            return;
+        for (const std::string& note : scene_->notes)
+            std::fprintf(stderr, "dfb_render: %s\n", note.c_str());
+        LiveScene scene;
+        const auto outward = [&](float azimuth) {
+            RenderSettings settings = settings_;
+            settings.view.azimuth = azimuth;
+            settings.view.elevation = 0;
+            return frameCamera(scene_->info, settings, 0).pinhole().forward() * -1.0f;
+        };
+        const Vec3 front = outward(0), side = outward(90);
+        const auto list = [](const Vec3& v) {
+            return std::array<double, 3>{static_cast<double>(v.x), static_cast<double>(v.y), static_cast<double>(v.z)};
+        };
+        scene.axes = {list(side), list(cross(front, side)), list(front)};
+        scene.unit = static_cast<double>(scene_->info.focus.box.largestExtent());
+        scene.fieldOfView = static_cast<double>(shownAngle(o_.view));
+        scene.mostSamples = std::max(256, o_.spp);
+        scene.ranks = fb_.size();
+        LiveWishes home;
+        home.camera.azimuth = static_cast<double>(o_.view.azimuth);
+        home.camera.elevation = static_cast<double>(o_.view.elevation);
+        home.camera.distance = static_cast<double>(o_.view.distance.value_or(0));
+        home.camera.target = list(o_.view.target.value_or(scene_->info.focus.box.center()));
+        home.width = o_.width;
+        home.height = o_.height;
+        home.samples = o_.spp;
+        view_->open(scene, home);
+        std::printf("look at it in a browser on this machine: %s\n", view_->url().c_str());
+        std::fflush(stdout);
+    }
+
+    // All ranks come to know what the viewers want. Waits for that while there is nothing to do. Returns false if the
+    // job is to end.
+    bool agree()
+    {
+        LiveWishes mine;
+        mine.ends = Interrupt::happened();
+        if (fb_.isDisplayRank())
+            mine = view_->waitForChange(wishes_.number, patience());
+        const LiveWishes now = shareWishes(fb_, mine);
+        if (!isBegun_ || now.look != wishes_.look)
+            look(now);
+        wishes_ = now;
+        isBegun_ = true;
+        return !now.ends;
+    }
+
+    // How long to wait for a change before the picture is refined.
+    std::chrono::milliseconds patience() const
+    {
+        if (!isBegun_ || !isDrawn_ || (samples_ > 0 && samples_ < wishes_.samples))
+            return std::chrono::milliseconds(0);
+        if (isRefined())
+            return std::chrono::milliseconds::max();
+        return std::chrono::milliseconds(150); // the camera may be moving
+    }
+    bool isRefined() const { return isDrawn_ && (wishes_.samples == 1 || samples_ >= wishes_.samples); }
+
+    void look(const LiveWishes& wishes)
+    {
+        if (wishes.width != fb_.config().image.width || wishes.height != fb_.config().image.height)
+            fb_.resize(wishes.width, wishes.height);
+        settings_.width = wishes.width;
+        settings_.height = wishes.height;
+        View& view = settings_.view;
+        view.azimuth = static_cast<float>(wishes.camera.azimuth);
+        view.elevation = static_cast<float>(wishes.camera.elevation);
+        view.distance.reset();
+        if (wishes.camera.distance > 0)
+            view.distance = static_cast<float>(wishes.camera.distance);
+        const std::array<double, 3>& t = wishes.camera.target;
+        const Vec3 target{static_cast<float>(t[0]), static_cast<float>(t[1]), static_cast<float>(t[2])};
+        const Vec3 center = scene_->info.focus.box.center();
+        view.target.reset();
+        if (target.x != center.x || target.y != center.y || target.z != center.z)
+            view.target = target;
+        isDrawn_ = false;
+        samples_ = 0;
+    }
+
+    void renderNext()
+    {
+        if (isRefined())
+            return;
+        const bool isFirst = !isDrawn_;
+        if (isFirst || samples_ == 0) {
+            // A single sample is in the middle of its pixel; several are all over it.
+            settings_.passes = isFirst ? 1 : 2;
+            for (auto& cells : scene_->renderers)
+                for (Renderer& renderer : cells)
+                    renderer.look(settings_);
+            ++params_.accumulationId;
+        }
+        std::optional<dfb::FrameReport> report;
+        try {
+            report = render(isFirst ? LiveView::anyLook : wishes_.look);
+        } catch (const dfb::FrameError& e) {
+            const bool isSuperseded = e.info().kind == dfb::ErrorKind::Cancelled
+                                      || (e.info().kind == dfb::ErrorKind::UserCode
+                                          && e.info().message.find(Superseded::text) != std::string::npos);
+            if (!isSuperseded)
+                throw;
+            samples_ = 0; // accumulation begins anew
+            return;
+        }
+        ++frames_;
+        isDrawn_ = true;
+        samples_ += !isFirst;
+        // The first of several samples alone is worse than the one in the middle.
+        if (fb_.isDisplayRank() && samples_ != 1)
+            show(*report);
+    }
+
+    // Renders a frame, which fails on all ranks if the viewers do not want `look` any more.
+    dfb::FrameReport render(std::uint64_t look)
+    {
+        const FrameCamera camera = frameCamera(scene_->info, settings_, 0);
+        const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
+            checkWanted(look);
+            return static_cast<double>(scene_->of(brick.id).front().renderTile(tile, 0));
+        };
+        auto frame = [&] {
+            if constexpr (isSingle) {
+                return imageLoop_.start(
+                    [&](auto& tile) {
+                        checkWanted(look);
+                        scene_->renderers.front().front().renderTile(tile, 0);
+                    },
+                    params_);
+            } else if (shared_) {
+                return (mixedLoop_ ? *mixedLoop_ : mixedLoop_.emplace(fb_, *shared_, inTurn_))
+                    .start(camera, renderBrick, params_);
+            } else {
+                return (dataLoop_ ? *dataLoop_ : dataLoop_.emplace(fb_, world_)).start(camera, renderBrick, params_);
+            }
+        }();
+        if (!view_)
+            return frame.end();
+        std::optional<dfb::FrameReport> report;
+        view_->whileWatching(
+            look, [&] { frame.cancel(); }, [&] { report = frame.end(); });
+        return *report;
+    }
+
+    void checkWanted(std::uint64_t look) const
+    {
+        if (Interrupt::happened() || (view_ && view_->hasMoved(look)))
+            throw Superseded();
+    }
+
+    void show(const dfb::FrameReport& report)
+    {
+        LivePicture picture;
+        picture.wishes = wishes_;
+        const Focus& focus = scene_->info.focus;
+        picture.distance = cameraDistance(focus, settings_.view, settings_.width, settings_.height)
+                           / static_cast<double>(focus.box.largestExtent());
+        picture.samples = std::max(1, samples_);
+        picture.camera = words(picture.samples);
+        tellTiles(fb_, picture);
+        view_->show(fb_.image().rgba8(), fb_.image().width(), fb_.image().height(), report, std::move(picture));
+    }
+
+    // What dfb_render makes the same picture with.
+    std::string words(int samples) const
+    {
+        const View& view = settings_.view;
+        const auto number = [](float value) { // the shortest text that is read as this number again
+            char text[32];
+            return std::string(text, std::to_chars(text, text + sizeof text, value).ptr);
+        };
+        std::string text = "--azimuth " + number(view.azimuth) + " --elevation " + number(view.elevation);
+        if (view.distance)
+            text += " --camera-distance " + number(*view.distance);
+        if (view.target)
+            text += " --target " + number(view.target->x) + ',' + number(view.target->y) + ',' + number(view.target->z);
+        text += " --size " + std::to_string(settings_.width) + 'x' + std::to_string(settings_.height);
+        if (samples > 1)
+            text += " --spp " + std::to_string(samples);
+        return text + " --background " + number(params_.background[0]) + ',' + number(params_.background[1]) + ','
+               + number(params_.background[2]);
+    }
+
+    Options o_;
+    FrameBuffer fb_;
+    std::unique_ptr<LiveView> view_; // on the display rank
+    std::unique_ptr<RankScene> scene_;
+    RenderSettings settings_;
+    dfb::FrameConfig params_;
+    dfb::World world_;
+    std::optional<dfb::SharedWorld> shared_;
+    dfb::RoundRobinBricks inTurn_;
+    std::optional<dfb::DataParallelLoop<FrameBuffer>> dataLoop_;
+    std::optional<dfb::MixedParallelLoop<FrameBuffer, dfb::RoundRobinBricks>> mixedLoop_;
+    dfb::ImageParallelLoop<FrameBuffer> imageLoop_{fb_, dfb::WorkDistribution::Owned};
+
+    LiveWishes wishes_; // that all ranks know of
+    bool isBegun_ = false;
+    bool isDrawn_ = false; // a picture of this look
+    int samples_ = 0;      // that have been accumulated for it since
+    std::int64_t frames_ = 0;
+};
+
+} // namespace example

@@ -1,0 +1,18 @@
+# Run with: cmake -DIN=<file> -DOUT=<.cpp> -P embed.cmake
+# Makes the file a string of the program.
+file(READ ${IN} text)
+# Compilers need not take a literal of more than 65536 characters; adjacent ones are one.
+string(LENGTH "${text}" length)
+set(literals "")
+set(at 0)
+while(at LESS length)
+  string(SUBSTRING "${text}" ${at} 8000 part)
+  string(APPEND literals "\n    R\"page(${part})page\"")
+  math(EXPR at "${at} + 8000")
+endwhile()
+file(WRITE ${OUT} "// Made of view.html.
+namespace example {
+extern const char viewPage[];
+const char viewPage[] =${literals};
+} // namespace example
+")

@@ -1,0 +1,56 @@
+// Interrupt: Ctrl-C, or the signal by which a launcher ends a job, becomes a fact that a loop can ask for.
+#pragma once
+
+#include <csignal>
+#include <ctime>
+
+namespace example {
+
+// While one lives, SIGINT and SIGTERM are noted. A signal that comes more than two seconds after the first ends the
+// process as usual: then nobody has asked. (A terminal and a launcher may both send the first.)
+class Interrupt {
+public:
+    Interrupt() : beforeInt_(install(SIGINT)), beforeTerm_(install(SIGTERM)) {}
+    ~Interrupt()
+    {
+        sigaction(SIGINT, &beforeInt_, nullptr);
+        sigaction(SIGTERM, &beforeTerm_, nullptr);
+    }
+    Interrupt(const Interrupt&) = delete;
+    Interrupt& operator=(const Interrupt&) = delete;
+
+    // Whether this process was told to end. Any thread.
+    static bool happened() { return first_ != 0; }
+
+private:
+    // When the first one came, in seconds of a clock that begins with 1; 0: none has.
+    static inline volatile std::sig_atomic_t first_ = 0;
+
+    static void note(int signal)
+    {
+        timespec now{};
+        clock_gettime(CLOCK_MONOTONIC, &now);
+        const auto seconds = static_cast<std::sig_atomic_t>(now.tv_sec + 1);
+        if (first_ == 0) {
+            first_ = seconds;
+        } else if (seconds - first_ > 2) {
+            std::signal(signal, SIG_DFL);
+            std::raise(signal);
+        }
+    }
+
+    static struct sigaction install(int signal)
+    {
+        struct sigaction action {
+        }, before{};
+        action.sa_handler = note;
+        action.sa_flags = SA_RESTART;
+        sigemptyset(&action.sa_mask);
+        sigaction(signal, &action, &before);
+        return before;
+    }
+
+    struct sigaction beforeInt_, beforeTerm_;
+};
+
+} // namespace example

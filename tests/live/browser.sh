@@ -1,0 +1,48 @@
+#!/bin/sh
+# sh tests/live/browser.sh [--only-if-installed] [OUTPUT FOLDER]
+# Tests the page of the live view in Debian's Chromium, driven by puppeteer-core. Installs both, puppeteer-core into
+# ~/.cache/dfb-live (or $DFB_LIVE_NODE_MODULES), builds dfb_render and in_situ (preset "release", unless $DFB_RENDER and
+# $DFB_IN_SITU say where they are), and writes screenshots to the output folder, build/live_browser.
+# With --only-if-installed: exits with 77 where something is missing.
+set -eu
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
+modules=${DFB_LIVE_NODE_MODULES:-}
+[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
+
+only_if_installed=
+if [ "${1:-}" = --only-if-installed ]; then
+    only_if_installed=1
+    shift
+fi
+output=${1:-$root/build/live_browser}
+
+missing() {
+    echo "browser.sh: skipped: $1 is missing; sh tests/live/browser.sh installs what the test needs"
+    exit 77
+}
+
+if [ -n "$only_if_installed" ]; then
+    command -v chromium >/dev/null 2>&1 || missing chromium
+    command -v node >/dev/null 2>&1 || missing node
+    [ -d "$modules/node_modules/puppeteer-core" ] || missing puppeteer-core
+else
+    sh "$root/cmake/install_packages.sh" browser
+    if [ ! -d "$modules/node_modules/puppeteer-core" ]; then
+        mkdir -p "$modules"
+        # The last major version for node 18 and 20.
+        npm install --prefix "$modules" --no-audit --no-fund puppeteer-core@24
+    fi
+fi
+
+if [ -z "${DFB_RENDER:-}" ]; then
+    (
+        cd "$root"
+        cmake --preset release
+        cmake --build --preset release --target dfb_render in_situ
+    )
+    DFB_RENDER=$root/build/release/examples/embree/dfb_render
+    DFB_IN_SITU=$root/build/release/examples/in_situ
+fi
+mkdir -p "$output"
+DFB_RENDER=$DFB_RENDER DFB_IN_SITU=$DFB_IN_SITU DFB_MPIEXEC=${DFB_MPIEXEC:-mpiexec;-n} DFB_LIVE_NODE_MODULES=$modules \
+    exec node "$root/tests/live/browser/drive.mjs" "$output"
