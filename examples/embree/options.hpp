@@ -468,8 +468,9 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             if (wrong && app.count(option) > 0)
                 throw CLI::ValidationError(option, why);
         };
-        for (const char* other : {"--frames", "--output", "--alpha", "--depth", "--aux", "--stats", "--wall",
-                                  "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
+        for (const char* other :
+             {"--frames", "--output", "--png-bits", "--layers", "--cinema", "--alpha", "--depth", "--aux", "--stats",
+              "--wall", "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
             refuse(options.live.has_value(), other, "does not go with --live");
         refuse(options.live && options.blend != Blending::Sort, "--blend", "order or nearest does not go with --live");
         const bool isData = options.mode == Mode::Data;
@@ -549,7 +550,7 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             file.look = merged(file.look, options.look);
             options.files.push_back(file);
             if (app.count("--ao") == 0 && !isVolume && options.path == 0)
-                options.ao = 16;
+                options.ao = options.live ? 4 : 16; // samples accumulate in a live view
         }
         app.get_option("--ao")->default_str(std::to_string(options.ao));
         options.values = detail::valuesOf(app, wordsOf, false);
