@@ -485,6 +485,12 @@ TEST_CASE("What a clip box opens shows its inner side, and lets light in", "[loo
     settings.aoDistance = 0.01f;
     const auto lit = render(scene, scene.bounds, settings);
     CHECK(lit->color[4 * (64 * 32 + 32)] == tile->color[4 * (64 * 32 + 32)]);
+    // Half of the light comes through the opening, and none through a whole ball.
+    settings.aoDistance = 2;
+    const auto bowl = render(scene, scene.bounds, settings);
+    const float part = bowl->color[4 * (64 * 32 + 32)] / tile->color[4 * (64 * 32 + 32)];
+    CHECK(part > 0.5f);
+    CHECK(part < 0.9f);
 }
 
 // ---- colour, opacity, placement -------------------------------------------------------------------------------------
