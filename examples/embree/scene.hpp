@@ -140,8 +140,8 @@ struct Scene {
     // Collective: of a mesh, or of spheres, this rank's share.
     void add(MeshShare share, bool fit, const Loaders& loaders)
     {
-        const std::vector<std::uint32_t> vertices = verticesOf(share);
-        const VertexLookup lookup(vertices, share.vertexBegins, loaders);
+        const VertexSet vertices(share.mesh.triangles);
+        const VertexLookup lookup(vertices.list(), share.vertexBegins, loaders);
         MeshPart part = partOf(share, lookup, vertices);
         const Placement placement = fitToUnitCube(unionOf(boxOf(part.mesh), loaders), fit);
         for (Vec3& p : part.mesh.positions)
