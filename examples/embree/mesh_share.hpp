@@ -8,6 +8,7 @@
 #include "mesh.hpp"
 
 #include <algorithm>
+#include <bitset>
 #include <cstdint>
 #include <optional>
 #include <string>
@@ -68,6 +69,59 @@ inline MeshShare dealMesh(Mesh whole, const Loaders& loaders)
     return share;
 }
 
+// The vertices that some triangles have: a bit for each of a range.
+class VertexSet {
+public:
+    explicit VertexSet(const std::vector<Triangle>& triangles)
+    {
+        std::uint32_t least = ~std::uint32_t{0}, greatest = 0;
+        for (const Triangle& triangle : triangles)
+            for (const std::uint32_t index : triangle) {
+                least = std::min(least, index);
+                greatest = std::max(greatest, index);
+            }
+        if (triangles.empty())
+            return;
+        first_ = least / 64 * 64;
+        words_.resize((greatest - first_) / 64 + 1);
+        for (const Triangle& triangle : triangles)
+            for (const std::uint32_t index : triangle)
+                words_[(index - first_) / 64] |= std::uint64_t{1} << (index % 64);
+        std::uint32_t count = 0;
+        for (const std::uint64_t word : words_) {
+            before_.push_back(count);
+            count += countOf(word);
+        }
+    }
+
+    // How many of them are before one.
+    std::uint32_t indexOf(std::uint32_t vertex) const
+    {
+        const std::size_t word = (vertex - first_) / 64;
+        return before_[word] + countOf(words_[word] & ((std::uint64_t{1} << (vertex % 64)) - 1));
+    }
+    // Ascending.
+    std::vector<std::uint32_t> list() const
+    {
+        std::vector<std::uint32_t> all;
+        for (std::size_t word = 0; word < words_.size(); ++word)
+            for (std::uint32_t bit = 0; bit < 64; ++bit)
+                if ((words_[word] >> bit & 1) != 0)
+                    all.push_back(first_ + 64 * static_cast<std::uint32_t>(word) + bit);
+        return all;
+    }
+
+private:
+    static std::uint32_t countOf(std::uint64_t word)
+    {
+        return static_cast<std::uint32_t>(std::bitset<64>(word).count());
+    }
+
+    std::uint32_t first_ = 0;
+    std::vector<std::uint64_t> words_;
+    std::vector<std::uint32_t> before_; // how many are before each word
+};
+
 // Asks the ranks that have vertices for what they have of them, as often as one likes. Collective, all of it.
 class VertexLookup {
 public:
@@ -120,32 +174,18 @@ private:
 };
 
 // The triangles of a share with their vertices. Collective.
-inline MeshPart partOf(MeshShare& share, const VertexLookup& lookup, std::vector<std::uint32_t> vertices)
+inline MeshPart partOf(MeshShare& share, const VertexLookup& lookup, const VertexSet& vertices)
 {
     MeshPart part;
-    part.vertices = std::move(vertices);
+    part.vertices = vertices.list();
     part.firstTriangle = static_cast<std::uint32_t>(share.firstTriangle);
     part.mesh.positions = lookup.of(share.mesh.positions);
     part.mesh.colors = lookup.of(share.mesh.colors);
     part.mesh.triangles = std::move(share.mesh.triangles);
     for (Triangle& triangle : part.mesh.triangles)
         for (std::uint32_t& index : triangle)
-            index = static_cast<std::uint32_t>(std::lower_bound(part.vertices.begin(), part.vertices.end(), index)
-                                               - part.vertices.begin());
+            index = vertices.indexOf(index);
     return part;
-}
-
-// The vertices that the triangles of a share have, ascending.
-inline std::vector<std::uint32_t> verticesOf(const MeshShare& share)
-{
-    std::vector<std::uint32_t> vertices;
-    vertices.reserve(3 * share.mesh.triangles.size());
-    for (const Triangle& triangle : share.mesh.triangles)
-        vertices.insert(vertices.end(), triangle.begin(), triangle.end());
-    std::sort(vertices.begin(), vertices.end());
-    vertices.erase(std::unique(vertices.begin(), vertices.end()), vertices.end());
-    vertices.shrink_to_fit();
-    return vertices;
 }
 
 // Collective: what vertexNormals() of the whole mesh has for the vertices of each part, to the bit: the rank that has a
@@ -206,9 +246,11 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
     return lookup.of(normals);
 }
 
-// Collective: gives each rank as many of the triangles, in the same order. Ranks that have read equal parts of a text
-// may have only vertices, or only triangles. `begins`: where the triangles of each rank begin, and the end.
-inline void evenOut(std::vector<Triangle>& triangles, std::vector<std::uint64_t>& begins, const Loaders& loaders)
+// Collective: gives each rank as many of some things, in the same order, unless it is about so. Ranks that have read
+// equal parts of a text may have only vertices, or only triangles. `begins`: where those of each rank begin, and the
+// end.
+template <class T>
+void evenOut(std::vector<T>& things, const std::vector<std::uint64_t>& begins, const Loaders& loaders)
 {
     const std::uint64_t all = begins.back(), ranks = begins.size() - 1;
     bool isEven = true;
@@ -221,18 +263,17 @@ inline void evenOut(std::vector<Triangle>& triangles, std::vector<std::uint64_t>
     for (std::size_t r = 0; r < ranks; ++r) {
         const auto [from, to] = Loaders::shareOf(all, static_cast<int>(r), loaders.size());
         const auto at = [&](std::uint64_t i) {
-            return triangles.begin()
-                   + static_cast<std::ptrdiff_t>(std::clamp<std::uint64_t>(i, first, first + triangles.size()) - first);
+            return things.begin()
+                   + static_cast<std::ptrdiff_t>(std::clamp<std::uint64_t>(i, first, first + things.size()) - first);
         };
-        Loaders::pack(std::vector<Triangle>(at(from), at(to)), parts[r]);
-        begins[r] = from;
+        Loaders::pack(std::vector<T>(at(from), at(to)), parts[r]);
     }
-    triangles = {};
+    things = {};
     for (const Loaders::Bytes& bytes : loaders.exchange(std::move(parts))) {
         const std::byte* at = bytes.data();
-        std::vector<Triangle> more;
+        std::vector<T> more;
         Loaders::unpack(at, more);
-        triangles.insert(triangles.end(), more.begin(), more.end());
+        things.insert(things.end(), more.begin(), more.end());
     }
 }
 
@@ -241,19 +282,23 @@ inline void evenOut(std::vector<Triangle>& triangles, std::vector<std::uint64_t>
 inline std::optional<MeshShare> finished(MeshShare share, const std::string& name, const Loaders& loaders, Notes* notes)
 {
     const std::uint64_t most = std::uint64_t{1} << 32;
-    std::vector<std::uint64_t> begins = loaders.beginsOf(share.mesh.triangles.size());
-    if (begins.back() == 0 || begins.back() >= most || share.vertexBegins.back() >= most)
+    const std::vector<std::uint64_t> triangles = loaders.beginsOf(share.mesh.triangles.size());
+    if (triangles.back() == 0 || triangles.back() >= most || share.vertexBegins.back() >= most)
         return std::nullopt;
-    evenOut(share.mesh.triangles, begins, loaders);
-    share.firstTriangle = begins[static_cast<std::size_t>(loaders.rank())];
     // Colours are used if all vertices have one.
-    const std::vector<Vec3>& colors = share.mesh.colors;
+    std::vector<Vec3>& colors = share.mesh.colors;
     const auto sums = loaders.sumOf(
         {static_cast<std::int64_t>(colors.size()), std::count_if(colors.begin(), colors.end(), detail::isColor)});
     const auto all = static_cast<std::int64_t>(share.vertexBegins.back());
     if (sums[0] > 0 && (sums[0] != all || sums[1] != all))
-        share.mesh.colors.assign(1, Vec3{-1, 0, 0}); // no colour: so they are left out on all ranks
+        colors.assign(1, Vec3{-1, 0, 0}); // no colour: so they are left out on all ranks
     detail::finishColors(share.mesh, name, notes);
+    if (sums[0] == all && sums[1] == all)
+        evenOut(colors, share.vertexBegins, loaders);
+    evenOut(share.mesh.positions, share.vertexBegins, loaders);
+    evenOut(share.mesh.triangles, triangles, loaders);
+    share.vertexBegins = loaders.beginsOf(share.mesh.positions.size());
+    share.firstTriangle = loaders.beginsOf(share.mesh.triangles.size())[static_cast<std::size_t>(loaders.rank())];
     return share;
 }
 

@@ -153,8 +153,8 @@ struct Scene {
     // Collective: of a mesh, or of spheres, this rank's share. They throw the same on all ranks.
     void add(MeshShare share, bool fit, const Loaders& loaders, const FileLook& look = {}, const std::string& name = {})
     {
-        const std::vector<std::uint32_t> vertices = verticesOf(share);
-        const VertexLookup lookup(vertices, share.vertexBegins, loaders);
+        const VertexSet vertices(share.mesh.triangles);
+        const VertexLookup lookup(vertices.list(), share.vertexBegins, loaders);
         MeshPart part = partOf(share, lookup, vertices);
         MeshObject object = placed(part.mesh, fit, look, name, loaders);
         object.normals = normalsOf(part, share.vertexBegins, lookup, loaders);

@@ -312,7 +312,7 @@ TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[head
     // The same field on two grids: a linear one, so that nothing is lost by leaving slices out.
     const auto sampler = [](int slices, float thickness) {
         VolumeSource source;
-        source.info.dims = {33, 33, slices};
+        source.info.dims = {17, 17, slices}; // longest along the thick sides
         source.info.type = VoxelType::Float32;
         source.info.maximum = 80;
         source.info.spacing = {1, 1, thickness};
@@ -335,7 +335,7 @@ TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[head
     light.direction = unit(Vec3{0.3f, 0.4f, 0.9f});
     const Vec3 view = unit(Vec3{-0.2f, -0.5f, -0.8f});
     int lit = 0;
-    for (const Vec3& p : {Vec3{0.5f, 0.5f, 0.5f}, Vec3{0.7f, 0.3f, 0.4f}, Vec3{0.2f, 0.8f, 0.15f}}) {
+    for (const Vec3& p : {Vec3{0.5f, 0.5f, 0.5f}, Vec3{0.65f, 0.35f, 0.4f}, Vec3{0.4f, 0.6f, 0.15f}}) {
         const auto a = cubes.shade(cubes.toVoxel(p), view, light), b = slabs.shade(slabs.toVoxel(p), view, light);
         CHECK(a.alpha > 0.0f);
         CHECK(std::fabs(a.alpha - b.alpha) < 1e-5f);
