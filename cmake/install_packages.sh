@@ -42,7 +42,7 @@ tools() {
     fi
 }
 
-libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
+libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev libhdf5-dev"
 libraries="$libraries libcpp-httplib-dev libturbojpeg0-dev" # the live view
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
 [ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib"
@@ -65,6 +65,7 @@ CLI11 CLI/CLI.hpp
 nlohmann-json nlohmann/json.hpp
 xxHash xxhash.h
 libpng png.h
+HDF5 hdf5.h hdf5/serial/hdf5.h
 $([ "$with" != bench ] || echo GoogleBenchmark benchmark/benchmark.h)
 END
 }

@@ -4,6 +4,7 @@
 #include "camera.hpp"
 #include "config_file.hpp"
 #include "file_look.hpp"
+#include "hdf5_path.hpp"
 #include "look_options.hpp"
 #include "option_values.hpp"
 #include "output_options.hpp"
@@ -154,11 +155,11 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
     app.add_option(
            "scene", options.scene,
            "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
-           "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, or name_XxYxZ_TYPE.raw with uint8, "
-           "int8, uint16, int16, uint32, int32, float32 or float64, and 'be' behind it where it is big-endian; "
-           "meshes: .ply, .obj; atoms: .xyz. Behind a file's name may stand how it is shown, as in "
-           "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, scale, rotate, translate, "
-           "and as the options of that name clip, transfer, range, isovalue")
+           "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, a data set of an HDF5 file, "
+           "FILE.h5:/PATH, or name_XxYxZ_TYPE.raw with uint8, int8, uint16, int16, uint32, int32, float32 or float64, "
+           "and 'be' behind it where it is big-endian; meshes: .ply, .obj; atoms: .xyz. Behind a file's name may stand "
+           "how it is shown, as in a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, "
+           "scale, rotate, translate, and as the options of that name clip, transfer, range, isovalue")
         ->required()
         ->option_text("SCENE...");
     app.option_defaults()->take_last(); // of an option that is given twice the last counts
@@ -537,9 +538,10 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
             } catch (const std::invalid_argument& wrong) {
                 throw CLI::ValidationError("scene", wrong.what());
             }
-            if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty())
+            const bool isInHdf5 = isHdf5(file.path);
+            if (const std::string wrong = detail::checkEnding(file.path, endings); !wrong.empty() && !isInHdf5)
                 throw CLI::ValidationError("scene", wrong + ", or the word synthetic or demo");
-            const bool isVolume = isVolumeEnding(detail::endingOf(file.path));
+            const bool isVolume = isInHdf5 || isVolumeEnding(detail::endingOf(file.path));
             if (!isVolume && (!file.look.transfer.empty() || file.look.range || !file.look.isovalues.empty()))
                 throw CLI::ValidationError("scene", "'" + word + "': transfer, range and isovalue are for volumes");
             if (isVolume && !isZero(file.look.rotate))

@@ -1,6 +1,7 @@
 // The files of a scene: who reads them, and how they come into it.
 #pragma once
 
+#include "hdf5_volume.hpp"
 #include "obj.hpp"
 #include "ply_share.hpp"
 #include "scene.hpp"
@@ -76,7 +77,9 @@ inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame 
     const std::string& path = file.path;
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));
     Notes notes;
-    if (isVolumeEnding(ending))
+    if (isHdf5(path))
+        scene.add(openHdf5(path, loaders, grid, lookOf), fit, file.look);
+    else if (isVolumeEnding(ending))
         scene.add(openVolume(path, loaders, grid, lookOf), fit, file.look);
     else if (ending == ".ply")
         detail::addMesh(scene, file, fit, {parsePly, readPlyShare}, loaders, notes);
@@ -86,7 +89,7 @@ inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame 
         detail::addSpheres(scene, file, fit, xyzFrame, loaders, notes);
     else
         throw std::runtime_error(path + ": unknown type '" + ending
-                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .ply, .obj or .xyz");
+                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .h5:/dataset, .ply, .obj or .xyz");
     for (std::string& note : loaders.linesOfFirst(notes))
         scene.notes.push_back(std::move(note));
 }

@@ -106,6 +106,36 @@ inline VoxelRange scanVoxels(std::istream& stream, const VolumeFile& file, std::
     return range;
 }
 
+// Of a whole volume: the range that its values are normalised over. Throws std::runtime_error that begins with `name`.
+inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, const std::string& name)
+{
+    const float lo = range.lo, hi = range.hi;
+    info.least = lo;
+    info.notFinite = range.notFinite;
+    if (lo > hi)
+        throw std::runtime_error(name + ": not one of its voxels is finite");
+    info.minimum = lo < 0 && hi > 0 && isFloat ? 0 : lo;
+    info.maximum = hi;
+    if (hi == info.minimum) { // all alike: something above them, or else below
+        info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
+        if (!std::isfinite(info.maximum)) {
+            info.minimum = hi / 2;
+            info.maximum = hi;
+        }
+    }
+}
+
+// Of floats in memory, `count` of them.
+inline void replaceNotFinite(std::byte* voxels, int count, float replacement)
+{
+    for (int i = 0; i < count; ++i, voxels += sizeof(float)) {
+        float value;
+        std::memcpy(&value, voxels, sizeof value);
+        if (!std::isfinite(value))
+            std::memcpy(voxels, &replacement, sizeof value);
+    }
+}
+
 // Collective: findVoxels() in this rank's own stream, and the range, of which each rank looks at a share of the
 // voxels. Throws std::runtime_error, the same on all ranks.
 inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const Loaders& loaders = {})
@@ -122,20 +152,7 @@ inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const L
     info.type = file.format.inMemory();
     info.spacing = file.spacing;
     info.origin = file.origin;
-    const float lo = range.lo, hi = range.hi;
-    info.least = lo;
-    info.notFinite = range.notFinite;
-    if (lo > hi)
-        throw std::runtime_error(file.path + ": not one of its voxels is finite");
-    info.minimum = lo < 0 && hi > 0 && file.format.isFloat() ? 0 : lo;
-    info.maximum = hi;
-    if (hi == info.minimum) { // all alike: something above them, or else below
-        info.maximum = hi + std::max(1.0f, std::fabs(hi) / 1024);
-        if (!std::isfinite(info.maximum)) {
-            info.minimum = hi / 2;
-            info.maximum = hi;
-        }
-    }
+    setRange(info, range, file.format.isFloat(), file.path);
     return info;
 }
 
@@ -164,12 +181,7 @@ inline RowReader rowReader(std::shared_ptr<std::istream> stream, const VolumeFil
         if (!format.isAsInMemory())
             format.convert(stored.data(), static_cast<std::size_t>(x1 - x0), out);
         if (format.isFloat())
-            for (int i = 0; i < x1 - x0; ++i) {
-                float value;
-                std::memcpy(&value, out + 4 * i, sizeof value);
-                if (!std::isfinite(value))
-                    std::memcpy(out + 4 * i, &minimum, sizeof value);
-            }
+            replaceNotFinite(out, x1 - x0, minimum);
     };
 }
 
@@ -293,6 +305,18 @@ inline VolumeFile volumeFileOf(const std::string& path, const VoxelGrid& grid = 
 // Collective: how a volume is to be shown, of one of which all but its look is known.
 using LookOf = std::function<VolumeLook(const VolumeSource&)>;
 
+// Collective: how a volume whose voxels can be read is shown, and where there is something to see.
+inline void lookInto(VolumeSource& source, const Loaders& loaders, const LookOf& lookOf)
+{
+    source.look.lo = source.info.minimum;
+    source.look.hi = source.info.maximum;
+    if (lookOf)
+        source.look = lookOf(source);
+    source.visible = visibleVoxels(source, loaders);
+    if (source.visible->points.empty())
+        source.range = rangeOf(source, loaders);
+}
+
 // Collective: the ranks share what has to be known of the whole volume. Without `lookOf` it is shown as a generated
 // volume is. Throws std::runtime_error, the same on all ranks.
 inline VolumeSource openVolume(const std::string& path, const Loaders& loaders = {}, const VoxelGrid& grid = {},
@@ -317,13 +341,7 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
     source.open = [open, file, info = source.info, counter = loaders.readCounter()] {
         return rowReader(open(), file, info, counter);
     };
-    source.look.lo = source.info.minimum;
-    source.look.hi = source.info.maximum;
-    if (lookOf)
-        source.look = lookOf(source);
-    source.visible = visibleVoxels(source, loaders);
-    if (source.visible->points.empty())
-        source.range = rangeOf(source, loaders);
+    lookInto(source, loaders, lookOf);
     return source;
 }
 
