@@ -3,6 +3,7 @@
 #include "together.hpp"
 
 #include <scene_files.hpp>
+#include <voxel_block.hpp>
 
 #include <algorithm>
 #include <cstring>
