@@ -1,9 +1,9 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
-# people's programs and those in Fortran need: on Debian and Ubuntu with apt-get; elsewhere says what is missing and
-# exits with 1. Quick when nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (90 MB),
+# the examples of other people's programs and those in Fortran need: on Debian and Ubuntu with apt-get; elsewhere says what
+# is missing and exits with 1. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -37,7 +37,7 @@ tools() {
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev"
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
-[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev"
+[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev python3-dev python3-numpy pybind11-dev"
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {
