@@ -215,6 +215,21 @@ class Errors(unittest.TestCase):
         self.assertRegex(str(error_of(lambda: dfb.MatrixCamera(np.eye(3), np.eye(4)))), r"view is \(3, 3\)")
         self.assertRegex(str(error_of(lambda: dfb.run_ranks(0, print))), "number of ranks is 0")
 
+    def test_wrong_sizes(self):
+        for size, text in ((("wide", 5), "the new size is 'wide' x 5: it must be two ints"), ((0, 5), "0x5"),
+                           ((2.5, 5), "the new size is 2.5 x 5")):
+            def again(thing, rank):
+                self.assertEqual((thing.width, thing.height), (WIDTH, HEIGHT))
+                thing.composite(*pixels(rank))
+                self.assertEqual(thing.image is not None, rank == 0)
+                thing.resize(20, 10)
+                self.assertEqual((thing.width, thing.height), (20, 10))
+
+            with self.subTest(size=size):
+                errors = errors_of(compositor, lambda thing, rank: thing.resize(*(size if rank == 1 else (20, 10))), again)
+                self.assertEqual({(e.kind, e.rank, str(e)) for e in errors}, {("InvalidArgument", 1, str(errors[0]))})
+                self.assertIn(text, str(errors[0]))
+
     def test_a_rank_leaves(self):
         """An exception that leaves `with` on one rank ends the waiting of the others; run_ranks raises it itself."""
         seen = []
@@ -238,6 +253,23 @@ class Errors(unittest.TestCase):
             self.fail("no KeyError")
         self.assertEqual(seen, [("Transport", 1)] * 2)
         self.assertEqual(dfb.run_ranks(2, lambda comm: (comm.rank, comm.size)), [(0, 2), (1, 2)])
+
+    def test_an_exception_leaves_with(self):
+        """It ends the waiting of the others at once, although the rank goes on and no time-out has passed."""
+        def rank(comm):
+            try:
+                with compositor(comm, timeout=20) as thing:
+                    if comm.rank == 1:
+                        raise KeyError("lost")
+                    return error_of(lambda: thing.composite(*pixels(comm.rank)))
+            except KeyError:
+                return None
+
+        errors = dfb.run_ranks(RANKS, rank)
+        self.assertIsNone(errors[1])
+        for error in (errors[0], errors[2]):
+            self.assertEqual((error.kind, error.rank), ("Transport", 1))
+            self.assertIn("an exception has ended its connection", str(error))
 
     def test_closed_and_busy(self):
         thing = compositor(None)

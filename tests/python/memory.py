@@ -129,6 +129,8 @@ class Memory(unittest.TestCase):
                 compositor.composite(rgba if comm.rank else None, depth if comm.rank else None)
                 copies = compositor.image_on_all_ranks()
                 compositor.resize(20, 10)  # they are nobody else's
+                for copy in copies:
+                    copy += 0  # may be written to
                 return copies
 
         for image, depths in dfb.run_ranks(3, rank):

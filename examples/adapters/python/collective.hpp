@@ -54,18 +54,28 @@ public:
     }
 
     // Throws BufferError on a rank that has arrays of the image, and dfb.Error on the others.
-    void resize(int width, int height)
+    void resize(const py::object& width, const py::object& height)
     {
         const Use use(*this);
-        if (views_->any())
+        const bool hasArrays = views_->any();
+        const Number newWidth(width), newHeight(height);
+        if (hasArrays)
             veto_.set("there are arrays of the image, so it cannot get another size: delete them, or take copies");
+        else if (!newWidth.isOne || !newHeight.isOne)
+            veto_.set("the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints");
+        const std::string vetoed = veto_.text();
         try {
-            withoutGil(*Cause::make(), [&] { object_->resize(width, height); });
+            withoutGil(*Cause::make(), [&] {
+                if (vetoed.empty())
+                    object_->resize(newWidth.value, newHeight.value);
+                else
+                    object_->resize(1, 1); // is refused on all ranks
+            });
         } catch (py::error_already_set& error) {
-            if (!veto_.isSet())
-                throw;
-            py::raise_from(error, PyExc_BufferError, veto_.text().c_str());
             veto_.clear();
+            if (!hasArrays)
+                throw;
+            py::raise_from(error, PyExc_BufferError, vetoed.c_str());
             throw py::error_already_set();
         }
     }
@@ -117,6 +127,18 @@ protected:
 
     private:
         Collective& owner_;
+    };
+
+    struct Number {
+        bool isOne = false;
+        int value = 0;
+
+        explicit Number(const py::object& from)
+        {
+            py::detail::make_caster<int> caster;
+            isOne = caster.load(from, true);
+            value = isOne ? py::detail::cast_op<int>(caster) : 0;
+        }
     };
 
     Object& object() const

@@ -20,25 +20,17 @@ namespace dfb_python {
 
 namespace py = pybind11;
 
-// Arrays that may not be written to: the library knows which pixels of its image are background, and leaves them.
-inline py::array readOnly(const py::dtype& type, std::vector<py::ssize_t> shape, const void* data,
-                          const py::capsule& base)
-{
-    py::array array(type, std::move(shape), data, base);
-    array.attr("setflags")(py::arg("write") = false);
-    return array;
-}
-
-inline py::object colorOf(const dfb::Image& image, const py::capsule& base)
+inline py::array colorOf(const dfb::Image& image, const py::capsule& base)
 {
     const bool isFloat = image.format() == dfb::OutputFormat::RGBA32F;
-    return readOnly(isFloat ? py::dtype::of<float>() : py::dtype::of<std::uint8_t>(),
-                    {image.height(), image.width(), 4}, image.bytes(), base);
+    return py::array(isFloat ? py::dtype::of<float>() : py::dtype::of<std::uint8_t>(),
+                     std::vector<py::ssize_t>{image.height(), image.width(), 4}, image.bytes(), base);
 }
 
-inline py::object depthOf(const dfb::Image& image, const py::capsule& base)
+inline py::array depthOf(const dfb::Image& image, const py::capsule& base)
 {
-    return readOnly(py::dtype::of<float>(), {image.height(), image.width()}, image.depth(), base);
+    return py::array(py::dtype::of<float>(), std::vector<py::ssize_t>{image.height(), image.width()}, image.depth(),
+                     base);
 }
 
 // Only with the GIL.
@@ -54,15 +46,22 @@ public:
 
     py::object color(const dfb::Image& image) const
     {
-        return image.empty() ? py::object(py::none()) : colorOf(image, base());
+        return image.empty() ? py::object(py::none()) : readOnly(colorOf(image, base()));
     }
     py::object depth(const dfb::Image& image) const
     {
-        return image.empty() || !image.hasDepth() ? py::object(py::none()) : depthOf(image, base());
+        return image.empty() || !image.hasDepth() ? py::object(py::none()) : readOnly(depthOf(image, base()));
     }
 
 private:
     using Held = std::shared_ptr<std::shared_ptr<dfb::MemoryPool>>;
+
+    // The library knows which pixels of its image are background, and does not write those again.
+    static py::object readOnly(const py::array& array)
+    {
+        array.attr("setflags")(py::arg("write") = false);
+        return array;
+    }
 
     py::capsule base() const
     {
@@ -79,7 +78,8 @@ inline py::tuple ownArrays(dfb::Image image)
         return py::make_tuple(py::none(), py::none());
     auto* kept = new dfb::Image(std::move(image));
     const py::capsule base(kept, [](void* held) { delete static_cast<dfb::Image*>(held); });
-    return py::make_tuple(colorOf(*kept, base), kept->hasDepth() ? depthOf(*kept, base) : py::object(py::none()));
+    const py::object depth = kept->hasDepth() ? py::object(depthOf(*kept, base)) : py::object(py::none());
+    return py::make_tuple(colorOf(*kept, base), depth);
 }
 
 } // namespace dfb_python
