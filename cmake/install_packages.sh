@@ -1,7 +1,7 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (90 MB),
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (100 MB),
 # the examples of other people's programs and those in Fortran need: on Debian and Ubuntu with apt-get; elsewhere says what
 # is missing and exits with 1. Quick when nothing is missing.
 set -eu

@@ -53,16 +53,30 @@ def run_ranks(count, function):
     comm is a ThreadCommunicator. No MPI is needed. Waits for all. If a function raises, ranks that wait for it get an Error
     of the kind "Transport", and its exception is raised here. Objects that a function leaves open are closed at its end.
     """
+    thrown = []
+
     def rank(comm):
         leaves = True
         try:
             result = function(comm)
             leaves = False
             return result
+        except BaseException as error:
+            thrown.append(error)
+            raise
         finally:
             _end_all(lambda other: other is comm, leaves)
 
-    return _dfb.run_ranks(count, rank)
+    try:
+        return _dfb.run_ranks(count, rank)
+    except BaseException:
+        if not thrown:
+            raise
+    try:
+        # The first, but not what a rank has heard of another that leaves, which may have come sooner.
+        raise min(thrown, key=lambda error: isinstance(error, Error) and error.kind == "Transport")
+    finally:
+        thrown.clear()
 
 
 def _refuse(message):
