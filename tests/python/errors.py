@@ -233,11 +233,12 @@ class Errors(unittest.TestCase):
     def test_a_rank_leaves(self):
         """run_ranks() raises the exception of a rank, also if others have come to their end first, as they heard of it."""
         seen = []
-        ahead = threading.Barrier(RANKS, timeout=20)
+        together = threading.Barrier(RANKS, timeout=20)
 
         def waiting(comm):
             with compositor(comm) as thing:
                 thing.composite(*pixels(comm.rank))
+                together.wait()  # or a rank may hear of it in this call
                 if comm.rank == 1:
                     raise KeyError("lost")
                 error = error_of(lambda: thing.composite(*pixels(comm.rank)))
@@ -248,7 +249,7 @@ class Errors(unittest.TestCase):
             try:
                 waiting(comm)
             finally:
-                ahead.wait()
+                together.wait()
 
         for _ in range(10):  # now this one, now that one comes first
             seen.clear()

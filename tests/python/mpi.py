@@ -95,6 +95,7 @@ def leaves():
     """The last rank leaves by an exception; the others hear of it and do not wait. The job ends with an error."""
     with dfb.ImageCompositor(comm, WIDTH, HEIGHT) as compositor:
         compositor.composite(*pixels(RANK))
+        comm.Barrier()  # or a rank may hear of it in this call
         if RANK == SIZE - 1:
             raise KeyError("lost")
         error = error_of(lambda: compositor.composite(*pixels(RANK)))
