@@ -1,10 +1,10 @@
 #!/bin/sh
 # sh cmake/install_packages.sh [clang|bench|tests|browser]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
-# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the examples of other
-# people's programs and those in Fortran, and pictures as EXR and plots need, with "browser" what drives the page of the
-# live view: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1, but for the live view,
-# which is left out then. Quick when nothing is missing.
+# sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (100 MB),
+# the examples of other people's programs and those in Fortran, and pictures as EXR and plots need, with "browser" what
+# drives the page of the live view: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1, but
+# for the live view, which is left out then. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -45,7 +45,9 @@ tools() {
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev libhdf5-dev"
 libraries="$libraries libcpp-httplib-dev libturbojpeg0-dev" # the live view
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
-[ "$with" != tests ] || libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib"
+if [ "$with" = tests ]; then
+    libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib python3-dev python3-numpy pybind11-dev"
+fi
 
 # Without dpkg: the header that each library is known by.
 missing_headers() {

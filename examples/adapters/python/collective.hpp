@@ -1,0 +1,160 @@
+// Collective: an object of the library with an image, whose construction, calls and end are collective.
+#pragma once
+
+#include "errors.hpp"
+#include "ranks.hpp"
+#include "settings.hpp"
+#include "views.hpp"
+
+#include <dfb/frame.hpp>
+#include <dfb/image.hpp>
+
+#include <pybind11/pybind11.h>
+
+#include <memory>
+#include <optional>
+#include <string>
+#include <utility>
+
+namespace dfb_python {
+
+// `Object`: dfb::ImageCompositor, or a class with such members. All members with the GIL, which they release while they
+// wait.
+template <class Object>
+class Collective {
+public:
+    // `make(connection)` returns the object. Collective.
+    template <class Make>
+    Collective(const py::object& comm, const Settings& settings, const Make& make)
+        : frame_(settings.frame), veto_(settings.veto)
+    {
+        auto connection = connect(comm);
+        views_.emplace(connection->pool());
+        const py::gil_scoped_release released;
+        object_ = make(std::move(connection));
+    }
+    Collective(const Collective&) = delete;
+    Collective& operator=(const Collective&) = delete;
+
+    int rank() const { return object().rank(); }
+    int size() const { return object().size(); }
+    int width() const { return object().config().image.width; }
+    int height() const { return object().config().image.height; }
+    int displayRank() const { return object().config().image.displayRank; }
+    bool isClosed() const { return !object_; }
+
+    // The last picture on the display rank, else None.
+    py::object image() { return Use(*this).views().color(object().image()); }
+    py::object depth() { return Use(*this).views().depth(object().image()); }
+
+    py::tuple imageOnAllRanks()
+    {
+        const Use use(*this);
+        return ownArrays(withoutGil(*Cause::make(), [&] { return object_->imageOnAllRanks(); }));
+    }
+
+    // Throws BufferError on a rank that has arrays of the image, and dfb.Error on the others.
+    void resize(const py::object& width, const py::object& height)
+    {
+        const Use use(*this);
+        const bool hasArrays = views_->any();
+        const Number newWidth(width), newHeight(height);
+        if (hasArrays)
+            veto_.set("there are arrays of the image, so it cannot get another size: delete them, or take copies");
+        else if (!newWidth.isOne || !newHeight.isOne)
+            veto_.set("the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints");
+        const std::string vetoed = veto_.text();
+        try {
+            withoutGil(*Cause::make(), [&] {
+                if (vetoed.empty())
+                    object_->resize(newWidth.value, newHeight.value);
+                else
+                    object_->resize(1, 1); // is refused on all ranks
+            });
+        } catch (py::error_already_set& error) {
+            veto_.clear();
+            if (!hasArrays)
+                throw;
+            py::raise_from(error, PyExc_BufferError, vetoed.c_str());
+            throw py::error_already_set();
+        }
+    }
+
+    // Arrays of the image stay as they are.
+    void close()
+    {
+        if (!object_)
+            return;
+        const Use use(*this);
+        views_.reset();
+        const py::gil_scoped_release released;
+        object_.reset();
+    }
+
+    // In place of close() on a rank that leaves because of an exception: the others may never come to their end. They
+    // get an error of the kind Transport. Waits for nobody.
+    void leave()
+    {
+        if (!object_)
+            return;
+        const Use use(*this);
+        views_.reset();
+        struct Left {};
+        const py::gil_scoped_release released;
+        try {
+            const auto ended = std::move(object_); // whose connection asks whether an exception passes
+            throw Left();
+        } catch (const Left&) {
+        }
+    }
+
+protected:
+    // A call of the object, which takes one at a time. Throws InvalidArgument if there cannot be one.
+    class Use {
+    public:
+        explicit Use(Collective& owner) : owner_(owner)
+        {
+            owner.object();
+            if (owner.isInUse_)
+                throw dfb::InvalidArgument("another call of this object has not returned yet");
+            owner.isInUse_ = true;
+        }
+        Use(const Use&) = delete;
+        Use& operator=(const Use&) = delete;
+        ~Use() { owner_.isInUse_ = false; }
+
+        const ImageViews& views() const { return *owner_.views_; }
+
+    private:
+        Collective& owner_;
+    };
+
+    struct Number {
+        bool isOne = false;
+        int value = 0;
+
+        explicit Number(const py::object& from)
+        {
+            py::detail::make_caster<int> caster;
+            isOne = caster.load(from, true);
+            value = isOne ? py::detail::cast_op<int>(caster) : 0;
+        }
+    };
+
+    Object& object() const
+    {
+        if (!object_)
+            throw dfb::InvalidArgument("this object is closed");
+        return *object_;
+    }
+    const dfb::FrameConfig& frame() const noexcept { return frame_; }
+
+private:
+    dfb::FrameConfig frame_;
+    Veto veto_;
+    std::unique_ptr<Object> object_;
+    std::optional<ImageViews> views_;
+    bool isInUse_ = false;
+};
+
+} // namespace dfb_python

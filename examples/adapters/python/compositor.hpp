@@ -1,0 +1,72 @@
+// Compositor: dfb::ImageCompositor for Python.
+#pragma once
+
+#include "arrays.hpp"
+#include "collective.hpp"
+
+#include <dfb/image_compositor.hpp>
+
+#include <memory>
+#include <string>
+#include <utility>
+
+namespace dfb_python {
+
+struct CompositorSettings : Settings {
+    dfb::ImageBlend blend = dfb::ImageBlend::Nearest;
+
+    explicit CompositorSettings(const py::dict& from) : Settings(from)
+    {
+        attempt([&] {
+            const auto name = argument<std::string>(from, "blend", "a str");
+            if (name == "depth")
+                blend = dfb::ImageBlend::ByDepth;
+            else if (name == "order")
+                blend = dfb::ImageBlend::InOrder;
+            else if (name != "nearest")
+                throw dfb::InvalidArgument("blend is '" + name + "': it must be 'nearest', 'depth' or 'order'");
+        });
+    }
+};
+
+class Compositor : public Collective<dfb::ImageCompositor> {
+public:
+    Compositor(const py::object& comm, const CompositorSettings& settings)
+        : Collective(comm, settings, [&](std::shared_ptr<dfb::Connection>&& connection) {
+              return std::make_unique<dfb::ImageCompositor>(std::move(connection), settings.blend, settings.config);
+          })
+    {
+    }
+
+    // What is wrong with the arguments on one rank comes out on all.
+    dfb::FrameReport composite(const py::object& rgba, const py::object& depth, const py::dict& options)
+    {
+        const Use use(*this);
+        const auto cause = Cause::make();
+        InputArrays arrays;
+        int place = -1;
+        const std::exception_ptr wrong = caught(*cause, [&] {
+            arrays.read(rgba, depth, options, object().config().image);
+            if (!options["order"].is_none())
+                place = argument<int>(options, "order", "an int or None");
+        });
+        return withoutGil(*cause, [&] {
+            if (!wrong)
+                return object().composite(arrays.image, place, frame());
+            object().startFailed(wrong, frame());
+            return object().end();
+        });
+    }
+
+    // In place of composite(): throws on all ranks.
+    void fail(const std::string& why)
+    {
+        const Use use(*this);
+        withoutGil(*Cause::make(), [&] {
+            object().startFailed(std::make_exception_ptr(std::runtime_error(why)), frame());
+            object().end();
+        });
+    }
+};
+
+} // namespace dfb_python

@@ -1,0 +1,222 @@
+// FrameBuffer: dfb::DistributedFrameBuffer and its loop over bricks, for Python.
+#pragma once
+
+#include "collective.hpp"
+#include "operation.hpp"
+#include "tiles.hpp"
+
+#include <dfb/distributed_framebuffer.hpp>
+#include <dfb/ops/sort_last.hpp>
+#include <dfb/render/cameras.hpp>
+#include <dfb/render/loops.hpp>
+#include <dfb/render/world.hpp>
+
+#include <array>
+#include <exception>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <type_traits>
+#include <utility>
+#include <variant>
+#include <vector>
+
+namespace dfb_python {
+
+using AnyCamera = std::variant<dfb::PerspectiveCamera, dfb::MatrixCamera>;
+using RenderBrick = std::function<void(const dfb::Brick&, RenderTile&)>;
+
+// A framebuffer with any of the operations. The members are those of dfb::DistributedFrameBuffer.
+class AnyFrameBuffer {
+public:
+    virtual ~AnyFrameBuffer() = default;
+
+    virtual int rank() const = 0;
+    virtual int size() const = 0;
+    virtual const dfb::FrameBufferConfig& config() const = 0;
+    virtual const dfb::Image& image() const = 0;
+    virtual dfb::Image imageOnAllRanks() = 0;
+    virtual void resize(int width, int height) = 0;
+    // A whole frame; its operation's data if it is a NumpyOperation.
+    virtual dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,
+                                    const dfb::FrameConfig& frame, const NumpyOperation::FrameData& data) = 0;
+    // In its place, on a rank that cannot. Throws on all ranks.
+    virtual dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
+                                  const NumpyOperation::FrameData& data) = 0;
+};
+
+template <class TileOp>
+class FrameBufferOf final : public AnyFrameBuffer {
+    // The connection is there already, of whichever transport.
+    using Inner = dfb::DistributedFrameBuffer<TileOp, dfb::NoPixelOp, dfb::InprocTransport>;
+    static_assert(std::is_same_v<typename Inner::Tile, RenderTile>);
+
+public:
+    FrameBufferOf(std::shared_ptr<dfb::Connection>&& connection, const dfb::FrameBufferConfig& config)
+        : inner_(std::move(connection), config)
+    {
+    }
+
+    int rank() const override { return inner_.rank(); }
+    int size() const override { return inner_.size(); }
+    const dfb::FrameBufferConfig& config() const override { return inner_.config(); }
+    const dfb::Image& image() const override { return inner_.image(); }
+    dfb::Image imageOnAllRanks() override { return inner_.imageOnAllRanks(); }
+    void resize(int width, int height) override { inner_.resize(width, height); }
+
+    dfb::FrameReport render(const dfb::World& world, const AnyCamera& camera, const RenderBrick& draw,
+                            const dfb::FrameConfig& frame, const NumpyOperation::FrameData& data) override
+    {
+        dfb::DataParallelLoop loop(inner_, world);
+        return std::visit([&](const auto& seen) { return loop.render(seen, draw, frame, own(data)); }, camera);
+    }
+
+    dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame,
+                          const NumpyOperation::FrameData& data) override
+    {
+        frame.declared = true; // as the loop's
+        auto open = inner_.begin(frame, own(data));
+        open.abort(why);
+        return open.end();
+    }
+
+private:
+    static typename Inner::TileFrameData own([[maybe_unused]] const NumpyOperation::FrameData& data)
+    {
+        if constexpr (std::is_same_v<TileOp, NumpyOperation>)
+            return data;
+        else
+            return {};
+    }
+
+    Inner inner_;
+};
+
+struct FrameBufferSettings : Settings {
+    enum class Blend { Alpha, Nearest, Function };
+    Blend blend = Blend::Alpha;
+    std::shared_ptr<py::object> function;
+
+    explicit FrameBufferSettings(const py::dict& from) : Settings(from)
+    {
+        attempt([&] {
+            const py::object given = from["blend"];
+            if (PyCallable_Check(given.ptr())) {
+                blend = Blend::Function;
+                function.reset(new py::object(given), [](py::object* kept) {
+                    const py::gil_scoped_acquire gil;
+                    delete kept;
+                });
+                return;
+            }
+            const auto name = argument<std::string>(from, "blend", "'alpha', 'nearest' or a function");
+            if (name == "nearest")
+                blend = Blend::Nearest;
+            else if (name != "alpha")
+                throw dfb::InvalidArgument("blend is '" + name + "': it must be 'alpha', 'nearest' or a function");
+        });
+    }
+
+    std::unique_ptr<AnyFrameBuffer> make(std::shared_ptr<dfb::Connection>&& connection) const
+    {
+        switch (blend) {
+        case Blend::Nearest: return std::make_unique<FrameBufferOf<dfb::DepthComposite>>(std::move(connection), config);
+        case Blend::Function: return std::make_unique<FrameBufferOf<NumpyOperation>>(std::move(connection), config);
+        case Blend::Alpha: break;
+        }
+        return std::make_unique<FrameBufferOf<dfb::AlphaBlend>>(std::move(connection), config);
+    }
+};
+
+class FrameBuffer : public Collective<AnyFrameBuffer> {
+public:
+    FrameBuffer(const py::object& comm, const FrameBufferSettings& settings)
+        : Collective(
+            comm, settings,
+            [&](std::shared_ptr<dfb::Connection>&& connection) { return settings.make(std::move(connection)); }),
+          function_(settings.function)
+    {
+    }
+
+    // Calls draw(brick, tile) for each brick and each tile that it may be seen in, on several threads in turn. What is
+    // wrong on one rank comes out on all.
+    dfb::FrameReport render(const py::object& bricks, const py::object& camera, const py::object& draw)
+    {
+        const Use use(*this);
+        const auto cause = Cause::make();
+        std::vector<py::object> objects;
+        dfb::World world;
+        std::optional<AnyCamera> seen;
+        const std::exception_ptr wrong = caught(*cause, [&] {
+            for (const py::handle brick : bricks) {
+                world.add(brickOf(brick));
+                objects.push_back(py::reinterpret_borrow<py::object>(brick));
+            }
+            seen = cameraOf(camera);
+            if (!PyCallable_Check(draw.ptr()))
+                throw dfb::InvalidArgument("the renderer is " + shown(draw) + ": it must be a function");
+        });
+        const NumpyOperation::FrameData data{function_, cause};
+        const auto& picture = object().config().image;
+        const RenderBrick render = [&](const dfb::Brick& brick, RenderTile& tile) {
+            withPython(*cause, [&] {
+                const py::object given = py::cast(PythonTile(tile, picture.width, picture.height));
+                draw(objects[static_cast<std::size_t>(&brick - world.bricks().data())], given);
+                given.cast<const PythonTile&>().copyTo(tile);
+            });
+        };
+        return withoutGil(*cause, [&] {
+            return wrong ? object().fail(wrong, frame(), data) : object().render(world, *seen, render, frame(), data);
+        });
+    }
+
+    // In place of render(): throws on all ranks.
+    void fail(const std::string& why)
+    {
+        const Use use(*this);
+        const auto cause = Cause::make();
+        withoutGil(*cause, [&] {
+            object().fail(std::make_exception_ptr(std::runtime_error(why)), frame(), {function_, cause});
+        });
+    }
+
+private:
+    static dfb::Vec3 pointOf(const py::handle& brick, const char* name)
+    {
+        try {
+            const auto p = brick.attr(name).cast<std::array<float, 3>>();
+            return {p[0], p[1], p[2]};
+        } catch (const py::cast_error&) {
+            throw dfb::InvalidArgument(std::string("brick.") + name + " is " + shown(brick.attr(name))
+                                       + ": it must be three floats");
+        }
+    }
+
+    static dfb::Brick brickOf(const py::handle& brick)
+    {
+        dfb::Brick result;
+        try {
+            result.id = brick.attr("id").cast<std::uint32_t>();
+        } catch (const py::cast_error&) {
+            throw dfb::InvalidArgument("brick.id is " + shown(brick.attr("id"))
+                                       + ": it must be an int, 0 to 2**32 - 1");
+        }
+        result.bounds = {pointOf(brick, "lower"), pointOf(brick, "upper")};
+        return result;
+    }
+
+    static AnyCamera cameraOf(const py::object& camera)
+    {
+        if (py::isinstance<dfb::PerspectiveCamera>(camera))
+            return camera.cast<dfb::PerspectiveCamera>();
+        if (py::isinstance<dfb::MatrixCamera>(camera))
+            return camera.cast<dfb::MatrixCamera>();
+        throw dfb::InvalidArgument("the camera is " + shown(camera)
+                                   + ": it must be a dfb.PerspectiveCamera or a dfb.MatrixCamera");
+    }
+
+    std::shared_ptr<py::object> function_; // the operation, if it is one of Python
+};
+
+} // namespace dfb_python
