@@ -306,18 +306,20 @@ inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const Fragment
     const std::size_t payload = format.bodyBytes(h.shape), stored = h.shape.stored();
     if (h.rawPayloadBytes != payload)
         failMalformed("wrong payload size", static_cast<std::int64_t>(payload), h.rawPayloadBytes);
-    if ((h.codec != 0) != (h.shape.isSplit != 0))
-        failMalformed("split and not compressed, or the other way round", h.codec, h.shape.isSplit);
     std::size_t offset = fragmentPrefix;
     if (h.codec != 0) {
         if (!codec || codec->id() != h.codec)
             failMalformed("compressed by a codec that this rank does not have", codec ? codec->id() : 0, h.codec);
+        if (h.shape.isSplit == 0)
+            failMalformed("compressed and not split", 1, 0);
         Buffer raw = pool.acquire(payload);
         if (!codec->decompress(message.data() + fragmentPrefix, message.size() - fragmentPrefix, raw.data(), payload))
             failMalformed("the payload does not decompress to its size", static_cast<std::int64_t>(payload), -1);
         message = pool.acquire(payload);
         format.join(h.shape, raw.data(), message.data());
         offset = 0;
+    } else if (h.shape.isSplit != 0) {
+        failMalformed("split and not compressed", 0, h.shape.isSplit);
     } else if (message.size() - fragmentPrefix != payload) {
         failMalformed("wrong message size", static_cast<std::int64_t>(fragmentPrefix + payload),
                       static_cast<std::int64_t>(message.size()));
