@@ -43,7 +43,7 @@ tools() {
 }
 
 libraries="libtbb-dev libsnappy-dev catch2 libembree-dev libcli11-dev nlohmann-json3-dev libxxhash-dev libpng-dev libhdf5-dev"
-libraries="$libraries libcpp-httplib-dev libturbojpeg0-dev" # the live view
+libraries="$libraries libassimp-dev libcpp-httplib-dev libturbojpeg0-dev" # meshes; the live view
 [ "$with" != bench ] || libraries="$libraries libbenchmark-dev python3-matplotlib"
 if [ "$with" = tests ]; then
     libraries="$libraries libtachyon-mt-0-dev libopenexr-dev python3-matplotlib python3-dev python3-numpy pybind11-dev"
@@ -68,6 +68,7 @@ nlohmann-json nlohmann/json.hpp
 xxHash xxhash.h
 libpng png.h
 HDF5 hdf5.h hdf5/serial/hdf5.h
+Assimp assimp/Importer.hpp
 $([ "$with" != bench ] || echo GoogleBenchmark benchmark/benchmark.h)
 END
 }

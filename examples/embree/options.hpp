@@ -157,7 +157,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
            "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and spheres "
            "together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, a data set of an HDF5 file, "
            "FILE.h5:/PATH, or name_XxYxZ_TYPE.raw with uint8, int8, uint16, int16, uint32, int32, float32 or float64, "
-           "and 'be' behind it where it is big-endian; meshes: .ply, .obj; atoms: .xyz. Behind a file's name may stand "
+           "and 'be' behind it where it is big-endian; meshes: .ply, .obj, .stl, .gltf, .glb; atoms: .xyz. Behind a "
+           "file's name may stand "
            "how it is shown, as in a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, "
            "scale, rotate, translate, and as the options of that name clip, transfer, range, isovalue")
         ->required()
@@ -523,7 +524,8 @@ inline ParsedOptions parseOptions(int argc, const char* const* argv)
                                                          + std::to_string(options.bezel));
         }
         outputOptions.checkPatterns(options);
-        const std::vector<std::string> endings{".raw", ".nrrd", ".nhdr", ".mha", ".mhd", ".ply", ".obj", ".xyz"};
+        const std::vector<std::string> endings{".raw", ".nrrd", ".nhdr", ".mha", ".mhd", ".ply",
+                                               ".obj", ".stl",  ".gltf", ".glb", ".xyz"};
         for (const std::string& word : options.scene) {
             const bool generated = word == "synthetic" || word == "demo";
             if (generated && options.scene.size() > 1)

@@ -1,6 +1,7 @@
 // The files of a scene: who reads them, and how they come into it.
 #pragma once
 
+#include "assimp_mesh.hpp"
 #include "hdf5_volume.hpp"
 #include "obj.hpp"
 #include "ply_share.hpp"
@@ -19,6 +20,9 @@ struct MeshReader {
     Mesh (*parse)(std::string_view bytes, const std::string& name, Notes* notes);
     std::optional<MeshShare> (*readShare)(const std::string& path, const Loaders& loaders, Notes* notes);
 };
+
+// Of a file that cannot be shared out.
+inline std::optional<MeshShare> noShare(const std::string&, const Loaders&, Notes*) { return std::nullopt; }
 
 inline std::string readCounted(const std::string& path, const Loaders& loaders)
 {
@@ -85,11 +89,15 @@ inline void addFile(Scene& scene, const SceneFile& file, bool fit, int xyzFrame 
         detail::addMesh(scene, file, fit, {parsePly, readPlyShare}, loaders, notes);
     else if (ending == ".obj")
         detail::addMesh(scene, file, fit, {parseObj, readObjShare}, loaders, notes);
+    else if (isAssimpEnding(ending))
+        detail::addMesh(scene, file, fit, {parseWithAssimp, detail::noShare}, loaders, notes);
     else if (ending == ".xyz")
         detail::addSpheres(scene, file, fit, xyzFrame, loaders, notes);
     else
-        throw std::runtime_error(path + ": unknown type '" + ending
-                                 + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .h5:/dataset, .ply, .obj or .xyz");
+        throw std::runtime_error(
+            path + ": unknown type '" + ending
+            + "', expected .raw, .nrrd, .nhdr, .mha, .mhd, .h5:/dataset, .ply, .obj, .stl, .gltf, .glb "
+              "or .xyz");
     for (std::string& note : loaders.linesOfFirst(notes))
         scene.notes.push_back(std::move(note));
 }
