@@ -416,14 +416,14 @@ TEST_CASE("A scene must be named", "[options]")
                                                                                        {"--size", "5x5"},
                                                                                        {""},
                                                                                        {"demos"},
-                                                                                       {"a.stl"},
+                                                                                       {"a.fbx"},
                                                                                        {"bunny"},
                                                                                        {"a.ply", "a.raw.gz"},
                                                                                        {".raw"},
                                                                                        {"a.ply", "synthetic"},
                                                                                        {"demo", "synthetic"},
                                                                                        {"demo", "a.ply"},
-                                                                                       {"a.ply", "a.stl"}}) {
+                                                                                       {"a.ply", "a.fbx"}}) {
         const ParsedOptions parsed = parse(words);
         INFO(parsed.message);
         CHECK_FALSE(parsed.options);
