@@ -354,7 +354,7 @@ Sight wished(int n, const example::LiveCamera& camera)
     return {target, {flat * c, float(std::sin(elevation)), flat * s}, float(camera.distance) * float(n), c, s};
 }
 
-// What the viewers of a live view have to say, on all ranks; nobody says anything if there is none.
+// The wishes of the viewers of a live view, on all ranks. Without a live view there are none.
 class Viewers {
 public:
     Viewers(FrameBuffer& fb, const Options& options) : fb_(fb), isLive_(options.live.has_value()) {}

@@ -343,7 +343,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
                                    c.z, opacity * p.opacity});
         }
         look.points = detail::linearPoints(look.points);
-        // What 8 bits stand for nobody knows, and the range is as good.
+        // Nobody knows the unit of 8-bit values, and the range is as good.
         const float shift = detail::hounsfieldShift(info);
         if (!choice.range && info.type != VoxelType::UInt8) {
             look.lo = leastHounsfield + shift;

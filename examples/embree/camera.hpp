@@ -59,7 +59,7 @@ inline float shownAngle(const View& view)
     return static_cast<float>(2 * std::atan(half) / detail::degree);
 }
 
-// What the camera looks at.
+// Returns the point that the camera looks at.
 inline Vec3 targetOf(const Focus& focus, const View& view) { return view.target ? *view.target : focus.box.center(); }
 
 // From the target to the camera, in world space.
@@ -94,7 +94,7 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
     return std::min(1.02 * radius / std::sin(angle), 1000 * unit); // farther away distances have too few digits
 }
 
-// The same view with azimuth, elevation and distance in place of the eye.
+// Returns the view with azimuth, elevation and distance in place of the eye.
 inline View withoutEye(const Focus& focus, View view)
 {
     if (!view.eye)

@@ -88,7 +88,7 @@ private:
     Vec3d columns_[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}; // of the rotation
 };
 
-// What of an object is shown: the points that lie in a box of its file's coordinates.
+// The part of an object that is shown: the points that lie in a box of its file's coordinates.
 struct Clip {
     Box box;
     FileToWorld place;

@@ -15,7 +15,7 @@
 
 namespace example {
 
-// What --config reads: an object of JSON, {"scene": ["a.ply"], "size": "300x200", "spp": 4, "shadows": true}, or the
+// The format of --config: an object of JSON, {"scene": ["a.ply"], "size": "300x200", "spp": 4, "shadows": true}, or the
 // same as TOML, without # in a value.
 class OptionsFile : public CLI::ConfigTOML {
 public:
@@ -57,7 +57,7 @@ inline nlohmann::ordered_json valueOf(const std::string& text)
 
 } // namespace detail
 
-// What --config reads to do the same again.
+// Returns the text of a file with which --config repeats this run.
 inline std::string optionsText(const std::vector<std::string>& scene,
                                const std::vector<std::pair<std::string, std::string>>& given)
 {

@@ -80,7 +80,7 @@ private:
         return std::clamp((static_cast<double>(world) - lo) / extent * cells, 0.0, cells);
     }
 
-    // What rays that hit surfaces cost, but for secondary ones. It is summed in units of which doubles hold all
+    // The cost of rays that hit surfaces, without secondary ones. It is summed in units of which doubles hold all
     // multiples, so that it does not depend on the number of ranks, nor of their order.
     std::vector<double> surfaceContent(const Scene& scene, const Loaders& loaders) const
     {

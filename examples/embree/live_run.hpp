@@ -53,7 +53,7 @@ public:
     }
 
 private:
-    // What a renderer throws when nobody wants the frame any more. The text is how ranks know the error.
+    // A renderer throws it when nobody wants the frame any more. Ranks know the error by its text.
     struct Superseded : std::runtime_error {
         static constexpr const char* text = "the viewers want another picture";
         Superseded() : std::runtime_error(text) {}
@@ -251,7 +251,7 @@ private:
         view_->show(fb_.image().rgba8(), fb_.image().width(), fb_.image().height(), report, std::move(picture));
     }
 
-    // What dfb_render makes the same picture with.
+    // Returns the options with which dfb_render makes this picture.
     std::string words(int samples) const
     {
         const View& view = settings_.view;

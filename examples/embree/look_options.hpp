@@ -117,7 +117,7 @@ private:
     std::string eye_, target_, up_, transfer_, range_, isovalue_, clip_;
 };
 
-// What holds of a file: what it says itself, and else what the run says.
+// Fills the look of a file, where it says nothing itself, from that of the run.
 inline FileLook merged(FileLook own, const FileLook& run)
 {
     if (!own.clip)

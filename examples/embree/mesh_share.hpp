@@ -144,7 +144,7 @@ public:
         }
     }
 
-    // What the others have of the vertices that this rank wants. `own`: what it has of its own run.
+    // Returns the values that others have for the vertices that this rank wants. `own`: the values of its own run.
     template <class T>
     std::vector<T> of(const std::vector<T>& own) const
     {

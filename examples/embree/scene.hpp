@@ -73,7 +73,7 @@ struct VolumeObject {
                                      + textOf(inFile.toWorld({0, 0, 0})) + " to " + textOf(inFile.toWorld(last)));
     }
 
-    // What is shown of the domain, which is between the centres of the outer voxels.
+    // The part of the domain that is shown. The domain is between the centres of the outer voxels.
     Box bounds() const
     {
         Box box;

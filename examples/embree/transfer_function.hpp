@@ -11,8 +11,8 @@
 
 namespace example {
 
-// What a value looks like; linear between points. The opacity is that of a slab as thick as 1/256 of the volume's
-// largest extent.
+// The colour and opacity of a value; linear between points. The opacity is that of a slab as thick as 1/256 of the
+// volume's largest extent.
 struct TransferPoint {
     float value = 0; // 0 to 1: from the least to the greatest of the range that is shown
     float r = 0, g = 0, b = 0, opacity = 0;

@@ -63,7 +63,7 @@ struct VisibleVoxels {
     std::vector<std::uint8_t> isSeen;
 };
 
-// What a user says of the voxels of a file, in place of what it says itself.
+// The user's spacing and origin, in place of those of the file.
 struct VoxelGrid {
     std::optional<Vec3> spacing, origin;
 };
@@ -287,7 +287,7 @@ inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& l
     return {all.lo, all.hi};
 }
 
-// What the name or the header of a file says; `grid` has what the user puts in its place. Throws std::runtime_error.
+// Reads the name or the header of a file. `grid` takes the place of its spacing and origin. Throws std::runtime_error.
 inline VolumeFile volumeFileOf(const std::string& path, const VoxelGrid& grid = {})
 {
     const std::string ending = path.substr(std::min(path.rfind('.'), path.size()));

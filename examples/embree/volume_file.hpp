@@ -39,7 +39,7 @@ struct VolumeFile {
     }
 };
 
-// What is no spacing or origin that coordinates in float can have is refused, by all who read one.
+// Readers refuse a spacing or origin that coordinates in float cannot have.
 inline bool isSpacing(double value) { return value >= 1e-15 && value <= 1e9; }
 inline bool isOrigin(double value) { return std::fabs(value) <= 1e12; }
 inline bool isDimension(int value) { return value >= 2 && value <= 65536; }

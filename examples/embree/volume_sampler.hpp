@@ -54,7 +54,7 @@ public:
         box.grow(volume_.placement.toWorld(volume_.shown.hi));
         return box;
     }
-    // What a clip box has left of the domain.
+    // Whether a point is in the part of the domain that a clip box has left.
     bool inDomain(const Vec3& v) const
     {
         const Vec3 &lo = volume_.shown.lo, &hi = volume_.shown.hi;

@@ -80,7 +80,7 @@ struct XyzColumns {
     }
 };
 
-// What is no element in a file, and how often.
+// Counts the words of a file that name no element.
 class UnknownElements {
 public:
     void add(std::string_view word)

@@ -511,7 +511,7 @@ private:
         }
     }
 
-    // What `edit` makes of the wishes becomes the wishes, unless it throws. Answers with their number.
+    // Lets `edit` change the wishes; nothing changes if it throws. Answers with their number.
     template <class Edit>
     void change(Response& response, const Edit& edit)
     {

@@ -27,7 +27,7 @@ struct LiveCamera {
     std::array<double, 3> target{};    // in the world
 };
 
-// What the viewers want. Its bytes may be sent to other ranks as they are.
+// The wishes of the viewers. Its bytes may be sent to other ranks as they are.
 struct LiveWishes {
     std::uint64_t number = 0; // grows with each change
     std::uint64_t look = 0;   // the number of the last change of camera or size
@@ -40,7 +40,7 @@ struct LiveWishes {
 };
 static_assert(std::is_trivially_copyable_v<LiveWishes>);
 
-// What a page must know to turn a camera. The camera is at target + distance * unit * outward, with
+// The scene as a page needs it to turn a camera. The camera is at target + distance * unit * outward, with
 // outward = cos(elevation) * sin(azimuth) * axes[0] + sin(elevation) * axes[1] + cos(elevation) * cos(azimuth) *
 // axes[2].
 struct LiveScene {
@@ -52,7 +52,7 @@ struct LiveScene {
     int ranks = 1;
 };
 
-// What show() needs to know of a picture beside its pixels.
+// A picture's data beside its pixels, for show().
 struct LivePicture {
     LiveWishes wishes;       // that it shows
     double distance = 0;     // of its camera
@@ -82,7 +82,7 @@ public:
     // Viewers may have wishes from now on; `home` is what is shown until they have.
     void open(const LiveScene& scene, const LiveWishes& home);
 
-    // What they want now. Any thread.
+    // Returns their wishes of this moment. Any thread.
     LiveWishes wishes() const;
     // Waits until they want something else than at `number`, or the job is to end, or for `atMost`.
     LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const;
@@ -112,9 +112,9 @@ void tellTiles(const FrameBuffer& fb, LivePicture& picture)
         picture.owners.push_back(fb.tileOwner(tile));
 }
 
-// What the display rank's viewers want, on all ranks, with `ends` if any rank is to end. `mine`: on the display rank
-// LiveView::wishes(), or what waitForChange() has returned; on the others only `ends` counts. Collective, outside
-// frames.
+// Returns the wishes of the display rank's viewers, on all ranks, with `ends` if any rank is to end. `mine`: on the
+// display rank LiveView::wishes(), or what waitForChange() has returned; on the others only `ends` counts. Collective,
+// outside frames.
 template <class FrameBuffer>
 LiveWishes shareWishes(FrameBuffer& fb, const LiveWishes& mine)
 {

@@ -309,7 +309,7 @@ TEST_CASE("A volume is as large as its spacing says", "[headers]")
 
 TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[headers]")
 {
-    // The same field on two grids: a linear one, so that nothing is lost by leaving slices out.
+    // One field on two grids. It is linear, so that nothing is lost by leaving slices out.
     const auto sampler = [](int slices, float thickness) {
         VolumeSource source;
         source.info.dims = {17, 17, slices}; // longest along the thick sides

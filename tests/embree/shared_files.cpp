@@ -180,7 +180,7 @@ void add(Primitives& all, const std::vector<BrickMesh>& meshes, const std::vecto
         }
 }
 
-// What is the same on all ranks.
+// The values that are equal on all ranks.
 struct Whole {
     std::vector<Box> cells;
     Box bounds, focus;

@@ -132,7 +132,7 @@ public:
         }
         return true;
     }
-    // What comes until the other side hangs up.
+    // Returns all bytes that come until the other side hangs up.
     std::string receiveAll() const
     {
         std::string all;

@@ -120,7 +120,7 @@ module dfb
   public :: dfb_config_init, dfb_input_init, dfb_is_display_rank, dfb_render, dfb_tile_pixels, dfb_image_rgba8, &
     dfb_image_rgba32f, dfb_image_depth, dfb_get_report, dfb_last_error, dfb_version
 
-  ! What the procedures below call.
+  ! The C functions that the procedures below call.
   interface
     subroutine c_config_init(config, struct_size, width, height) bind(c, name='dfb_config_init_sized')
       import :: dfb_config, c_size_t, c_int

@@ -172,7 +172,7 @@ const float* dfb_image_depth(const dfb_framebuffer* framebuffer);
 // Copies the picture to all ranks, where these functions return it then. Collective; waits for all ranks.
 int dfb_image_on_all_ranks(dfb_framebuffer* framebuffer);
 
-// What the last picture that was made has cost. Times are in milliseconds and of this rank, but for render_ms_max. The
+// The cost of the last picture that was made. Times are in milliseconds and of this rank, but for render_ms_max. The
 // other numbers are sums over all ranks.
 typedef struct dfb_report {
     int64_t frame;                  // its number

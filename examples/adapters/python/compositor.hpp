@@ -38,7 +38,7 @@ public:
     {
     }
 
-    // What is wrong with the arguments on one rank comes out on all.
+    // Wrong arguments on one rank are an error on all.
     dfb::FrameReport composite(const py::object& rgba, const py::object& depth, const py::dict& options)
     {
         const Use use(*this);

@@ -41,7 +41,7 @@ private:
     std::shared_ptr<std::string> why_ = std::make_shared<std::string>();
 };
 
-// What an argument is, for a text.
+// Returns an argument as the text of an error shows it.
 inline std::string shown(const py::handle& value) { return py::repr(value); }
 
 // The value of an argument. Throws InvalidArgument if it has another type.

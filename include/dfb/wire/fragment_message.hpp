@@ -139,7 +139,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const int width = tile.region.width(), height = tile.region.height();
     const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
     const bool isRounded = color != WireFormat::Float32 && !tile.hasBytes;
-    // What travels as it is goes straight to the message, to where it belongs if all pixels are active.
+    // Pixels that travel as they are go straight to the message, to their place if all are active.
     const PlaneFormat gathered(channels, tile.hasBytes ? 1 : sizeof(float));
     Buffer message = pool.acquire(isRounded ? fragmentPrefix : mostBytes(width, height, gathered.pixelBytes()));
     Buffer before; // the message, if another takes its place

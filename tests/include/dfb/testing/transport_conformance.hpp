@@ -415,7 +415,7 @@ private:
             trouble = hopeless();
             return !trouble.empty() || ready();
         };
-        // What is missing here says more than that another rank waits for this one.
+        // A cause that is missing here says more than that another rank waits for this one.
         if (!waitUntil(over, deadline) || (!trouble.empty() && Clock::now() >= deadline))
             throw GaveUp(what());
         if (!trouble.empty())
