@@ -1,7 +1,5 @@
-// Options in files: JSON or TOML to read, JSON to write, so that a picture can be made again.
+// Options in files, JSON or TOML to read.
 #pragma once
-
-#include "option_values.hpp"
 
 #include <CLI/CLI.hpp>
 #include <nlohmann/json.hpp>
@@ -10,7 +8,6 @@
 #include <iterator>
 #include <sstream>
 #include <string>
-#include <utility>
 #include <vector>
 
 namespace example {
@@ -56,16 +53,5 @@ inline nlohmann::ordered_json valueOf(const std::string& text)
 }
 
 } // namespace detail
-
-// Returns the text of a file with which --config repeats this run.
-inline std::string optionsText(const std::vector<std::string>& scene,
-                               const std::vector<std::pair<std::string, std::string>>& given)
-{
-    nlohmann::ordered_json json;
-    json["scene"] = scene;
-    for (const auto& [name, text] : given)
-        json[name] = detail::valueOf(text);
-    return json.dump(2) + '\n';
-}
 
 } // namespace example

@@ -2,6 +2,7 @@
 #pragma once
 
 #include "file_look.hpp"
+#include "text.hpp"
 #include "vec.hpp"
 
 #include <dfb/channels.hpp>
@@ -17,8 +18,6 @@
 
 namespace example {
 namespace detail {
-
-inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
 
 // An empty string if the path ends in one of `endings`, else what is wrong with it: the form CLI11 wants.
 inline std::string checkEnding(const std::string& path, const std::vector<std::string>& endings)

@@ -1,28 +1,12 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
-#include "config_file.hpp"
-
 #include <dfb/image.hpp>
 
-#include <nlohmann/json.hpp>
-#include <png.h>
-#define XXH_INLINE_ALL
-#include <xxhash.h>
-
 #include <algorithm>
-#include <cerrno>
-#include <cmath>
-#include <csetjmp>
 #include <cstddef>
 #include <cstdint>
-#include <cstdio>
-#include <cstring>
-#include <filesystem>
-#include <fstream>
-#include <stdexcept>
 #include <string>
-#include <system_error>
 #include <utility>
 #include <vector>
 
@@ -30,216 +14,44 @@ namespace example {
 
 namespace detail {
 
-[[noreturn]] inline void failToWrite(const std::string& path, const std::string& why)
-{
-    throw std::runtime_error(path + ": cannot be written: " + why);
-}
-
-// The rows of an image as a PFM: from the lowest to the highest, little-endian. `planes` floats of each pixel,
-// `stride` floats apart.
-inline void writeFloats(const std::string& path, int width, int height, const float* values, int stride, int planes)
-{
-    errno = 0;
-    std::ofstream stream(path, std::ios::binary | std::ios::trunc);
-    stream << (planes == 3 ? "PF\n" : "Pf\n") << width << ' ' << height << "\n-1.0\n";
-    std::vector<float> row(static_cast<std::size_t>(width) * static_cast<std::size_t>(planes));
-    for (int y = height - 1; y >= 0; --y) {
-        std::size_t at = 0;
-        for (int x = 0; x < width; ++x) {
-            const float* pixel =
-                values + (static_cast<std::ptrdiff_t>(y) * width + x) * static_cast<std::ptrdiff_t>(stride);
-            for (int c = 0; c < planes; ++c)
-                row[at++] = pixel[c];
-        }
-        stream.write(reinterpret_cast<const char*>(row.data()), static_cast<std::streamsize>(4 * row.size()));
-    }
-    stream.close();
-    if (!stream)
-        failToWrite(path, std::strerror(errno));
-}
-
-// Rows of 16-bit sRGB; `fillRow(y)` puts each into `row`. Returns false if libpng fails, which it tells by longjmp: so
-// nothing here has a destructor.
-template <class FillRow>
-bool writePngRows(std::FILE* file, int width, int height, bool hasAlpha, const std::uint8_t* row,
-                  const FillRow& fillRow)
-{
-    png_structp png = png_create_write_struct(
-        PNG_LIBPNG_VER_STRING, nullptr, [](png_structp p, png_const_charp) { png_longjmp(p, 1); },
-        [](png_structp, png_const_charp) {});
-    png_infop info = png == nullptr ? nullptr : png_create_info_struct(png);
-    if (info == nullptr || setjmp(png_jmpbuf(png)) != 0) {
-        png_destroy_write_struct(&png, &info);
-        return false;
-    }
-    png_init_io(png, file);
-    png_set_IHDR(png, info, static_cast<png_uint_32>(width), static_cast<png_uint_32>(height), 16,
-                 hasAlpha ? PNG_COLOR_TYPE_RGB_ALPHA : PNG_COLOR_TYPE_RGB, PNG_INTERLACE_NONE,
-                 PNG_COMPRESSION_TYPE_DEFAULT, PNG_FILTER_TYPE_DEFAULT);
-    png_set_sRGB(png, info, PNG_sRGB_INTENT_PERCEPTUAL);
-    png_write_info(png, info);
-    for (int y = 0; y < height; ++y) {
-        fillRow(y);
-        png_write_row(png, row);
-    }
-    png_write_end(png, info);
-    png_destroy_write_struct(&png, &info);
-    return true;
-}
+// Throws std::runtime_error.
+[[noreturn]] void failToWrite(const std::string& path, const std::string& why);
 
 } // namespace detail
 
 // Throws if the file cannot be opened for writing. What it holds stays; if there is none, none is left behind.
-inline void requireWritable(const std::string& path)
-{
-    std::error_code ignored;
-    const bool existed = std::filesystem::exists(path, ignored);
-    errno = 0;
-    if (!std::ofstream(path, std::ios::binary | std::ios::app))
-        detail::failToWrite(path, std::strerror(errno));
-    if (!existed && !ignored)
-        std::filesystem::remove(path, ignored);
-}
+void requireWritable(const std::string& path);
 
 // An 8-bit PNG of RGBA pixels whose colour is sRGB-encoded, row 0 on top. With `hasAlpha` their alpha is straight, as
 // PNG has it, and is written; else it is left out: premultiplied colour is the image over black.
-inline void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha)
-{
-    const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    std::vector<std::uint8_t> rgb;
-    if (!hasAlpha) {
-        rgb.resize(3 * pixels);
-        for (std::size_t i = 0; i < pixels; ++i)
-            std::memcpy(rgb.data() + 3 * i, srgba + 4 * i, 3);
-    }
-    png_image image{};
-    image.version = PNG_IMAGE_VERSION;
-    image.width = static_cast<png_uint_32>(width);
-    image.height = static_cast<png_uint_32>(height);
-    image.format = hasAlpha ? PNG_FORMAT_RGBA : PNG_FORMAT_RGB;
-    // Not png_image_write_to_file: when that fails it deletes what was at the path, be it a device.
-    errno = 0;
-    std::FILE* file = std::fopen(path.c_str(), "wb");
-    if (file == nullptr)
-        detail::failToWrite(path, std::strerror(errno));
-    const void* first = hasAlpha ? static_cast<const void*>(srgba) : rgb.data();
-    const bool written = png_image_write_to_stdio(&image, file, 0, first, 0, nullptr) != 0;
-    const bool closed = std::fclose(file) == 0;
-    if (!written || !closed)
-        detail::failToWrite(path, written ? std::strerror(errno) : image.message);
-}
+void writePng(const std::string& path, int width, int height, const std::uint8_t* srgba, bool hasAlpha);
 
 // Likewise with 16 bits a channel, from linear premultiplied RGBA: sRGB-encoded, and straight where it has alpha, as
 // straightPixels() says; over black where it has none.
-inline void writePng16(const std::string& path, int width, int height, const float* rgba, bool hasAlpha)
-{
-    const std::size_t channels = hasAlpha ? 4 : 3;
-    std::vector<std::uint8_t> row(2 * channels * static_cast<std::size_t>(width));
-    const auto encoded = [](double linear) {
-        const double v = std::clamp(linear, 0.0, 1.0); // NaN: 0
-        return v <= 0.0031308 ? 12.92 * v : 1.055 * std::pow(v, 1 / 2.4) - 0.055;
-    };
-    const auto fill = [&](const float* pixels) {
-        std::size_t at = 0;
-        for (int x = 0; x < width; ++x, pixels += 4) {
-            const double alpha = hasAlpha ? std::min(static_cast<double>(pixels[3]), 1.0) : 1.0;
-            for (std::size_t c = 0; c < channels; ++c) {
-                const double v = c == 3      ? std::clamp(alpha, 0.0, 1.0)
-                                 : alpha > 0 ? encoded(static_cast<double>(pixels[c]) / alpha)
-                                             : 0.0;
-                const unsigned level = static_cast<unsigned>(v * 65535 + 0.5);
-                row[at++] = static_cast<std::uint8_t>(level >> 8); // big-endian
-                row[at++] = static_cast<std::uint8_t>(level & 255);
-            }
-        }
-    };
-    errno = 0;
-    std::FILE* file = std::fopen(path.c_str(), "wb");
-    if (file == nullptr)
-        detail::failToWrite(path, std::strerror(errno));
-    const bool written = detail::writePngRows(file, width, height, hasAlpha, row.data(), [&](int y) {
-        fill(rgba + 4 * static_cast<std::size_t>(y) * static_cast<std::size_t>(width));
-    });
-    const bool closed = std::fclose(file) == 0;
-    if (!written || !closed)
-        detail::failToWrite(path, errno != 0 ? std::strerror(errno) : "libpng cannot");
-}
+void writePng16(const std::string& path, int width, int height, const float* rgba, bool hasAlpha);
 
 // Pixels of a PNG from linear premultiplied RGBA of an image, row 0 on top: sRGB-encoded colour with straight alpha.
 // Alpha is round(255 * alpha). The colour is that of colour / alpha, divided in double and clamped to 1, at the nearest
 // sRGB level or dithered; it is 0 where alpha is 0 or less, which loses colour that has no alpha. Over black the
 // picture is the premultiplied image again, but for the rounding of both to 8 bits.
-inline std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither)
-{
-    const std::size_t rowSize = 4 * static_cast<std::size_t>(width);
-    std::vector<std::uint8_t> pixels(rowSize * static_cast<std::size_t>(height)), alphas(rowSize);
-    std::vector<double> row(rowSize);
-    for (int y = 0; y < height; ++y, rgba += rowSize) {
-        for (std::size_t i = 0; i < rowSize; i += 4) {
-            const double alpha = std::min(static_cast<double>(rgba[i + 3]), 1.0);
-            for (std::size_t c = i; c < i + 3; ++c)
-                row[c] = alpha > 0 ? static_cast<double>(rgba[c]) / alpha : 0.0;
-            row[i + 3] = 1; // dithering keeps colours below alpha, which is for premultiplied ones
-        }
-        std::uint8_t* out = pixels.data() + static_cast<std::size_t>(y) * rowSize;
-        if (dither)
-            dfb::ditherPixels(row.data(), width, dfb::OutputFormat::SRGBA8, 0, y, reinterpret_cast<std::byte*>(out));
-        else
-            dfb::convertPixels(row.data(), width, dfb::OutputFormat::SRGBA8, reinterpret_cast<std::byte*>(out));
-        dfb::convertPixels(rgba, width, dfb::OutputFormat::RGBA8, reinterpret_cast<std::byte*>(alphas.data()));
-        for (std::size_t i = 3; i < rowSize; i += 4)
-            out[i] = alphas[i];
-    }
-    return pixels;
-}
+std::vector<std::uint8_t> straightPixels(int width, int height, const float* rgba, bool dither);
 
 // Linear RGB as a colour PFM, from RGBA pixels, row 0 on top.
-inline void writePfm(const std::string& path, int width, int height, const float* rgba)
-{
-    detail::writeFloats(path, width, height, rgba, 4, 3);
-}
+void writePfm(const std::string& path, int width, int height, const float* rgba);
 
 // One value per pixel as a greyscale PFM; the values are `stride` floats apart (4 and rgba + 3: the alpha of RGBA).
-inline void writeGreyPfm(const std::string& path, int width, int height, const float* values, int stride)
-{
-    detail::writeFloats(path, width, height, values, stride, 1);
-}
+void writeGreyPfm(const std::string& path, int width, int height, const float* values, int stride);
 
 // Three floats per pixel as a colour PFM.
-inline void writeVectorPfm(const std::string& path, int width, int height, const float* values)
-{
-    detail::writeFloats(path, width, height, values, 3, 3);
-}
+void writeVectorPfm(const std::string& path, int width, int height, const float* values);
 
 // A colour for each id, black where there is none (all bits set).
-inline void writeIdPng(const std::string& path, int width, int height, const std::uint32_t* ids)
-{
-    const std::size_t pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
-    std::vector<std::uint8_t> rgba(4 * pixels, 0);
-    for (std::size_t i = 0; i < pixels; ++i) {
-        const std::uint64_t hash = XXH3_64bits(ids + i, sizeof *ids);
-        for (std::size_t c = 0; c < 3 && ids[i] != 0xffffffffu; ++c)
-            rgba[4 * i + c] = static_cast<std::uint8_t>(64 + (hash >> (8 * c)) % 192);
-    }
-    writePng(path, width, height, rgba.data(), false);
-}
+void writeIdPng(const std::string& path, int width, int height, const std::uint32_t* ids);
 
 // XXH3 of the pixels as they are in memory, 16 hexadecimal digits.
-inline std::string hashPixels(const float* rgba, std::size_t pixelCount)
-{
-    char text[17];
-    std::snprintf(text, sizeof text, "%016llx",
-                  static_cast<unsigned long long>(XXH3_64bits(rgba, pixelCount * 4 * sizeof(float))));
-    return text;
-}
+std::string hashPixels(const float* rgba, std::size_t pixelCount);
 
-inline double meanAlpha(const float* rgba, std::size_t pixelCount)
-{
-    double sum = 0;
-    for (std::size_t i = 0; i < pixelCount; ++i)
-        sum += static_cast<double>(rgba[4 * i + 3]);
-    return pixelCount > 0 ? sum / static_cast<double>(pixelCount) : 0;
-}
+double meanAlpha(const float* rgba, std::size_t pixelCount);
 
 // Where the time of a rank has gone. Times are this rank's own; waiting for slower ranks counts as compositing.
 struct Times {
@@ -304,90 +116,8 @@ std::size_t slowestOf(const std::vector<Rank>& ranks)
     return static_cast<std::size_t>(least - ranks.begin());
 }
 
-namespace detail {
+void writeText(const std::string& path, const std::string& text);
 
-// The `value` of each rank.
-template <class Rank, class Value>
-nlohmann::ordered_json ofRanks(const std::vector<Rank>& ranks, const Value& value)
-{
-    nlohmann::ordered_json all = nlohmann::ordered_json::array();
-    for (const Rank& rank : ranks)
-        all.push_back(value(rank));
-    return all;
-}
-
-} // namespace detail
-
-inline nlohmann::ordered_json toJson(const RunStats& run)
-{
-    using detail::ofRanks;
-    nlohmann::ordered_json json;
-    json["version"] = run.version;
-    json["scene"] = run.scene;
-    json["options"] = nlohmann::ordered_json::object();
-    for (const auto& [name, text] : run.options)
-        json["options"][name] = detail::valueOf(text);
-    json["ranks"] = run.ranks.size();
-    json["threads_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.threads; });
-    json["transport"] = run.transport;
-    json["mode"] = run.mode;
-    json["width"] = run.width;
-    json["height"] = run.height;
-    json["image_hash"] = run.imageHash;
-    json["mean_alpha"] = run.meanAlpha;
-    const std::size_t slowest = slowestOf(run.ranks);
-    json["slowest_rank"] = slowest;
-    const auto add = [](auto& to, const auto& ranks, std::size_t which, const char* name, const auto& value) {
-        to[name] = value(ranks[which]);
-        to[std::string(name) + "_of_ranks"] = ofRanks(ranks, value);
-    };
-    add(json, run.ranks, slowest, "total_ms", [](const RankStats& r) { return r.totalMs; });
-    add(json, run.ranks, slowest, "load_ms", [](const RankStats& r) { return r.times.loadMs; });
-    add(json, run.ranks, slowest, "render_ms", [](const RankStats& r) { return r.times.renderMs; });
-    add(json, run.ranks, slowest, "compositing_ms", [](const RankStats& r) { return r.times.compositingMs; });
-    add(json, run.ranks, slowest, "write_ms", [](const RankStats& r) { return r.times.writeMs; });
-    json["bytes_read_of_ranks"] = ofRanks(run.ranks, [](const RankStats& r) { return r.bytesRead; });
-    json["run_ms"] = run.runMs;
-    json["samples_taken"] = run.samplesTaken;
-    json["samples_saved"] = run.samplesSaved;
-    json["frames"] = nlohmann::ordered_json::array();
-    for (const FrameStats& frame : run.frames) {
-        nlohmann::ordered_json entry;
-        using Rank = RankFrameStats;
-        const std::size_t last = slowestOf(frame.ranks);
-        entry["slowest_rank"] = last;
-        add(entry, frame.ranks, last, "total_ms", [](const Rank& r) { return r.times.totalMs(); });
-        add(entry, frame.ranks, last, "render_ms", [](const Rank& r) { return r.times.renderMs; });
-        add(entry, frame.ranks, last, "compositing_ms", [](const Rank& r) { return r.times.compositingMs; });
-        add(entry, frame.ranks, last, "write_ms", [](const Rank& r) { return r.times.writeMs; });
-        entry["bytes_sent"] = frame.bytesSent;
-        entry["messages_sent"] = frame.messagesSent;
-        entry["tiles_total"] = frame.tilesTotal;
-        entry["tiles_touched"] = frame.tilesTouched;
-        entry["peak_memory_bytes"] = frame.peakMemoryBytes;
-        entry["order_undefined_pixels"] = frame.orderUndefinedPixels;
-        entry["merge_error_bound"] = frame.mergeErrorBound;
-        entry["wire_color"] = frame.wireColor;
-        entry["wire_error_bound"] = frame.wireErrorBound;
-        entry["compressed"] = frame.compressed;
-        entry["compressed_links"] = frame.compressedLinks;
-        entry["tiles_rendered"] = ofRanks(frame.ranks, [](const Rank& r) { return r.tilesRendered; });
-        entry["work_of_ranks"] = ofRanks(frame.ranks, [](const Rank& r) { return r.work; });
-        json["frames"].push_back(entry);
-    }
-    return json;
-}
-
-inline void writeText(const std::string& path, const std::string& text)
-{
-    errno = 0;
-    std::ofstream stream(path, std::ios::trunc);
-    stream << text;
-    stream.close();
-    if (!stream)
-        detail::failToWrite(path, std::strerror(errno));
-}
-
-inline void writeStats(const std::string& path, const RunStats& run) { writeText(path, toJson(run).dump(2) + '\n'); }
+void writeStats(const std::string& path, const RunStats& run);
 
 } // namespace example

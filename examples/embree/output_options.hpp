@@ -3,8 +3,7 @@
 
 #include "frame_pattern.hpp"
 #include "option_values.hpp"
-
-#include <dfb/channels.hpp>
+#include "options.hpp"
 
 #include <CLI/CLI.hpp>
 
@@ -13,20 +12,6 @@
 #include <utility>
 
 namespace example {
-
-struct OutputFiles {
-    // Empty: not written. All but the last two may be patterns.
-    std::string output, alpha, depth, aux, stats, saveOptions;
-    std::string cinema; // a folder; empty: none. `output` is in it then
-    int pngBits = 8;
-    dfb::ChannelMask layers = dfb::depthChannel; // of an .exr, beside colour
-
-    bool isExr() const { return detail::endingOf(output) == ".exr"; }
-    bool writesNothing() const
-    {
-        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && saveOptions.empty();
-    }
-};
 
 // Adds the options to a command line, for as long as that and `files` live.
 class OutputOptions {
@@ -111,7 +96,7 @@ public:
         }
         if (app_.count("--layers") > 0 && !files.isExr())
             throw CLI::ValidationError("--layers", "needs --output FILE.exr");
-        if (app_.count("--png-bits") > 0 && detail::endingOf(files.output) != ".png")
+        if (app_.count("--png-bits") > 0 && endingOf(files.output) != ".png")
             throw CLI::ValidationError("--png-bits", "needs --output FILE.png");
         if (app_.count("--layers") > 0)
             files.layers = detail::parseLayers("--layers", layers_);

@@ -3,6 +3,7 @@
 
 #include "cinema.hpp"
 #include "exr.hpp"
+#include "frame_pattern.hpp"
 #include "options.hpp"
 #include "output.hpp"
 #include "phase_clock.hpp"
@@ -20,6 +21,7 @@
 #include <cstring>
 #include <deque>
 #include <exception>
+#include <filesystem>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -58,7 +60,7 @@ inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 inline bool wantsFloat(const Options& o)
 {
     return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background)
-           || detail::endingOf(o.output) == ".pfm" || o.isExr() || o.pngBits == 16;
+           || endingOf(o.output) == ".pfm" || o.isExr() || o.pngBits == 16;
 }
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
@@ -152,7 +154,7 @@ inline void writeImage(const std::string& path, const dfb::Image& image, bool is
     const int width = image.width(), height = image.height();
     if (image.format() != dfb::OutputFormat::RGBA32F) {
         writePng(path, width, height, image.rgba8(), false);
-    } else if (detail::endingOf(path) == ".pfm") {
+    } else if (endingOf(path) == ".pfm") {
         writePfm(path, width, height, image.rgba32f());
     } else if (!isOpaque) {
         writePng(path, width, height, straightPixels(width, height, image.rgba32f(), dither).data(), true);

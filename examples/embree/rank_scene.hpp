@@ -1,36 +1,17 @@
 // RankScene: what one rank holds of the scene that the command line asks for.
 #pragma once
 
-#include "auto_look.hpp"
-#include "brick_exchange.hpp"
-#include "content_cut.hpp"
-#include "generated.hpp"
+#include "loaders.hpp"
 #include "options.hpp"
 #include "renderer.hpp"
-#include "scene_files.hpp"
 
 #include <algorithm>
-#include <iterator>
+#include <cstdint>
+#include <vector>
 
 namespace example {
 
-inline RenderSettings renderSettings(const Options& options)
-{
-    RenderSettings settings;
-    settings.width = options.width;
-    settings.height = options.height;
-    settings.frames = options.frames;
-    settings.passes = options.spp;
-    settings.aoRays = options.ao;
-    settings.aoDistance = options.aoDistance;
-    settings.shadows = options.shadows;
-    settings.pathBounces = options.path;
-    settings.seed = options.seed;
-    settings.opacity = options.opacity;
-    settings.earlyTermination = options.earlyTermination;
-    settings.view = options.view;
-    return settings;
-}
+RenderSettings renderSettings(const Options& options);
 
 // The ranks of a framebuffer, which outlives them. No frame may be open while they load.
 template <class FrameBuffer>
@@ -39,29 +20,6 @@ Loaders loadersOf(FrameBuffer& fb)
     return Loaders(
         fb.rank(), fb.size(), [&fb](const Loaders::Bytes& bytes) { return fb.allGather(bytes); },
         [&fb](const std::vector<std::int64_t>& values) { return fb.allReduce(values, dfb::Reduce::Sum); });
-}
-
-// Collective. Throws std::runtime_error that names the file, the same on all ranks.
-inline Scene makeScene(const Options& options, int brickCount, const Loaders& loaders)
-{
-    LookOf look;
-    if (!options.look.transfer.empty() || options.look.range || !options.look.isovalues.empty())
-        look = [&](const VolumeSource& source) { return lookOf(source, options.look, loaders); };
-    if (options.scene.front() == "synthetic")
-        return syntheticScene(brickCount, options.seed, look);
-    if (options.scene.front() == "demo")
-        return demoScene(options.seed, look);
-    Scene scene;
-    const auto vec = [](const std::array<float, 3>& v) { return Vec3{v[0], v[1], v[2]}; };
-    VoxelGrid grid;
-    if (options.spacing)
-        grid.spacing = vec(*options.spacing);
-    if (options.origin)
-        grid.origin = vec(*options.origin);
-    for (const SceneFile& file : options.files)
-        addFile(scene, file, options.fit, options.xyzFrame, loaders, grid,
-                [&](const VolumeSource& source) { return lookOf(source, file.look, loaders); });
-    return scene;
 }
 
 struct RankScene {
@@ -79,82 +37,8 @@ struct RankScene {
     }
 };
 
-// Whether a rank holds a brick: `copies` ranks in a row do.
-inline bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int copies)
-{
-    const int first = rankOfBrick(brick, brickCount, rankCount);
-    return (rank - first + rankCount) % rankCount < copies;
-}
-
-// Of surfaces without secondary rays, a brick's work is what its box covers of the image, so that equal boxes are best.
-inline bool cutsByContent(const Options& options, const Scene& scene)
-{
-    if (options.cut != CutBy::Auto)
-        return options.cut == CutBy::Content;
-    return scene.grid[0] == 0 && (!scene.volumes.empty() || options.ao > 0 || options.shadows);
-}
-
 // Collective: each rank reads what it needs, and all come to the same cells. Throws std::runtime_error, on some ranks
 // or all.
-inline RankScene loadRankScene(const Options& options, const Loaders& loaders)
-{
-    const int rank = loaders.rank(), rankCount = loaders.size();
-    const bool isImage = options.mode == Mode::Image;
-    const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
-    Scene scene = makeScene(options, sceneBricks, loaders);
-    const RenderSettings settings = renderSettings(options);
-    RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
-    if (scene.volumes.empty())
-        for (const auto& [option, isGiven] : {std::pair{"--transfer", !options.look.transfer.empty()},
-                                              std::pair{"--range", options.look.range.has_value()},
-                                              std::pair{"--isovalue", !options.look.isovalues.empty()}})
-            if (isGiven)
-                result.notes.push_back(std::string(option) + " is for volumes, and there are none");
-    if (options.path > 0 && !scene.volumes.empty())
-        result.notes.push_back(scene.meshes.empty() && scene.spheres.empty()
-                                   ? "there is nothing to see: --path leaves volumes out, and there are no surfaces"
-                                   : "--path leaves volumes out");
-    frameCamera(result.info, settings, 0); // throws if there is none
-    const float ghosts = ghostReach(result.info, settings);
-    std::vector<Box> cells{scene.bounds};
-    if (!isImage && cutsByContent(options, scene)) {
-        const ContentCut cut(scene, result.info, settings, loaders);
-        cells = loaders.gatherOf<Box>([&] { // rank 0 tells, in case the others are other machines
-            return rank > 0 ? std::vector<Box>() : cut.cells(brickCount * options.interleave);
-        });
-    } else if (!isImage) {
-        cells = cutScene(scene, brickCount * options.interleave);
-    }
-    const int copies = options.mode == Mode::Mixed ? std::min(options.replicate, rankCount) : 1;
-    std::vector<Holders> holders;
-    std::vector<Box> reaches;
-    for (std::size_t c = 0; c < cells.size(); ++c) {
-        const int brick = static_cast<int>(c) % brickCount;
-        holders.push_back(isImage ? Holders{0, rankCount} : Holders{rankOfBrick(brick, brickCount, rankCount), copies});
-        reaches.push_back(reachOf(scene, cells[c], ghosts));
-    }
-    std::vector<CellSurfaces> surfaces = exchangeBricks(scene, holders, reaches, loaders);
-    for (int brick = 0; brick < brickCount; ++brick) {
-        Box bounds;
-        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
-             c += static_cast<std::size_t>(brickCount))
-            bounds.grow(cells[c]);
-        result.bounds.push_back(bounds);
-        if (!isImage && !holdsBrick(rank, brick, brickCount, rankCount, copies))
-            continue;
-        const auto id = static_cast<std::uint32_t>(brick);
-        result.brickIds.push_back(id);
-        result.renderers.emplace_back();
-        for (std::size_t c = static_cast<std::size_t>(brick); c < cells.size();
-             c += static_cast<std::size_t>(brickCount)) {
-            Brick loaded = loadBrick(scene, id, cells[c], ghosts);
-            std::move(surfaces[c].meshes.begin(), surfaces[c].meshes.end(), std::back_inserter(loaded.meshes));
-            std::move(surfaces[c].spheres.begin(), surfaces[c].spheres.end(), std::back_inserter(loaded.spheres));
-            surfaces[c] = CellSurfaces();
-            result.renderers.back().emplace_back(std::move(loaded), result.info, settings);
-        }
-    }
-    return result;
-}
+RankScene loadRankScene(const Options& options, const Loaders& loaders);
 
 } // namespace example

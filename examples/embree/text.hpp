@@ -14,6 +14,9 @@ namespace example {
 // Each a line for the user about something that is not as the file, or an option, may have meant it.
 using Notes = std::vector<std::string>;
 
+// With its dot; empty if there is none.
+inline std::string endingOf(const std::string& path) { return path.substr(std::min(path.rfind('.'), path.size())); }
+
 // Goes through a text line by line. Lines end with \n, \r\n or \r.
 class TextLines {
 public:

@@ -2,6 +2,9 @@
 #include "support.hpp"
 #include "together.hpp"
 
+#include <auto_look.hpp>
+#include <generated.hpp>
+#include <look_options.hpp>
 #include <rank_scene.hpp>
 
 #include <dfb/tile.hpp>

@@ -1,6 +1,7 @@
 // The command line of the bundled renderer.
 #include "support.hpp"
 
+#include <frame_pattern.hpp>
 #include <options.hpp>
 
 #include <array>

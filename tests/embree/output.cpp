@@ -3,6 +3,8 @@
 
 #include <output.hpp>
 
+#include <png.h>
+
 #include <dfb/image.hpp>
 
 #include <cmath>

@@ -4,11 +4,16 @@
 #include <cinema.hpp>
 #include <exr.hpp>
 #include <options.hpp>
+#include <output.hpp>
 #include <progress_line.hpp>
 
 #include <png.h>
 #if defined(DFB_EXAMPLE_HAS_OPENEXR)
+#include <ImfChannelList.h>
+#include <ImfFrameBuffer.h>
+#include <ImfHeader.h>
 #include <ImfInputFile.h>
+#include <ImfStringAttribute.h>
 #endif
 
 #include <cmath>

@@ -1,0 +1,443 @@
+// Tracing the rays of a tile through one brick.
+#include "renderer.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cmath>
+#include <limits>
+#include <utility>
+
+#if defined(__SSE2__) || defined(_M_X64)
+#include <xmmintrin.h>
+#endif
+
+namespace example {
+
+namespace {
+
+// Denormals flushed to zero, as Embree wants it, for as long as this lives.
+class FlushDenormals {
+public:
+#if defined(__SSE2__) || defined(_M_X64)
+    FlushDenormals() : before_(_mm_getcsr()) { _mm_setcsr(before_ | 0x8040u); }
+    ~FlushDenormals() { _mm_setcsr(before_); }
+
+private:
+    unsigned before_;
+#else
+    FlushDenormals() {}
+    ~FlushDenormals() {}
+#endif
+public:
+    FlushDenormals(const FlushDenormals&) = delete;
+    FlushDenormals& operator=(const FlushDenormals&) = delete;
+};
+
+float leastOpacity(const Brick& brick, const RenderSettings& settings)
+{
+    float least = 1;
+    for (const BrickMesh& mesh : brick.meshes)
+        least = std::min(least, mesh.opacity.value_or(settings.opacity));
+    for (const BrickSpheres& spheres : brick.spheres)
+        least = std::min(least, spheres.opacity.value_or(settings.opacity));
+    return least;
+}
+
+// How many hits of at least that opacity end a ray.
+std::size_t mostHits(const RenderSettings& settings, float opacity)
+{
+    if (settings.pathBounces > 0)
+        return 1;
+    double through = 1; // reckoned as in Accumulator
+    for (std::size_t hits = 1; hits <= 100; ++hits) {
+        through *= 1 - static_cast<double>(opacity);
+        if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
+            return hits;
+    }
+    return std::numeric_limits<std::size_t>::max();
+}
+
+// The direction of a set that is distributed by the cosine around a normal, of two numbers from 0 to 1.
+Vec3 cosineDirection(const Vec3& normal, double u, double v)
+{
+    const double angle = 2 * 3.14159265358979323846 * v, r = std::sqrt(u);
+    const Vec3d n(normal);
+    const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d(0, 1, 0) : Vec3d(1, 0, 0);
+    const Vec3d a = unit(cross(n, other)), b = cross(n, a);
+    return rounded(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
+}
+
+// That of number `index`.
+Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
+{
+    const std::uint64_t h = hash64(key, static_cast<std::uint64_t>(index));
+    return cosineDirection(normal, unitReal(h), unitReal(hash64(h)));
+}
+
+Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
+
+// The distances at which a ray enters and leaves a box; false if it misses.
+bool clip(const Box& box, const Vec3& origin, const Vec3& inverse, float& enter, float& leave)
+{
+    enter = 0;
+    leave = std::numeric_limits<float>::max();
+    for (int i = 0; i < 3; ++i) {
+        const float from = component(origin, i), steps = component(inverse, i);
+        const float a = (component(box.lo, i) - from) * steps, b = (component(box.hi, i) - from) * steps;
+        if (std::isnan(a) || std::isnan(b))
+            continue; // 0 * infinity, of a ray within a face, limits nothing
+        enter = std::max(enter, std::min(a, b));
+        leave = std::min(leave, std::max(a, b));
+    }
+    return enter <= leave;
+}
+
+} // namespace
+
+// The colour gathered along a ray so far.
+struct Renderer::Accumulator {
+    double r = 0, g = 0, b = 0, alpha = 0, through = 1;
+    float depth = std::numeric_limits<float>::infinity(), farDepth = -std::numeric_limits<float>::infinity();
+    Vec3 normal, albedo; // premultiplied
+    std::uint32_t primitive = dfb::noId, instance = dfb::noId;
+    std::int64_t cost = 0;
+
+    void add(float t, float red, float green, float blue, float opacity)
+    {
+        if (!(opacity > 0))
+            return;
+        if (alpha == 0)
+            depth = t;
+        farDepth = t;
+        r += through * static_cast<double>(red);
+        g += through * static_cast<double>(green);
+        b += through * static_cast<double>(blue);
+        alpha += through * static_cast<double>(opacity);
+        through *= 1 - static_cast<double>(opacity);
+    }
+    // To be called before add().
+    void addSurface(const Hit& hit, float opacity)
+    {
+        if (!(opacity > 0))
+            return;
+        const float weight = static_cast<float>(through) * opacity;
+        normal = normal + hit.normal * weight;
+        albedo = albedo + hit.color * weight;
+        if (primitive == dfb::noId) {
+            primitive = hit.primitive;
+            instance = hit.geometry;
+        }
+    }
+};
+
+// The numbers of a ray: a function of pixel, sample, frame and seed alone.
+struct Renderer::RaySample {
+    std::uint64_t key = 0;
+    dfb::LensSample lens;
+    double x = 0, y = 0; // in the image
+};
+
+// Where a ray is in one volume: the next sample it has to look at, and the one behind the last.
+struct Renderer::VolumeRay {
+    int next = 0, end = 0;
+    Vec3 inverseStep;
+    int valueOf = -1; // the sample whose value is known
+    float value = 0;
+};
+
+Renderer::Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings)
+    : settings_(settings), scene_(scene), cell_(brick.cell),
+      mostHits_(mostHits(settings, leastOpacity(brick, settings))),
+      surfaces_(brick.cell, std::move(brick.meshes), std::move(brick.spheres))
+{
+    looksAhead_ = ghostReach(scene, settings) > 0 && mostHits_ < std::numeric_limits<std::size_t>::max()
+                  && !(cell_ == scene.bounds);
+    volumes_.reserve(brick.volumes.size());
+    for (BrickVolume& volume : brick.volumes)
+        volumes_.emplace_back(std::move(volume), scene.step);
+    for (const VolumeSampler& volume : volumes_)
+        hasIsosurfaces_ |= !volume.look().isovalues.empty();
+}
+
+// One function for all tile types and so one machine code for all bricks.
+std::int64_t Renderer::render(const Target& to, int frameIndex) const
+{
+    if (volumes_.empty() && surfaces_.empty())
+        return 0;
+    const FlushDenormals flush;
+    const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
+    const dfb::PerspectiveCamera& view = camera.pinhole();
+    const Light light{unit(view.forward() * -0.75f + view.up() * 0.55f + view.right() * -0.40f)};
+    std::vector<Hit> hits, scratch;
+    std::vector<VolumeRay> rays(volumes_.size());
+    std::int64_t cost = 0;
+    for (int y = to.region.y0; y < to.region.y1; ++y)
+        for (int x = to.region.x0; x < to.region.x1; ++x) {
+            const RaySample sample = sampleAt(x, y, to.sample, frameIndex);
+            const auto [origin, direction] = camera.ray(sample.x, sample.y, sample.lens);
+            if (!(dot(direction, direction) > 0))
+                continue;
+            const Accumulator sum = trace(origin, direction, light, sample.key, hits, scratch, rays);
+            cost += sum.cost;
+            if (sum.alpha == 0)
+                continue;
+            const std::array<float, 4> rgba{static_cast<float>(sum.r), static_cast<float>(sum.g),
+                                            static_cast<float>(sum.b), static_cast<float>(sum.alpha)};
+            if (to.deep) {
+                to.deep->add(x, y, {rgba, sum.depth, sum.farDepth});
+                continue;
+            }
+            const std::ptrdiff_t at = static_cast<std::ptrdiff_t>(y - to.region.y0) * to.stride + (x - to.region.x0);
+            std::copy(rgba.begin(), rgba.end(), to.color + 4 * at);
+            to.depth[at] = sum.depth;
+            if (to.normal == nullptr)
+                continue;
+            const Vec3 position = pointAt(origin, direction, sum.depth);
+            for (int i = 0; i < 3; ++i) {
+                to.normal[3 * at + i] = component(sum.normal, i);
+                to.albedo[3 * at + i] = component(sum.albedo, i);
+                to.position[3 * at + i] = component(position, i);
+            }
+            to.primitiveId[at] = sum.primitive;
+            to.instanceId[at] = sum.instance;
+        }
+    return cost;
+}
+
+// Low-discrepancy sequences over the samples (the R2 sequence of Roberts for the image, the R3 one for lens and
+// time), shifted by a hash of the pixel. A single sample is in the pixel's centre, the lens's middle, the shutter's
+// beginning.
+Renderer::RaySample Renderer::sampleAt(int x, int y, int index, int frameIndex) const
+{
+    const std::uint64_t pixel = (static_cast<std::uint64_t>(y) << 32) | static_cast<std::uint32_t>(x);
+    const std::uint64_t key = hash64(hash64(settings_.seed, static_cast<std::uint64_t>(frameIndex)), pixel);
+    RaySample sample;
+    sample.key = hash64(key, static_cast<std::uint64_t>(index) + 1);
+    sample.x = x + 0.5;
+    sample.y = y + 0.5;
+    if (settings_.passes <= 1)
+        return sample;
+    const auto at = [index](double shift, double step) {
+        const double v = shift + step * index;
+        return v - std::floor(v);
+    };
+    const std::uint64_t second = hash64(key), third = hash64(second), fourth = hash64(third);
+    sample.x = x + at(unitReal(key), 0.7548776662466927);
+    sample.y = y + at(unitReal(second), 0.5698402909980532);
+    sample.lens = {at(unitReal(third), 0.8191725133961644), at(unitReal(fourth), 0.6710436067037893),
+                   at(unitReal(hash64(fourth)), 0.5497004779019703)};
+    return sample;
+}
+
+// The part of the sky that a hit sees, as far as the rays look: the R2 sequence of Roberts, which has less noise
+// than chance. Of everything that the brick has, in its cell or not.
+float Renderer::openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const
+{
+    const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
+    const float reach = ghostReach(scene_, settings_), least = 1e-3f * reach;
+    const std::uint64_t own = hash64(key, (static_cast<std::uint64_t>(hit.geometry) << 32) | hit.primitive);
+    const double first = unitReal(own), second = unitReal(hash64(own));
+    const auto at = [](double shift, double step, int i) {
+        const double v = shift + step * i;
+        return v - std::floor(v);
+    };
+    int open = 0;
+    for (int i = 0; i < settings_.aoRays; ++i) {
+        const Vec3 ray = cosineDirection(normal, at(first, 0.7548776662466927, i), at(second, 0.5698402909980532, i));
+        open += !surfaces_.occluded(point, ray, least, reach);
+    }
+    return static_cast<float>(open) / static_cast<float>(settings_.aoRays);
+}
+
+// Also of what is beyond the cell, as far as shadows are cast.
+bool Renderer::isInShadow(const Vec3& point, const Light& light) const
+{
+    const float reach = ghostReach(scene_, settings_);
+    return surfaces_.occluded(point, light.direction, 1e-3f * reach, reach);
+}
+
+// Diffuse light from a bright sky, over the bounces of one path that begins at a hit. Volumes are left out.
+Vec3 Renderer::pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits,
+                         std::int64_t& cost) const
+{
+    Vec3 through = hit.color;
+    const float least = 1e-4f * scene_.bounds.largestExtent();
+    for (int bounce = 0; bounce < settings_.pathBounces; ++bounce) {
+        const Vec3 normal = dot(hit.normal, direction) > 0 ? hit.normal * -1.0f : hit.normal;
+        direction = cosineDirection(normal, key, bounce);
+        const Vec3 origin = point + normal * least;
+        surfaces_.intersect(origin, direction, hits, 1);
+        ++cost;
+        if (hits.empty()) {
+            const float sky = 0.9f + 0.5f * dot(direction, unit(settings_.view.up)); // brighter above
+            return product(through, Vec3{sky, sky, 1.05f * sky});
+        }
+        hit = hits.front();
+        point = pointAt(origin, direction, hit.t);
+        through = product(through, hit.color);
+    }
+    return Vec3{0, 0, 0};
+}
+
+Renderer::Accumulator Renderer::trace(const Vec3& origin, const Vec3& direction, const Light& light, std::uint64_t key,
+                                      std::vector<Hit>& hits, std::vector<Hit>& scratch,
+                                      std::vector<VolumeRay>& rays) const
+{
+    Accumulator sum;
+    const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
+    float enter = 0, leave = 0;
+    // Wider than the cell by more than rounding: it is the points that decide.
+    const Box reach = cell_.padded(1e-5f * (scene_.bounds.largestExtent() + length(origin)));
+    if (!clip(reach, origin, inverse, enter, leave))
+        return sum;
+    sum.cost = 1;
+    surfaces_.intersect(origin, direction, hits, mostHits_);
+    if (hits.size() == mostHits_)
+        leave = std::min(leave, hits.back().t);
+    if (looksAhead_ && !hits.empty()) {
+        ++sum.cost;
+        if (surfaces_.blocks(origin, direction, enter, mostHits_, scratch))
+            return sum;
+    }
+    if (settings_.pathBounces > 0) {
+        if (hits.empty())
+            return sum;
+        const Hit first = hits.front();
+        const Vec3 c = pathLight(first, pointAt(origin, direction, first.t), direction, key, hits, sum.cost);
+        sum.addSurface(first, 1);
+        sum.add(first.t, c.x, c.y, c.z, 1);
+        return sum;
+    }
+    const int none = std::numeric_limits<int>::max();
+    for (std::size_t i = 0; i < volumes_.size(); ++i) {
+        float first = 0, last = 0;
+        const Box box = volumes_[i].bounds().padded(2 * scene_.step);
+        rays[i] = {none, none, {}, -1, 0};
+        if (!clip(box, origin, inverse, first, last))
+            continue;
+        first = std::max(first, enter);
+        last = std::min(last, leave);
+        if (first > last)
+            continue;
+        rays[i].next = std::max(1, static_cast<int>(first / scene_.step) - 1);
+        rays[i].end = static_cast<int>(last / scene_.step) + 2;
+        rays[i].inverseStep = volumes_[i].inverseAdvance(inverse, scene_.step);
+    }
+
+    auto hit = hits.begin();
+    const double least = static_cast<double>(settings_.earlyTermination);
+    const auto isDone = [&] { return sum.through <= 0 || sum.through < least; };
+    const auto addHit = [&](const Hit& surface) {
+        const float opacity = surface.opacity.value_or(settings_.opacity);
+        const Vec3 point = pointAt(origin, direction, surface.t);
+        const bool inShadow = settings_.shadows && opacity > 0 && isInShadow(point, light);
+        Vec3 c = (inShadow ? surface.color * light.ambient : light.shade(surface.color, surface.normal, direction))
+                 * opacity;
+        sum.cost += settings_.shadows;
+        if (settings_.aoRays > 0 && opacity > 0) {
+            c = c * (0.3f + 0.7f * openness(surface, point, direction, key)); // some comes by many bounces
+            sum.cost += settings_.aoRays;
+        }
+        sum.addSurface(surface, opacity);
+        sum.add(surface.t, c.x, c.y, c.z, opacity);
+    };
+    const auto addHits = [&](float before) {
+        for (; hit != hits.end() && hit->t <= before && !isDone(); ++hit)
+            addHit(*hit);
+    };
+    while (!isDone()) {
+        int k = none;
+        for (const VolumeRay& ray : rays)
+            k = std::min(k, ray.next < ray.end ? ray.next : none);
+        if (k == none)
+            break;
+        // All bricks take their samples from one grid along the ray.
+        const float t = static_cast<float>(k) * scene_.step;
+        const Vec3 point = pointAt(origin, direction, t);
+        const bool mine = cell_.contains(point);
+        if (hasIsosurfaces_) {
+            findCrossings(origin, direction, k, rays, scratch);
+            for (auto crossing = scratch.begin(); crossing != scratch.end() && !isDone(); ++crossing) {
+                addHits(crossing->t);
+                if (!isDone())
+                    addHit(*crossing);
+            }
+            if (isDone())
+                break;
+        }
+        for (std::size_t i = 0; i < rays.size(); ++i) {
+            if (rays[i].next != k)
+                continue;
+            rays[i].next = k + 1;
+            const VolumeSampler& volume = volumes_[i];
+            const Vec3 voxel = volume.toVoxel(point);
+            if (!mine || !volume.inDomain(voxel))
+                continue;
+            const int skip = volume.emptySteps(voxel, rays[i].inverseStep);
+            if (skip > 0) {
+                rays[i].next = k + skip;
+                continue;
+            }
+            ++sum.cost;
+            const TransferFunction::Entry entry = volume.shade(voxel, direction, light);
+            if (entry.alpha > 0) {
+                addHits(t);
+                if (isDone())
+                    break;
+                sum.albedo = sum.albedo + Vec3{entry.r, entry.g, entry.b} * static_cast<float>(sum.through);
+                sum.add(t, entry.r, entry.g, entry.b, entry.alpha);
+            }
+        }
+    }
+    addHits(std::numeric_limits<float>::infinity());
+    return sum;
+}
+
+// Where the ray meets isosurfaces between samples k - 1 and k, front to back: those of its points that are in the
+// cell. The values at both samples, which may be a step outside of it, are the same in all bricks.
+void Renderer::findCrossings(const Vec3& origin, const Vec3& direction, int k, std::vector<VolumeRay>& rays,
+                             std::vector<Hit>& crossings) const
+{
+    crossings.clear();
+    for (std::size_t i = 0; i < rays.size(); ++i) {
+        const VolumeSampler& volume = volumes_[i];
+        const VolumeLook& look = volume.look();
+        if (rays[i].next != k || look.isovalues.empty())
+            continue;
+        const auto valueAt = [&](float t) { return volume.valueAt(volume.toVoxel(pointAt(origin, direction, t))); };
+        const float t0 = static_cast<float>(k - 1) * scene_.step, t1 = static_cast<float>(k) * scene_.step;
+        const float v0 = rays[i].valueOf == k - 1 ? rays[i].value : valueAt(t0), v1 = valueAt(t1);
+        rays[i].valueOf = k;
+        rays[i].value = v1;
+        for (std::size_t n = 0; n < look.isovalues.size(); ++n) {
+            const float iso = look.isovalues[n];
+            if (std::isnan(v0) || std::isnan(v1) || (v0 < iso) == (v1 < iso))
+                continue;
+            float a = t0, b = t1, va = v0, vb = v1; // iso is between va and vb
+            float t = t0;
+            for (int step = 0; step < 4; ++step) {
+                t = std::clamp(a + (b - a) * ((iso - va) / (vb - va)), a, b);
+                const float v = valueAt(t);
+                const bool isBehind = (v < iso) == (vb < iso);
+                (isBehind ? b : a) = t;
+                (isBehind ? vb : va) = v;
+            }
+            const Vec3 point = pointAt(origin, direction, t), voxel = volume.toVoxel(point);
+            if (!(t > 0) || !cell_.contains(point) || !volume.inDomain(voxel))
+                continue;
+            Hit hit;
+            hit.t = t;
+            hit.geometry = volume.geometry();
+            hit.primitive = static_cast<std::uint32_t>(n);
+            hit.normal = volume.directionAt(voxel);
+            hit.color = look.isoColors[n];
+            hit.opacity = look.isoOpacity;
+            crossings.push_back(hit);
+        }
+    }
+    std::sort(crossings.begin(), crossings.end(), [](const Hit& a, const Hit& b) {
+        return a.t != b.t ? a.t < b.t : a.geometry != b.geometry ? a.geometry < b.geometry : a.primitive < b.primitive;
+    });
+}
+
+} // namespace example
