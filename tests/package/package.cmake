@@ -59,7 +59,8 @@ set(_name_of_tbb TBB)
 set(_name_of_snappy Snappy)
 
 # Everything, in three ways.
-dfb_add_package_test(find_package HOW find_package VERSION 0.1 EXPECT ${_others} OPTIONS -DFRAME=ON)
+set(_minor ${PROJECT_VERSION_MAJOR}.${PROJECT_VERSION_MINOR})
+dfb_add_package_test(find_package HOW find_package VERSION ${_minor} EXPECT ${_others} OPTIONS -DFRAME=ON)
 foreach(_how add_subdirectory FetchContent)
   set(_options "")
   foreach(_component mpi tbb snappy)
@@ -132,7 +133,13 @@ dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing C
 # What cannot be had is said clearly.
 dfb_add_package_test(find_package_misses_testing HOW find_package COMPONENTS testing
   FAILS "component 'testing' is not installed")
-dfb_add_package_test(other_minor_version HOW find_package VERSION 0.0 FAILS "requested version \"0.0\"")
+# In versions 0.x each minor version has an interface of its own; of two patches the later one will do.
+math(EXPR _earlier "${PROJECT_VERSION_MINOR} - 1")
+math(EXPR _later "${PROJECT_VERSION_MINOR} + 1")
+math(EXPR _patch "${PROJECT_VERSION_PATCH} + 1")
+foreach(_version ${PROJECT_VERSION_MAJOR}.${_earlier} ${PROJECT_VERSION_MAJOR}.${_later} ${_minor}.${_patch})
+  dfb_add_package_test(refuses_${_version} HOW find_package VERSION ${_version} FAILS "requested version \"${_version}\"")
+endforeach()
 dfb_add_package_test(unknown_component HOW find_package COMPONENTS cuda FAILS "component 'cuda' is not installed")
 foreach(_component IN LISTS _others)
   set(_package ${_name_of_${_component}})
