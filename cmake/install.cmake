@@ -3,7 +3,8 @@
 include(GNUInstallDirs)
 include(CMakePackageConfigHelpers)
 
-set(_dfb_config_dir ${CMAKE_INSTALL_LIBDIR}/cmake/dfb)
+# Headers are the same on all processors, and so is what is installed.
+set(_dfb_config_dir ${CMAKE_INSTALL_DATADIR}/cmake/dfb)
 target_include_directories(dfb_core INTERFACE $<INSTALL_INTERFACE:${CMAKE_INSTALL_INCLUDEDIR}>)
 install(DIRECTORY ${PROJECT_SOURCE_DIR}/include/dfb DESTINATION ${CMAKE_INSTALL_INCLUDEDIR}
   FILES_MATCHING PATTERN "*.hpp" PATTERN "compiled.cpp")
@@ -31,3 +32,67 @@ write_basic_package_version_file(${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake
   COMPATIBILITY SameMinorVersion ARCH_INDEPENDENT)
 install(FILES ${PROJECT_BINARY_DIR}/dfbConfig.cmake ${PROJECT_BINARY_DIR}/dfbConfigVersion.cmake
   DESTINATION ${_dfb_config_dir})
+install(FILES ${PROJECT_SOURCE_DIR}/LICENSE DESTINATION ${CMAKE_INSTALL_DOCDIR})
+
+# For pkg-config: dfb-core.pc is the headers alone, dfb.pc all components. A dependency is the module of pkg-config that has
+# the headers which CMake has found: this keeps paths of this machine out. If there is none, dfb.pc has its flags.
+find_package(PkgConfig QUIET)
+set(_dfb_pc_requires dfb-core)
+set(_dfb_pc_cflags "")
+set(_dfb_pc_libs "")
+
+# _dfb_pc_add(<component> <target> <libraries> <module>...)
+function(_dfb_pc_add component target libraries)
+  string(TOUPPER ${component} definition)
+  string(APPEND _dfb_pc_cflags " -DDFB_HAS_${definition}=1")
+  get_target_property(folders ${target} INTERFACE_INCLUDE_DIRECTORIES)
+  if(NOT folders)
+    set(folders "")
+  endif()
+  set(real "")
+  foreach(folder IN LISTS folders)
+    get_filename_component(folder ${folder} REALPATH)
+    list(APPEND real ${folder})
+  endforeach()
+  set(found "")
+  foreach(module IN LISTS ARGN)
+    if(PKG_CONFIG_FOUND AND NOT found)
+      pkg_get_variable(folder ${module} includedir)
+      get_filename_component(folder "${folder}" REALPATH)
+      if(folder IN_LIST real)
+        set(found ${module})
+      endif()
+    endif()
+  endforeach()
+  if(found)
+    string(APPEND _dfb_pc_requires " ${found}")
+  else()
+    list(TRANSFORM folders PREPEND " -I")
+    string(APPEND _dfb_pc_cflags ${folders})
+    list(JOIN libraries " " libraries)
+    string(APPEND _dfb_pc_libs " ${libraries}")
+  endif()
+  foreach(name requires cflags libs)
+    set(_dfb_pc_${name} "${_dfb_pc_${name}}" PARENT_SCOPE)
+  endforeach()
+endfunction()
+
+if(TARGET dfb_mpi)
+  # Without the bindings for C++ that mpi.h may have: pkg-config's mpi does not link them.
+  string(APPEND _dfb_pc_cflags " -DMPICH_SKIP_MPICXX=1 -DOMPI_SKIP_MPICXX=1")
+  _dfb_pc_add(mpi MPI::MPI_CXX "${MPI_CXX_LIBRARIES}" mpi ompi-cxx mpich) # mpi: of Debian, whichever is chosen
+endif()
+if(TARGET dfb_tbb)
+  _dfb_pc_add(tbb TBB::tbb $<TARGET_LINKER_FILE:TBB::tbb> tbb)
+endif()
+if(TARGET dfb_snappy)
+  _dfb_pc_add(snappy Snappy::snappy $<TARGET_LINKER_FILE:Snappy::snappy> snappy)
+endif()
+
+# From the file on, since what is installed may be moved.
+file(RELATIVE_PATH _dfb_pc_include ${CMAKE_INSTALL_FULL_DATADIR}/pkgconfig ${CMAKE_INSTALL_FULL_INCLUDEDIR})
+foreach(_dfb_name dfb dfb-core)
+  configure_file(${CMAKE_CURRENT_LIST_DIR}/${_dfb_name}.pc.in ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in @ONLY)
+  file(GENERATE OUTPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc INPUT ${PROJECT_BINARY_DIR}/${_dfb_name}.pc.in)
+  install(FILES ${PROJECT_BINARY_DIR}/${_dfb_name}.pc DESTINATION ${CMAKE_INSTALL_DATADIR}/pkgconfig)
+endforeach()

@@ -1,10 +1,10 @@
 #!/bin/sh
-# sh cmake/install_packages.sh [clang|bench|tests|browser]
+# sh cmake/install_packages.sh [clang|bench|tests|browser|aarch64]
 # Installs what building dfb, its tests and its examples needs and this machine lacks, with "clang" also Clang and its
 # sanitizers, with "bench" also what the benchmarks need beyond that, with "tests" what the site, the Python package (100 MB),
 # the examples of other people's programs and those in Fortran, and pictures as EXR and plots need, with "browser" what
-# drives the page of the live view: on Debian and Ubuntu with apt-get; elsewhere says what is missing and exits with 1, but
-# for the live view, which is left out then. Quick when nothing is missing.
+# drives the page of the live view, with "aarch64" a compiler for that processor and qemu: on Debian and Ubuntu with apt-get;
+# elsewhere says what is missing and exits with 1, but for the live view, which is left out then. Quick when nothing is missing.
 set -eu
 with=${1:-}
 
@@ -39,6 +39,10 @@ tools() {
         have chromium || echo chromium
         have node || echo nodejs
         have npm || echo npm
+    fi
+    if [ "$with" = aarch64 ]; then
+        have aarch64-linux-gnu-g++ || echo g++-aarch64-linux-gnu
+        have qemu-aarch64 || echo qemu-user
     fi
 }
 

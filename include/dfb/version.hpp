@@ -2,10 +2,10 @@
 #pragma once
 
 #define DFB_VERSION_MAJOR 0
-#define DFB_VERSION_MINOR 1
+#define DFB_VERSION_MINOR 2
 #define DFB_VERSION_PATCH 0
 
-// Everything stands in an inline namespace named after the version, such as dfb::v0_1. A program writes dfb::Image. If
+// Everything stands in an inline namespace named after the version, such as dfb::v1_0. A program writes dfb::Image. If
 // a process has two versions, as with two plugins, neither takes the functions of the other.
 #define DFB_NAMESPACE_OF_(major, minor) v##major##_##minor
 #define DFB_NAMESPACE_OF(major, minor) DFB_NAMESPACE_OF_(major, minor)

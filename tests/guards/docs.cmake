@@ -1,6 +1,6 @@
 # Run with: cmake -DROOT=<source dir> -P docs.cmake
 # docs/configuration.md has each field of each configuration, and no other; links within README and docs lead somewhere;
-# the README is short.
+# the README is short; what repeats the version has that of dfb/version.hpp.
 cmake_minimum_required(VERSION 3.16)
 file(READ ${ROOT}/docs/configuration.md page)
 set(count 0)
@@ -94,3 +94,17 @@ string(LENGTH "${newlines}" lines)
 if(lines GREATER 120)
   message(SEND_ERROR "README.md has ${lines} lines: docs/ is the place for more than 120")
 endif()
+
+file(STRINGS ${ROOT}/include/dfb/version.hpp version REGEX "^#define DFB_VERSION_(MAJOR|MINOR|PATCH) ")
+list(TRANSFORM version REPLACE ".*[ \t]([0-9]+)$" "\\1")
+list(GET version 0 1 minor)
+list(JOIN minor "\\." minor)
+list(JOIN version "\\." version)
+foreach(place "README.md: *find_package\\(dfb ${minor} REQUIRED\\)" "CHANGELOG.md:## ${version}$"
+    "examples/cluster/spack/package.py:    version\\(\"${version}\",")
+  string(REGEX MATCH "^([^:]*):(.*)$" place "${place}")
+  file(STRINGS ${ROOT}/${CMAKE_MATCH_1} lines REGEX "^${CMAKE_MATCH_2}")
+  if(NOT lines)
+    message(SEND_ERROR "${CMAKE_MATCH_1} does not have the version of dfb/version.hpp: no line '${CMAKE_MATCH_2}'")
+  endif()
+endforeach()

@@ -59,7 +59,8 @@ set(_name_of_tbb TBB)
 set(_name_of_snappy Snappy)
 
 # Everything, in three ways.
-dfb_add_package_test(find_package HOW find_package VERSION 0.1 EXPECT ${_others} OPTIONS -DFRAME=ON)
+set(_minor ${PROJECT_VERSION_MAJOR}.${PROJECT_VERSION_MINOR})
+dfb_add_package_test(find_package HOW find_package VERSION ${_minor} EXPECT ${_others} OPTIONS -DFRAME=ON)
 foreach(_how add_subdirectory FetchContent)
   set(_options "")
   foreach(_component mpi tbb snappy)
@@ -100,6 +101,31 @@ dfb_add_package_test(find_package_core_compiled HOW find_package COMPONENTS core
 dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
 
+# By pkg-config and the compiler alone: all, core, and all where pkg-config does not know the dependencies.
+find_program(DFB_PKG_CONFIG pkg-config)
+mark_as_advanced(DFB_PKG_CONFIG)
+if(DFB_PKG_CONFIG)
+  function(dfb_add_pkg_config_test name module stage)
+    list(JOIN ARGN "," expect)
+    add_test(NAME package.${name} COMMAND ${CMAKE_COMMAND} -DCXX=${CMAKE_CXX_COMPILER} -DMODULE=${module} -DSTAGE=${stage}
+      -DMAIN=${CMAKE_CURRENT_SOURCE_DIR}/package/main.cpp -DBUILD=${CMAKE_CURRENT_BINARY_DIR}/package/${name}
+      -DVERSION=${PROJECT_VERSION} -DEXPECT=${expect} ${_source} -P ${CMAKE_CURRENT_SOURCE_DIR}/package/pkg_config.cmake)
+    set_tests_properties(package.${name} PROPERTIES LABELS package FIXTURES_REQUIRED dfb_stage)
+  endfunction()
+  set(_source "")
+  dfb_add_pkg_config_test(pkg_config dfb ${_stage} ${_others})
+  dfb_add_pkg_config_test(pkg_config_core dfb-core ${_stage})
+  if(_others)
+    set(_options -DCMAKE_CXX_COMPILER=${CMAKE_CXX_COMPILER} -DMPI_CXX_COMPILER=${MPI_CXX_COMPILER})
+    foreach(_component MPI TBB SNAPPY)
+      list(APPEND _options -DDFB_WITH_${_component}=${DFB_WITH_${_component}})
+    endforeach()
+    list(JOIN _options "|" _options)
+    set(_source -DSOURCE=${PROJECT_SOURCE_DIR} -DOPTIONS=${_options})
+    dfb_add_pkg_config_test(pkg_config_alone dfb ${CMAKE_CURRENT_BINARY_DIR}/package/pkg_config_alone/stage ${_others})
+  endif()
+endif()
+
 # What tests are made of, beside what is asked for.
 dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing COMPONENTS testing EXPECT testing
   WITHOUT MPI TBB Snappy)
@@ -107,7 +133,13 @@ dfb_add_package_test(find_package_testing HOW find_package STAGE stage_testing C
 # What cannot be had is said clearly.
 dfb_add_package_test(find_package_misses_testing HOW find_package COMPONENTS testing
   FAILS "component 'testing' is not installed")
-dfb_add_package_test(other_minor_version HOW find_package VERSION 0.0 FAILS "requested version \"0.0\"")
+# In versions 0.x each minor version has an interface of its own; of two patches the later one will do.
+math(EXPR _earlier "${PROJECT_VERSION_MINOR} - 1")
+math(EXPR _later "${PROJECT_VERSION_MINOR} + 1")
+math(EXPR _patch "${PROJECT_VERSION_PATCH} + 1")
+foreach(_version ${PROJECT_VERSION_MAJOR}.${_earlier} ${PROJECT_VERSION_MAJOR}.${_later} ${_minor}.${_patch})
+  dfb_add_package_test(refuses_${_version} HOW find_package VERSION ${_version} FAILS "requested version \"${_version}\"")
+endforeach()
 dfb_add_package_test(unknown_component HOW find_package COMPONENTS cuda FAILS "component 'cuda' is not installed")
 foreach(_component IN LISTS _others)
   set(_package ${_name_of_${_component}})

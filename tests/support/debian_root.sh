@@ -92,7 +92,7 @@ make_root() {
 
 # in_root COMMAND...: runs it there, with nothing of this environment.
 in_root() {
-    chroot "$root" /usr/bin/env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
+    chroot "$root" /usr/bin/env -i PATH=/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin HOME=/root LC_ALL=C.UTF-8 \
         OMPI_ALLOW_RUN_AS_ROOT=1 OMPI_ALLOW_RUN_AS_ROOT_CONFIRM=1 "$@"
 }
 
@@ -100,6 +100,14 @@ in_root() {
 # next one meanwhile.
 with_display() {
     in_root xvfb-run -a -s "-screen 0 1280x1024x24 -nolisten tcp -noreset" "$@"
+}
+
+# install_there PACKAGE...: with apt; a package may be a file, too.
+install_there() {
+    say "installing there: $*"
+    { in_root dpkg --configure -a && in_root apt-get -q update && in_root DEBIAN_FRONTEND=noninteractive apt-get -y -q install \
+        --no-install-recommends "$@"; } >"$root/packages.log" 2>&1 ||
+        give_up "packages cannot be installed: see $root/packages.log"
 }
 
 # enter_root PACKAGE...: makes the system in the folder $root if it is not there, and installs what it lacks.
@@ -116,11 +124,7 @@ enter_root() {
     done)
     if [ -n "$missing" ]; then
         # shellcheck disable=SC2086 # one word per package
-        say "installing there:" $missing
-        # shellcheck disable=SC2086
-        { in_root dpkg --configure -a && in_root apt-get -q update && in_root DEBIAN_FRONTEND=noninteractive apt-get -y -q install \
-            --no-install-recommends $missing; } >"$root/packages.log" 2>&1 ||
-            give_up "packages cannot be installed: see $root/packages.log"
+        install_there $missing
         in_root apt-get clean
     fi
 }

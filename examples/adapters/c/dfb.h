@@ -199,7 +199,7 @@ int dfb_get_report_sized(const dfb_framebuffer* framebuffer, dfb_report* report,
 // the next error.
 const char* dfb_last_error(void);
 
-// The version of the library, such as "0.1.0".
+// The version of the library: "MAJOR.MINOR.PATCH".
 const char* dfb_version(void);
 
 #ifdef __cplusplus

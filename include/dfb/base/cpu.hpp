@@ -107,8 +107,23 @@ public:
 private:
     static constexpr unsigned flushAndDenormalsZero = 0x8040;
     unsigned saved_;
+#elif defined(__aarch64__) && defined(__GNUC__) // Clang's, too
+    FloatEnvironment() : saved_(controlRegister()) { setControlRegister(saved_ & ~flushToZero); }
+    ~FloatEnvironment() { setControlRegister(saved_); }
+
+    static std::uint64_t controlRegister() noexcept
+    {
+        std::uint64_t value = 0;
+        __asm__ volatile("mrs %0, fpcr" : "=r"(value));
+        return value;
+    }
+    static void setControlRegister(std::uint64_t value) noexcept { __asm__ volatile("msr fpcr, %0" : : "r"(value)); }
+    static constexpr std::uint64_t flushToZero = std::uint64_t{1} << 24;
+
+private:
+    std::uint64_t saved_;
 #else
-    FloatEnvironment() = default;
+    FloatEnvironment() {} // not defaulted: compilers would call a variable of it unused
 #endif
 };
 

@@ -186,24 +186,26 @@ inline bool copyAndCheckColors(const float* rgba, int count, float* out)
     return (bad[0] | bad[1] | bad[2] | bad[3]) == 0;
 }
 
-#if defined(DFB_HAS_AVX2_CLONES)
 DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
 {
+    int i = 0;
+    bool areGood = true;
+#if defined(DFB_HAS_AVX2_CLONES)
     constexpr float most = std::numeric_limits<float>::max();
     const __m256 low = _mm256_setr_ps(-most, -most, -most, 0, -most, -most, -most, 0);
     const __m256 high = _mm256_setr_ps(most, most, most, 1, most, most, most, 1);
     __m256 areInside = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
-    int i = 0;
     for (; i + 2 <= count; i += 2) {
         const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
         _mm256_storeu_ps(out + 4 * i, two);
         areInside = _mm256_and_ps(
             areInside, _mm256_and_ps(_mm256_cmp_ps(two, low, _CMP_GE_OQ), _mm256_cmp_ps(two, high, _CMP_LE_OQ)));
     }
-    const bool isLastGood = i == count || copyAndCheckColors(rgba + 4 * i, 1, out + 4 * i);
-    return isLastGood && _mm256_movemask_ps(areInside) == 255;
-}
+    areGood = _mm256_movemask_ps(areInside) == 255;
 #endif
+    const bool isRestGood = i == count || copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i);
+    return isRestGood && areGood;
+}
 
 // Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
 inline float canonicalDepth(float depth)

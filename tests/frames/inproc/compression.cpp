@@ -2,9 +2,8 @@
 #include "catch.hpp"
 #include "random_scene.hpp"
 
-#include <dfb/dfb.hpp>
-#if defined(DFB_HAS_SNAPPY)
 #include <dfb/comm/snappy_codec.hpp>
+#include <dfb/dfb.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -101,4 +100,3 @@ TEST_CASE("A rank for which nothing is gained gets its messages as they are", "[
     CHECK(links == std::vector<std::int64_t>{-1, 1, -1, 1, -1, 1, -1, 1, -1, 1});
     CHECK(wrong == 0);
 }
-#endif

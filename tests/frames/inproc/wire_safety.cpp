@@ -16,6 +16,7 @@
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <string_view>
 #include <vector>
 
 namespace wire_safety_cases {
@@ -114,6 +115,29 @@ TEST_CASE("Small differences of a configuration are found as well", "[wire_safet
     INFO(joined(texts));
     CHECK(allSame(texts));
     CHECK(has(texts[0], "minTransmittance is 2e-09 on rank 0 and 1e-09 on rank 1"));
+}
+
+TEST_CASE("A rank of another minor version is refused by all ranks, with both versions", "[wire_safety]")
+{
+    const std::string minor = std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR);
+    const std::string setting = "the version of dfb=" + minor;
+    const auto watched = std::make_shared<Board>();
+    watched->inspect = [&](int from, int, const MessageHeader&, dfb::Buffer& message) {
+        const std::string_view text(reinterpret_cast<const char*>(message.data()), message.size());
+        if (const std::size_t at = text.find(setting); from == 3 && at != text.npos)
+            put(message, at + setting.size() - 1, 'x');
+        return Board::What::Pass;
+    };
+    std::vector<std::string> texts(4);
+    runOn(watched, 4, [&](const BoardTransport::Communicator& communicator) {
+        texts[static_cast<std::size_t>(communicator.inner.rank())] =
+            outcomeOf([&] { FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(1))); });
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "InvalidArgument"));
+    CHECK(has(texts[0], "the version of dfb is " + minor + " on rank 2 and " + minor.substr(0, minor.size() - 1)
+                            + "x on rank 3"));
 }
 
 TEST_CASE("A rank of another version or byte order is found when framebuffers are made", "[wire_safety]")

@@ -5,21 +5,23 @@
 
 #include <algorithm>
 #include <array>
+#include <cfloat>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
 #include <limits>
 #include <tuple>
-#include <type_traits>
 #include <vector>
 
 namespace dfb::testing {
 
 #if defined(__SIZEOF_FLOAT128__)
-__extension__ typedef __float128 Exact; // 113 bits
+__extension__ typedef __float128 Exact;
+inline constexpr int exactBits = 113;
 #else
-using Exact = long double;
+using Exact = long double; // on x86 64 bits, on aarch64 113
+inline constexpr int exactBits = LDBL_MANT_DIG;
 #endif
 
 inline constexpr std::uint32_t noIdOfPixel = 0xffffffffu;
@@ -181,8 +183,7 @@ inline std::uint8_t toUnorm8(Exact value)
     const Exact scaled = value * 255;
     const int below = static_cast<int>(scaled);
     const Exact overTie = scaled - below - static_cast<Exact>(0.5);
-    const Exact rounding =
-        scaled * static_cast<Exact>(sizeof(Exact) == 16 && !std::is_same_v<Exact, long double> ? 0x1p-108 : 0x1p-60);
+    const Exact rounding = scaled * static_cast<Exact>(exactBits >= 113 ? 0x1p-108 : 0x1p-60);
     const bool isTie = overTie <= rounding && -overTie <= rounding;
     return static_cast<std::uint8_t>(below + (isTie ? below % 2 : overTie > 0 ? 1 : 0));
 }

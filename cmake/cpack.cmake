@@ -1,0 +1,25 @@
+# cpack -G DEB in the build folder makes libdfb-dev_<version>_all.deb: for all processors, as nothing in it is compiled,
+# dfb::compiled neither. It depends on what the headers of the components need that this build has.
+set(CPACK_PACKAGE_CONTACT "the maintainers of dfb <maintainers@dfb.invalid>")
+set(CPACK_PACKAGE_DESCRIPTION_SUMMARY "Distributed rendering: the tiles of many ranks become one image (headers)")
+set(CPACK_RESOURCE_FILE_LICENSE ${PROJECT_SOURCE_DIR}/LICENSE)
+set(CPACK_STRIP_FILES OFF)
+
+set(CPACK_DEBIAN_PACKAGE_NAME libdfb-dev)
+set(CPACK_DEBIAN_FILE_NAME DEB-DEFAULT)
+set(CPACK_DEBIAN_PACKAGE_ARCHITECTURE all)
+set(CPACK_DEBIAN_PACKAGE_SECTION libdevel)
+set(CPACK_DEBIAN_PACKAGE_SUGGESTS "cmake (>= 3.16), pkg-config")
+set(_dfb_depends "")
+if(DFB_WITH_MPI)
+  list(APPEND _dfb_depends "libmpich-dev | libopenmpi-dev")
+endif()
+if(DFB_WITH_TBB)
+  list(APPEND _dfb_depends "libtbb-dev")
+endif()
+if(DFB_WITH_SNAPPY)
+  list(APPEND _dfb_depends "libsnappy-dev")
+endif()
+list(JOIN _dfb_depends ", " CPACK_DEBIAN_PACKAGE_DEPENDS)
+
+include(CPack)
