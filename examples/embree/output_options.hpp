@@ -15,8 +15,8 @@
 namespace example {
 
 struct OutputFiles {
-    // Empty: not written. All but the last two may be patterns.
-    std::string output, alpha, depth, aux, stats, saveOptions;
+    // Empty: not written. All but the last three may be patterns.
+    std::string output, alpha, depth, aux, stats, trace, saveOptions;
     std::string cinema; // a folder; empty: none. `output` is in it then
     int pngBits = 8;
     dfb::ChannelMask layers = dfb::depthChannel; // of an .exr, beside colour
@@ -24,7 +24,8 @@ struct OutputFiles {
     bool isExr() const { return detail::endingOf(output) == ".exr"; }
     bool writesNothing() const
     {
-        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && saveOptions.empty();
+        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && trace.empty()
+               && saveOptions.empty();
     }
 };
 
@@ -85,6 +86,13 @@ public:
             ->check(detail::ending({".json"}))
             ->option_text("FILE")
             ->group(group);
+        app_.add_option(
+                "--trace", files.trace,
+                "What each thread of each rank did for the frames, and when, for ui.perfetto.dev and speedscope; "
+                "default none")
+            ->check(detail::ending({".json"}))
+            ->option_text("FILE")
+            ->group(group);
 
         app_.add_option(
                 "--save-options", files.saveOptions,
@@ -130,6 +138,8 @@ public:
         }
         if (files.stats.find('%') != std::string::npos)
             throw CLI::ValidationError("--stats", "'" + files.stats + "': one file for all frames, without %");
+        if (files.trace.find('%') != std::string::npos)
+            throw CLI::ValidationError("--trace", "'" + files.trace + "': one file for all frames, without %");
         if (files.saveOptions.find('%') != std::string::npos)
             throw CLI::ValidationError("--save-options", "'" + files.saveOptions + "': one file, without %");
     }
