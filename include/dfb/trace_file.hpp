@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <array>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstdlib>
@@ -154,8 +155,11 @@ private:
                 out << printed(",\n{\"ph\": \"M\", \"name\": \"thread_name\", \"pid\": %d, \"tid\": %d, \"args\": "
                                "{\"name\": \"%s %d\"}}",
                                pid, row, isThread ? "thread" : "frames", isThread ? r.thread : row);
+            // Programs add both times up: rounding must not make what ends overlap what begins then.
+            const bool isPart = e.kind != TraceEvent::Kind::Frame && e.end > e.begin;
+            const Duration lasts = e.end - e.begin - std::chrono::nanoseconds(isPart ? 1 : 0);
             out << ",\n{\"ph\": \"X\", \"name\": \"" << nameOf(e) << '"' << place(rank, row, e.begin)
-                << ", \"dur\": " << microseconds(e.end - e.begin) << ", \"args\": {\"frame\": " << e.frame;
+                << ", \"dur\": " << microseconds(lasts) << ", \"args\": {\"frame\": " << e.frame;
             if (e.tile >= 0)
                 out << ", \"tile\": " << e.tile;
             if (e.peer >= 0)
