@@ -2,8 +2,9 @@
 // are made one image by dfb, by IceT and by plain loops, frame by frame in turn.
 //   mpirun -n 4 bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size 1024x1024,...] [--frames 21]
 //   [--systems dfb,icet,plain] [--moving] [--reader] [--only TEXT] [--json FILE] [--table FILE] [--commit ID]
+//   [--trace FILE]
 // --moving: each frame is seen from another side than the one before. --reader: rank 0 reads the image within the
-// clock.
+// clock. --trace: of dfb's first system, in the last scene and size.
 #include "scenes.hpp"
 #include "systems.hpp"
 
@@ -32,7 +33,7 @@ struct Options {
     std::vector<std::array<int, 2>> sizes{{1024, 1024}};
     int frames = 21;
     bool isMoving = false, isReadInside = false;
-    std::string json, table, commit;
+    std::string json, table, commit, trace;
     std::string only; // the systems whose name and configuration have one of these, with | between
 
     bool wants(const std::string& system) const
@@ -215,6 +216,7 @@ public:
         const auto scene = bench::makeScene(sceneName, size_, width, height);
         Inputs inputs(comm_, *scene, rank_);
         inputs.isReadInside = o_.isReadInside;
+        inputs.trace = o_.trace;
         for (int i = 1; o_.isMoving && i < 4; ++i)
             inputs.views.emplace_back(comm_, *bench::makeScene(sceneName, size_, width, height, 0.15 * i), rank_);
         bench::ExactImage exact;
@@ -383,7 +385,7 @@ Options optionsOf(int argc, char** argv)
         argc, argv,
         "usage: mpirun -n RANKS bench_compositing [--scene bricks,overlap,dense,one,empty|all] [--size WxH,...] "
         "[--frames N] [--systems dfb,icet,plain] [--moving] [--reader] [--only TEXT] [--json FILE] [--table FILE] "
-        "[--commit ID]",
+        "[--commit ID] [--trace FILE]",
         {{"--scene", readScenes},
          {"--size", bench::readSizes(o.sizes)},
          {"--systems", readSystems},
@@ -391,6 +393,7 @@ Options optionsOf(int argc, char** argv)
          {"--only", bench::readText(o.only)},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
+         {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}},
         {{"--moving", &o.isMoving}, {"--reader", &o.isReadInside}});
     return o;

@@ -17,7 +17,7 @@ using bench::System;
 
 struct Options {
     int width = 1024, height = 1024, frames = 21;
-    std::string json, table, commit;
+    std::string json, table, commit, trace;
     std::string only; // the systems whose name and configuration have one of these, with | between
 };
 
@@ -72,6 +72,7 @@ public:
     {
         const bench::BrickScene scene(size_, o_.width, o_.height);
         Inputs inputs(comm_, scene, rank_);
+        inputs.trace = o_.trace;
         bench::ExactImage exact;
         if (rank_ == 0)
             exact = scene.exact();
@@ -332,11 +333,12 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_error_time [--size WxH] [--frames N] [--json FILE] [--table FILE] [--commit ID] "
-        "[--only TEXT]",
+        "[--only TEXT] [--trace FILE]",
         {{"--size", [&o](const std::string& value) { return bench::readSize(value, o.width, o.height); }},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
+         {"--trace", bench::readText(o.trace)},
          {"--only", bench::readText(o.only)},
          {"--commit", bench::readText(o.commit)}});
     return o;

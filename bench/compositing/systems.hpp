@@ -13,6 +13,7 @@
 
 #include <dfb/dfb.hpp>
 #include <dfb/testing/error_report.hpp>
+#include <dfb/trace_file.hpp>
 
 #include <algorithm>
 #include <array>
@@ -62,6 +63,7 @@ struct Inputs {
     std::vector<View> views;
     std::size_t frame = 0;     // that is under way
     bool isReadInside = false; // rank 0 reads the image within the clock
+    std::string trace{};       // the file that gets a trace of the first of dfb's systems; empty: none
 
     bool isMoving() const { return views.size() > 1; }
     const View& view() const { return views[frame % views.size()]; }
@@ -79,6 +81,7 @@ struct Compositor {
     std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
     bool trafficIsOfAll = false;
     std::function<double()> peakMemory;
+    std::function<void(const std::string& path)> writeTrace; // collective; none without a trace
 };
 
 struct System {
@@ -232,6 +235,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
                 ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
             else if (!settings.hasDefaultThreads)
                 ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
+            const auto trace = inputs.trace.empty() ? nullptr : std::make_shared<dfb::TraceFile>();
+            ownConfig.trace = trace;
             const auto r = std::make_shared<Renderer>(connection, ownConfig);
             for (const View& view : inputs.views)
                 r->images.emplace_back(r->fb, view.image, settings);
@@ -266,6 +271,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
             compositor.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
             compositor.trafficIsOfAll = true;
             compositor.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
+            if (trace)
+                compositor.writeTrace = [r, trace](const std::string& path) { trace->write(r->fb, path); };
             return compositor;
         };
         systems.push_back(std::move(s));
@@ -514,6 +521,10 @@ inline void measureInTurns(Inputs& inputs, std::vector<System>& systems, int fra
     }
     for (System& s : systems)
         takeResult(comm, s, exact);
+    const auto traced = std::find_if(systems.begin(), systems.end(),
+                                     [](const System& s) { return s.compositor.writeTrace != nullptr; });
+    if (traced != systems.end())
+        traced->compositor.writeTrace(std::exchange(inputs.trace, std::string()));
     for (System& s : systems) {
         s.compositor = {};
         s.start = {}; // may hold memory too

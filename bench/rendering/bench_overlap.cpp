@@ -27,7 +27,7 @@ struct Options {
     std::vector<std::array<int, 2>> sizes{{512, 512}};
     int views = 12;
     int inARow = 0; // times that all views are rendered in a row; 0: single frames
-    std::string json, table, commit, only;
+    std::string json, table, commit, only, trace;
 };
 
 class Bench {
@@ -44,6 +44,8 @@ public:
         config.image.width = width;
         config.image.height = height;
         config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
+        const auto trace = o_.trace.empty() ? nullptr : std::make_shared<dfb::TraceFile>();
+        config.trace = trace;
         bench::MarchedBricks bricks(comm_, config, o_.views, false);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
 #ifdef DFB_BENCH_HAS_ICET
@@ -80,6 +82,8 @@ public:
         for (const MarchedSystem& s : systems)
             traffic.push_back(s.traffic ? s.traffic() : std::array<double, 2>{});
         report(systems, traffic, width, height, largest);
+        if (trace)
+            bricks.writeTrace(*trace, o_.trace);
     }
 
     // All views in a row.
@@ -251,12 +255,13 @@ Options optionsOf(int argc, char** argv)
     bench::readOptions(
         argc, argv,
         "usage: mpirun -n RANKS bench_overlap [--size WxH,...] [--views N] [--json FILE] [--table FILE] "
-        "[--commit ID] [--only TEXT] [--in-a-row TIMES]",
+        "[--commit ID] [--only TEXT] [--trace FILE] [--in-a-row TIMES]",
         {{"--size", bench::readSizes(o.sizes)},
          {"--views", [&o](const std::string& value) { return (o.views = std::atoi(value.c_str())) > 0; }},
          {"--in-a-row", [&o](const std::string& value) { return (o.inARow = std::atoi(value.c_str())) > 0; }},
          {"--json", bench::readText(o.json)},
          {"--table", bench::readText(o.table)},
+         {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)},
          {"--only", bench::readText(o.only)}});
     return o;

@@ -385,7 +385,7 @@ ParsedOptions parseOptions(int argc, const char* const* argv)
         };
         for (const char* other :
              {"--frames", "--output", "--png-bits", "--layers", "--cinema", "--alpha", "--depth", "--aux", "--stats",
-              "--wall", "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
+              "--trace", "--wall", "--exposure", "--adaptive", "--interleave", "--deep", "--verify", "--in-flight"})
             refuse(options.live.has_value(), other, "does not go with --live");
         refuse(options.live && options.blend != Blending::Sort, "--blend", "order or nearest does not go with --live");
         const bool isData = options.mode == Mode::Data;

@@ -27,8 +27,8 @@ enum class Compression { None, Snappy, Auto };
 enum class OwnerMap { Lattice, Linear, Hash };
 
 struct OutputFiles {
-    // Empty: not written. All but the last two may be patterns.
-    std::string output, alpha, depth, aux, stats, saveOptions;
+    // Empty: not written. All but the last three may be patterns.
+    std::string output, alpha, depth, aux, stats, trace, saveOptions;
     std::string cinema; // a folder; empty: none. `output` is in it then
     int pngBits = 8;
     dfb::ChannelMask layers = dfb::depthChannel; // of an .exr, beside colour
@@ -36,7 +36,8 @@ struct OutputFiles {
     bool isExr() const { return endingOf(output) == ".exr"; }
     bool writesNothing() const
     {
-        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && saveOptions.empty();
+        return output.empty() && alpha.empty() && depth.empty() && aux.empty() && stats.empty() && trace.empty()
+               && saveOptions.empty();
     }
 };
 

@@ -70,6 +70,13 @@ public:
             ->check(detail::ending({".json"}))
             ->option_text("FILE")
             ->group(group);
+        app_.add_option(
+                "--trace", files.trace,
+                "What each thread of each rank did for the frames, and when, for ui.perfetto.dev and speedscope; "
+                "default none")
+            ->check(detail::ending({".json"}))
+            ->option_text("FILE")
+            ->group(group);
 
         app_.add_option(
                 "--save-options", files.saveOptions,
@@ -115,6 +122,8 @@ public:
         }
         if (files.stats.find('%') != std::string::npos)
             throw CLI::ValidationError("--stats", "'" + files.stats + "': one file for all frames, without %");
+        if (files.trace.find('%') != std::string::npos)
+            throw CLI::ValidationError("--trace", "'" + files.trace + "': one file for all frames, without %");
         if (files.saveOptions.find('%') != std::string::npos)
             throw CLI::ValidationError("--save-options", "'" + files.saveOptions + "': one file, without %");
     }

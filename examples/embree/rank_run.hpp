@@ -12,6 +12,7 @@
 
 #include <dfb/dfb.hpp>
 #include <dfb/testing/verified.hpp>
+#include <dfb/trace_file.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -202,6 +203,8 @@ public:
           threads_(threads > 0 ? threads : connection_->threadShare())
     {
         dfb::FrameBufferConfig config = configOf(o, threads_);
+        if (!o.trace.empty())
+            config.trace = trace_ = std::make_shared<dfb::TraceFile>();
         PixelOp pixelOp{};
         if constexpr (hasWall) {
             // Of what a wall shows no rank has the whole.
@@ -306,7 +309,7 @@ private:
             for (const char* ending :
                  {".normal.pfm", ".albedo.pfm", ".position.pfm", ".primitive.png", ".instance.png"})
                 all.push_back(aux.path(frame) + ending);
-        for (const std::string& path : {o_.stats, o_.saveOptions, cinemaTable()})
+        for (const std::string& path : {o_.stats, o_.trace, o_.saveOptions, cinemaTable()})
             if (!areNumbered && !path.empty())
                 all.push_back(path);
         return all;
@@ -549,6 +552,8 @@ private:
                     throw std::runtime_error(writeError_);
             }))
             return false;
+        if (trace_ && !onAllRanks([&] { trace_->write(*fb_, o_.trace); }))
+            return false;
         clock_.enter(Phase::Compositing);
         std::vector<std::int64_t> numbers{clock_.totalNs(),
                                           clock_.ns(Phase::Load),
@@ -669,7 +674,8 @@ private:
                 std::printf("wrote %s\n", first[i].c_str());
         }
         for (const std::string& path : files(0, false)) {
-            const bool isOfRun = path == o_.stats || path == o_.saveOptions || path == cinemaTable();
+            const bool isOfRun =
+                path == o_.stats || path == o_.trace || path == o_.saveOptions || path == cinemaTable();
             if (o_.frames > 1 && !isOfRun)
                 std::printf("wrote %s, the last of %d frames; %%04d in the name gives a file for each\n", path.c_str(),
                             o_.frames);
@@ -678,7 +684,7 @@ private:
         }
         if (o_.writesNothing())
             std::fprintf(stderr, "dfb_render: nothing was written: there is no --output, --alpha, --depth, --aux, "
-                                 "--stats, --cinema or --save-options\n");
+                                 "--stats, --trace, --cinema or --save-options\n");
     }
 
     PhaseClock clock_;
@@ -686,6 +692,7 @@ private:
     const char* transport_; // its name
     std::shared_ptr<dfb::Connection> connection_;
     int threads_;
+    std::shared_ptr<dfb::TraceFile> trace_;  // null: none is written
     std::unique_ptr<dfb::DisplayWall> wall_; // outlives the framebuffer that sends to it
     std::unique_ptr<FrameBuffer> fb_;
     std::unique_ptr<RankScene> scene_;

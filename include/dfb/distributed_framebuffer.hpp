@@ -189,7 +189,10 @@ public:
                     if (!tile)
                         tile.reset(new WorkerTile); // start() clears it
                     tile->tile = -1;
+                    detail::TraceSpan span(fb_->config().trace.get(), TraceEvent::Kind::Tile, number_);
                     guard([&] { job(static_cast<std::int64_t>(i), *tile); }, *tile);
+                    if (span.event())
+                        span.event()->tile = static_cast<std::int32_t>(tile->tile);
                     spare = std::move(tile);
                 });
             });

@@ -7,6 +7,7 @@
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
 #include <dfb/tile_layout.hpp>
+#include <dfb/trace.hpp>
 #include <dfb/wire/wire_format.hpp>
 
 #include <array>
@@ -76,6 +77,9 @@ struct FrameBufferConfig {
     // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then renders
     // it. Ranks may give different ones.
     std::chrono::milliseconds quiet{2000};
+    // Is told what this rank does for its frames, and when: see trace.hpp. Null: nobody is, which costs nothing. Ranks
+    // may give different ones.
+    std::shared_ptr<TraceSink> trace{};
 };
 
 // The samples that a tile gets in a frame: those with the numbers [first, first + count).

@@ -149,6 +149,13 @@ public:
     // compositor is gone. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
+    // Returns the bytes of each rank, by rank, on all ranks. Collective, while no picture is open. Waits for all ranks.
+    // Throws TransportError.
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
+    {
+        return engine_->allGather(bytes);
+    }
+
     // Changes the size of the picture; image() is empty then. Collective. Waits for all ranks. Throws InvalidArgument
     // if a picture is open, or on all ranks if the size cannot be.
     void resize(int width, int height);

@@ -12,6 +12,9 @@ find_package(nlohmann_json CONFIG REQUIRED) # dfb_render has it, too
 add_executable(dfb_check_stats embree/tools/check_stats.cpp)
 target_link_libraries(dfb_check_stats PRIVATE dfb_developer nlohmann_json::nlohmann_json)
 
+add_executable(dfb_check_trace embree/tools/check_trace.cpp)
+target_link_libraries(dfb_check_trace PRIVATE dfb_developer nlohmann_json::nlohmann_json)
+
 add_executable(dfb_make_volume embree/tools/make_volume.cpp)
 target_link_libraries(dfb_make_volume PRIVATE dfb_developer)
 
@@ -47,6 +50,7 @@ file(GENERATE OUTPUT ${_settings} CONTENT "# For cli_cases.cmake.
 set(RENDER [==[$<TARGET_FILE:dfb_render>]==])
 set(COMPARE [==[$<TARGET_FILE:dfb_compare_pfm>]==])
 set(CHECK_STATS [==[$<TARGET_FILE:dfb_check_stats>]==])
+set(CHECK_TRACE [==[$<TARGET_FILE:dfb_check_trace>]==])
 set(MPIEXEC [==[${_launch}]==]) # with its flags, up to the one before the number of ranks; empty: no MPI
 set(POSTFLAGS [==[${MPIEXEC_POSTFLAGS}]==])
 set(TIMEOUT_PROGRAM [==[${DFB_TIMEOUT}]==])
@@ -83,6 +87,7 @@ if(UNIX AND NOT APPLE)
 endif()
 _add_cli_case(ordinary ranks3 ranks4 np3 np4)
 _add_cli_case(stats ranks3 np3)
+_add_cli_case(trace ranks1 ranks3 np3)
 _add_cli_case(loading ranks1 ranks3 np4)
 _add_cli_case(frames ranks3 np3)
 _add_cli_case(no_output one np3)

@@ -5,14 +5,14 @@ cmake_minimum_required(VERSION 3.21)
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp)
 set(level_1 base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp frame/hidden_tiles.hpp fwd.hpp
-            testing/reference.hpp)
+            testing/reference.hpp trace.hpp)
 set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp
             error.hpp testing/error_report.hpp)
 set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
             comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
             gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
 set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/progress.hpp comm/reduction.hpp frame/open_frame.hpp
-            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp)
+            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp trace_file.hpp)
 set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
 set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
             tile_layout.hpp)

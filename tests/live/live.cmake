@@ -56,3 +56,9 @@ add_test(NAME live.browser COMMAND ${CMAKE_COMMAND} -E env
   "DFB_LIVE_NODE_MODULES=${DFB_LIVE_NODE_MODULES}"
   sh ${CMAKE_CURRENT_SOURCE_DIR}/live/browser.sh --only-if-installed ${CMAKE_CURRENT_BINARY_DIR}/live_browser)
 set_tests_properties(live.browser PROPERTIES LABELS example TIMEOUT 300 RUN_SERIAL ON SKIP_RETURN_CODE 77)
+
+# A trace in speedscope, with the same browser: see speedscope.sh.
+add_test(NAME render.speedscope COMMAND ${CMAKE_COMMAND} -E env DFB_RENDER=$<TARGET_FILE:dfb_render>
+  "DFB_LIVE_NODE_MODULES=${DFB_LIVE_NODE_MODULES}"
+  sh ${CMAKE_CURRENT_SOURCE_DIR}/trace/speedscope.sh --only-if-installed ${CMAKE_CURRENT_BINARY_DIR}/speedscope)
+set_tests_properties(render.speedscope PROPERTIES LABELS example TIMEOUT 120 SKIP_RETURN_CODE 77)

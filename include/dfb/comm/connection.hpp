@@ -176,8 +176,9 @@ public:
             receivers_.erase(place);
     }
 
-    // `message` starts with a MessageHeader; `destination` is another rank. Never blocks.
-    void send(int destination, Buffer&& message)
+    // `message` starts with a MessageHeader; `destination` is another rank. Returns the message's running number. Never
+    // blocks.
+    std::uint32_t send(int destination, Buffer&& message)
     {
         auto header = detail::loadAs<detail::MessageHeader>(message.data());
         {
@@ -191,6 +192,7 @@ public:
             std::memcpy(message.data(), &header, sizeof header);
         }
         link_->send(destination, std::move(message));
+        return header.sequence;
     }
 
     // Whether another rank sees memory of this one; the place of a block of pool() there, or -1; and the memory at a

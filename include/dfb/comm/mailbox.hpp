@@ -10,6 +10,7 @@
 #include <dfb/comm/quiescence.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/exec.hpp>
+#include <dfb/trace.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -52,12 +53,12 @@ public:
     // The scopes of reduce(), and of rounds that check whether anything is under way. The handler has others.
     static constexpr std::uint32_t ownScope = 0, quietScope = ~std::uint32_t{0};
 
-    // `poolBytes`: see FlowControl.
+    // `poolBytes`: see FlowControl. `trace` may be null.
     Mailbox(std::shared_ptr<Connection> connection, std::shared_ptr<Executor> executor, std::size_t poolBytes,
-            MailboxOwner& handler)
-        : connection_(std::move(connection)), executor_(std::move(executor)), handler_(handler),
+            MailboxOwner& handler, TraceSink* trace = nullptr)
+        : connection_(std::move(connection)), executor_(std::move(executor)), handler_(handler), trace_(trace),
           flow_(connection_->size(), poolBytes,
-                {[this](int to, Buffer&& message) { connection_->send(to, std::move(message)); },
+                {[this](int to, Buffer&& message) { pass(to, std::move(message)); },
                  [this](int to, const FlowControl::Request& request) {
                      sendBody(to, MessageKind::CreditRequest, epoch_, request);
                  },
@@ -98,6 +99,7 @@ public:
     std::uint32_t address() const noexcept { return address_; }
     Connection& connection() noexcept { return *connection_; }
     Executor& executor() const noexcept { return *executor_; }
+    TraceSink* trace() const noexcept { return trace_; } // or null
 
     // Begins to count credit anew; see FlowControl. No message with credit may be in a task.
     void newEpoch(std::int64_t number)
@@ -116,7 +118,7 @@ public:
             return;
         }
         countSent(message);
-        connection_->send(destination, std::move(message));
+        pass(destination, std::move(message));
     }
 
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
@@ -163,6 +165,7 @@ public:
         const auto done = [&] { return roomy() || failed() || over(); };
         if (done())
             return true;
+        const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
         const Connection::Hurry hurry(*connection_);
         for (auto lastChange = Clock::now(); !done();) {
             if (const std::size_t now = flow_.underWay(); now < before) {
@@ -304,6 +307,7 @@ public:
     // does. Returns false if `deadline` passes before. Throws TransportError.
     bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
+        const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
         const auto over = [&] { return failed() || ready(); };
         const auto late = [&] { return deadline && Clock::now() >= *deadline; };
         waitAwake(over);
@@ -512,18 +516,44 @@ private:
         case MessageKind::Credit:
         case MessageKind::CreditRequest:
         case MessageKind::ImagePlace: return false;
-        case MessageKind::ReduceUp:
-        case MessageKind::ReduceDown: {
-            const bool hasScope = message.size() >= sizeof(MessageHeader) + sizeof(std::uint32_t);
-            const std::uint32_t scope = hasScope ? scopeOf(message) : ownScope;
-            return scope != ownScope && scope != quietScope;
+        default: return !isOwnReduction(kind, message) && !(isReduction(kind) && scopeOf(message) == quietScope);
         }
-        default: return true;
-        }
+    }
+    static bool isReduction(MessageKind kind)
+    {
+        return kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown;
+    }
+    // Of reduce(), or of no purpose at all.
+    static bool isOwnReduction(MessageKind kind, const Buffer& message)
+    {
+        return isReduction(kind)
+               && (message.size() < sizeof(MessageHeader) + sizeof(std::uint32_t) || scopeOf(message) == ownScope);
     }
     static std::uint32_t scopeOf(const Buffer& message)
     {
         return loadAs<std::uint32_t>(message.data() + sizeof(MessageHeader));
+    }
+
+    // To another rank, now that it may go.
+    void pass(int destination, Buffer&& message)
+    {
+        TraceSpan span(trace_, TraceEvent::Kind::Send, epoch_);
+        trace(span, destination, loadAs<MessageHeader>(message.data()), message);
+        const std::uint32_t sequence = connection_->send(destination, std::move(message));
+        if (span.event())
+            span.event()->sequence = sequence;
+    }
+
+    static void trace(TraceSpan& span, int peer, const MessageHeader& header, const Buffer& message)
+    {
+        TraceEvent* event = span.event();
+        if (!event)
+            return;
+        event->message = static_cast<std::uint8_t>(header.kind);
+        event->frame = isOwnReduction(header.kind, message) ? -1 : header.number;
+        event->byteCount = static_cast<std::int64_t>(message.size());
+        event->peer = peer;
+        event->sequence = header.sequence;
     }
 
     struct Arrival {
@@ -566,8 +596,10 @@ private:
 
     void dispatch(Arrival&& a)
     {
+        TraceSpan span(trace_, TraceEvent::Kind::Receive, epoch_);
+        trace(span, a.source, a.header, a.message);
         try {
-            if (a.header.kind == MessageKind::ReduceUp || a.header.kind == MessageKind::ReduceDown) {
+            if (isReduction(a.header.kind)) {
                 if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
                 if (keyOf(a.header, a.message).scope == ownScope) {
@@ -605,6 +637,7 @@ private:
     std::shared_ptr<Connection> connection_;
     std::shared_ptr<Executor> executor_;
     MailboxOwner& handler_;
+    TraceSink* const trace_;
     std::uint32_t address_ = 0;
     std::atomic<std::int64_t> epoch_{0};
     FlowControl flow_;

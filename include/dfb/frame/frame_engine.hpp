@@ -44,7 +44,8 @@ public:
         config_.messages.poolBytes =
             std::max(config_.messages.poolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
         MailboxOwner& self = *this;
-        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self);
+        mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self,
+                                             config_.trace.get());
         gains_.emplace(config_.messages.codec ? size() : 0);
         mailbox_->start();
         Agreement mine;
@@ -158,6 +159,7 @@ public:
         bytesBefore_ = mailbox_->bytesSent();
         messagesBefore_ = mailbox_->messagesSent();
         renderNs_ = 0;
+        votedAt_.reset();
         isEnding_ = false;
         figures_.newFrame();
         std::int64_t rendered = 0;
@@ -179,6 +181,7 @@ public:
 
     void setTile(const InputPixels& tile) override
     {
+        const TraceSpan span(config_.trace.get(), TraceEvent::Kind::SetTile, tile.frame, tile.tile);
         checkTile(tile, layout(), pipeline_->table().frameInfo(),
                   [this](int index) { return pipeline_->table().samples(index).count; });
         pipeline_->checkPlanes(tile);
@@ -324,6 +327,7 @@ public:
     FrameReport end() override
     {
         beginEnd();
+        EndOfFrame ending{*this};
         const Verdict verdict = outcome_->conclude();
         if (verdict.error && !outcome_->isPartial(verdict))
             throw FrameError(*verdict.error);
@@ -340,7 +344,8 @@ public:
         const double nsPerMs = 1e6;
         FrameReport report;
         report.frame = open_.number();
-        report.totalMs = static_cast<double>(std::chrono::nanoseconds(Clock::now() - beginTime_).count()) / nsPerMs;
+        ending.time = Clock::now();
+        report.totalMs = static_cast<double>(std::chrono::nanoseconds(*ending.time - beginTime_).count()) / nsPerMs;
         report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
         report.compositingOverheadMs = report.totalMs - report.renderMs;
         report.tilesTotal = layout().tileCount();
@@ -363,6 +368,7 @@ public:
     // A frame that is left without end(), mostly while an exception passes.
     void leave() noexcept override
     {
+        const EndOfFrame ending{*this};
         try {
             if (outcome_->failed())
                 outcome_->dropRest();
@@ -425,6 +431,38 @@ private:
         const bool isLeftOut = config_.messages.compression == CompressionMode::Auto
                                && (mailbox_->connection().isSeenBy(other) || !gains_->isWorthwhile(other));
         return isLeftOut ? nullptr : config_.messages.codec.get();
+    }
+
+    // Tells the trace of the frame when it has ended, in whatever way.
+    struct EndOfFrame {
+        FrameEngine& engine;
+        std::optional<Clock::time_point> time{}; // nothing: when this is destroyed
+
+        ~EndOfFrame()
+        {
+            if (engine.config_.trace)
+                engine.traceFrame(time.value_or(Clock::now()));
+        }
+    };
+
+    void traceFrame(Clock::time_point end) const
+    {
+        TraceEvent event;
+        event.frame = open_.number();
+        const auto add = [&](TraceEvent::Kind kind, Clock::time_point from, Clock::time_point to) {
+            event.kind = kind;
+            event.begin = from;
+            event.end = to;
+            config_.trace->add(event);
+        };
+        const auto rendered = isEnding_ ? beginTime_ + std::chrono::nanoseconds(renderNs_) : end;
+        add(TraceEvent::Kind::Frame, beginTime_, end);
+        add(TraceEvent::Kind::Render, beginTime_, rendered);
+        add(TraceEvent::Kind::End, rendered, end);
+        if (!votedAt_)
+            return;
+        event.byteCount = votedBytes_;
+        add(TraceEvent::Kind::Verdict, *votedAt_, outcome_->decidedAt().value_or(end));
     }
 
     // Lets messages of the frame in. `tiles`: that this rank expects to finish, beside those of `withoutSamples`, of
@@ -640,7 +678,14 @@ private:
             return;
         ErrorInfo where;
         TileTable::Arrival arrival;
-        outcome_->guarded([&] { take(where, arrival); }, where, source);
+        {
+            TraceSpan span(config_.trace.get(), TraceEvent::Kind::Input, open_.number());
+            outcome_->guarded([&] { take(where, arrival); }, where, source);
+            if (TraceEvent* event = span.event()) {
+                event->tile = static_cast<std::int32_t>(where.tile);
+                event->peer = source;
+            }
+        }
         if (arrival.spoilt) {
             pipeline_->table().saidWhy();
             outcome_->tryVote();
@@ -662,13 +707,20 @@ private:
         mailbox_->submitWork(tile);
     }
 
+    // False if an operation has thrown.
+    bool finish(int tile, const ErrorInfo& where)
+    {
+        const TraceSpan span(config_.trace.get(), TraceEvent::Kind::Finish, open_.number(), tile);
+        return outcome_->guarded([&] { pipeline_->finish(tile); }, where);
+    }
+
     // A tile that is complete.
     void work(int tile) override
     {
         ErrorInfo where;
         where.tile = tile;
         if (open_.beginReading()) {
-            const bool finished = outcome_->guarded([&] { pipeline_->finish(tile); }, where);
+            const bool finished = finish(tile, where);
             if ((finished || params_.allowPartial) && open_.tileFinished())
                 outcome_->guarded([&] { allFinished(); }, where);
             endReading();
@@ -756,7 +808,9 @@ private:
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
         v.maxima[Verdict::RenderNs] = renderNs_;
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
-        v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
+        votedAt_ = Clock::now();
+        votedBytes_ = v.sums[Verdict::BytesSent];
+        v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(*votedAt_ - beginTime_).count();
         v.wireErrorBound = reports.wireErrorBound;
         v.tileErrors = FrameFigures::of(reports.errors);
         figures_.addTo(v);
@@ -852,6 +906,8 @@ private:
     bool isEnding_ = false; // beginEnd() was called
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
+    std::optional<Clock::time_point> votedAt_;  // the verdict was entered
+    std::int64_t votedBytes_ = 0;               // sent until then
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 
     std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others

@@ -49,6 +49,7 @@ public:
     {
         terms_ = terms;
         verdict_.reset();
+        decidedAt_.reset();
         isEnding_ = false;
         quiescence_.newFrame(terms.quiet);
     }
@@ -140,6 +141,8 @@ public:
             mine.incomplete = tiles_.table().unfinished(terms_.declared);
         mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
             verdict_ = Verdict::from(result);
+            if (mailbox_.trace())
+                decidedAt_ = Clock::now();
             frame_.decide();
             mailbox_.notify();
         });
@@ -202,6 +205,9 @@ public:
             std::rethrow_exception(transportError);
         return verdict;
     }
+
+    // When the verdict came, for the trace. Nothing: it did not. After conclude().
+    std::optional<Clock::time_point> decidedAt() const noexcept { return decidedAt_; }
 
     // The frame has an image although something is missing.
     bool isPartial(const Verdict& verdict) const
@@ -482,6 +488,7 @@ private:
     Terms terms_;
     bool lastFailed_ = false;
     std::optional<Verdict> verdict_; // set once, before the frame is Decided
+    std::optional<Clock::time_point> decidedAt_;
     Quiescence quiescence_;
     bool isEnding_ = false;      // beginEnd() was called
     Clock::time_point endedAt_;  // then

@@ -4,6 +4,7 @@
 #include <dfb/dfb.hpp>
 
 #include <dfb/testing/tile_op_test.hpp>
+#include <dfb/trace_file.hpp>
 
 #include <algorithm>
 #include <array>

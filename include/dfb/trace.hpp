@@ -1,0 +1,86 @@
+// TraceSink: is told what a rank does for its frames, and when. TraceFile, in trace_file.hpp, is one that writes a
+// file.
+#pragma once
+
+#include <dfb/version.hpp>
+
+#include <chrono>
+#include <cstdint>
+#include <optional>
+
+DFB_NAMESPACE_BEGIN
+
+// A span of time on one rank, by its steady_clock.
+struct TraceEvent {
+    using Clock = std::chrono::steady_clock;
+
+    enum class Kind : std::uint8_t {
+        // Of a frame, told when it has ended, also if it failed:
+        Frame,   // begin() to the return of end(): FrameReport::totalMs
+        Render,  // begin() to the call of end(): renderMs
+        End,     // the call of end() to its return: compositingOverheadMs
+        Verdict, // this rank's vote to the verdict of all; byteCount: this rank's part of FrameReport::bytesSent
+        // Of a thread, by which they are told; one lies within another or beside it:
+        Tile,    // a job of Frame::forEachTile()
+        SetTile, // Frame::setTile(): the input is encoded and sent, or taken by this rank
+        Input,   // an input is taken by the owner of its tile: TileOp::add(). peer: whose message it is, or -1
+        Finish,  // tile operation and pixel operation of a tile, whose pixels go into the image or into a message
+        Send,    // a message is given to the transport. peer: its receiver
+        Receive, // a message is handled, which may have waited in the inbox. peer: its sender
+        Wait     // for room, for a reduction such as the verdict, or for another rank. Other work may be within it
+    };
+
+    Kind kind = Kind::Frame;
+    std::uint8_t message = 0; // of Send and Receive: what it is, a detail::MessageKind
+    Clock::time_point begin{}, end{};
+    std::int64_t frame = -1; // its number; -1: of none
+    std::int64_t byteCount = 0;
+    std::int32_t tile = -1, peer = -1; // -1: none
+    // Of Send and Receive: with both ranks it says which message of a connection it is.
+    std::uint32_t sequence = 0;
+};
+
+// The contract: add() is called by any thread, several at once, sometimes with a lock held. It is quick, waits for
+// nothing, and calls nothing of the library. It cannot throw: a sink that fails has to bear it.
+class TraceSink {
+public:
+    virtual ~TraceSink() = default;
+    virtual void add(const TraceEvent& event) noexcept = 0;
+};
+
+namespace detail {
+
+// Tells a sink, if there is one, of the time from its construction to its end.
+class TraceSpan {
+public:
+    TraceSpan(TraceSink* sink, TraceEvent::Kind kind, std::int64_t frame, std::int64_t tile = -1)
+    {
+        if (!sink)
+            return;
+        sink_ = sink;
+        event_.emplace();
+        event_->kind = kind;
+        event_->frame = frame;
+        event_->tile = static_cast<std::int32_t>(tile);
+        event_->begin = TraceEvent::Clock::now();
+    }
+    TraceSpan(const TraceSpan&) = delete;
+    TraceSpan& operator=(const TraceSpan&) = delete;
+    ~TraceSpan()
+    {
+        if (!event_)
+            return;
+        event_->end = TraceEvent::Clock::now();
+        sink_->add(*event_);
+    }
+
+    // What is to be told. Null: there is no sink.
+    TraceEvent* event() noexcept { return event_ ? &*event_ : nullptr; }
+
+private:
+    TraceSink* sink_ = nullptr;
+    std::optional<TraceEvent> event_;
+};
+
+} // namespace detail
+DFB_NAMESPACE_END

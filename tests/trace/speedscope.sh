@@ -1,0 +1,48 @@
+#!/bin/sh
+# sh tests/trace/speedscope.sh [--only-if-installed] [OUTPUT FOLDER]
+# Opens a trace of dfb_render in speedscope, in Debian's Chromium, and writes a screenshot to the output folder,
+# build/speedscope. Installs speedscope and puppeteer-core into ~/.cache/dfb-live (or $DFB_LIVE_NODE_MODULES), and builds
+# dfb_render (preset "release", unless $DFB_RENDER says where it is). $DFB_TRACE: a trace to show in place of its own.
+# With --only-if-installed: exits with 77 where something is missing.
+set -eu
+root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
+modules=${DFB_LIVE_NODE_MODULES:-}
+[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
+
+only_if_installed=
+if [ "${1:-}" = --only-if-installed ]; then
+    only_if_installed=1
+    shift
+fi
+output=${1:-$root/build/speedscope}
+
+missing() {
+    echo "speedscope.sh: skipped: $1 is missing; sh tests/trace/speedscope.sh installs what the test needs"
+    exit 77
+}
+
+if [ -n "$only_if_installed" ]; then
+    command -v chromium >/dev/null 2>&1 || missing chromium
+    command -v node >/dev/null 2>&1 || missing node
+    for package in puppeteer-core speedscope; do
+        [ -d "$modules/node_modules/$package" ] || missing $package
+    done
+else
+    sh "$root/cmake/install_packages.sh" browser
+    if [ ! -d "$modules/node_modules/puppeteer-core" ] || [ ! -d "$modules/node_modules/speedscope" ]; then
+        mkdir -p "$modules"
+        npm install --prefix "$modules" --no-audit --no-fund puppeteer-core@24 speedscope@1
+    fi
+fi
+
+mkdir -p "$output"
+trace=${DFB_TRACE:-}
+if [ -z "$trace" ]; then
+    if [ -z "${DFB_RENDER:-}" ]; then
+        (cd "$root" && cmake --preset release && cmake --build --preset release --target dfb_render)
+        DFB_RENDER=$root/build/release/examples/embree/dfb_render
+    fi
+    trace=$output/trace.json
+    "$DFB_RENDER" demo --ranks 3 --size 320x240 --frames 4 --in-flight 2 --trace "$trace" >/dev/null
+fi
+DFB_LIVE_NODE_MODULES=$modules exec node "$root/tests/trace/speedscope.mjs" "$trace" "$output/speedscope.png"
