@@ -574,7 +574,9 @@ private:
         if (listener_)
             listener_->look();
         const bool started = !leaving_ && startSends();
-        const bool arrived = receivePackets();
+        // A second time, as Open MPI's MPI_Testsome returns what had come before the call, and only then looks for
+        // more: the bell would not ring again.
+        const bool arrived = receivePackets() || receivePackets();
         const bool delivered = receiveBodies();
         const bool completed = finishSends();
         isRungForAll_ = areAllHere_ && sends_.requests.empty() && receives_.requests.empty() && waitingPeers_.empty();
