@@ -120,7 +120,7 @@ private:
 };
 
 // Pixels of a row with 8 bits a channel, where they lie: as FragmentRow, with `bytes` in place of colours. Some may not
-// be active: those whose depth is not below the limit.
+// be active: those whose depth is not below the limit, or that are 0.
 struct ByteRow : FragmentRow {
     const std::byte* bytes = nullptr;
     float depthLimit = std::numeric_limits<float>::infinity();
@@ -168,7 +168,7 @@ public:
         result.color = bytes_ ? decodeRow(result) : color_;
         return true;
     }
-    // Does so for a fragment that keepsBytes() and has a depth.
+    // Does so for a fragment that keepsBytes(). Its pixels in place are not looked at: some may be empty.
     bool nextBytes(ByteRow& result)
     {
         const int row = row_++;
@@ -186,7 +186,7 @@ public:
         result.spans = &result.valid;
         result.spanCount = 1;
         result.bytes = pixels.color + 4 * first;
-        result.depth = pixels.depth + first;
+        result.depth = pixels.depth ? pixels.depth + first : nullptr;
         result.depthLimit = pixels.activity.depthLimit;
         return true;
     }

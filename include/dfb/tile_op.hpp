@@ -163,12 +163,12 @@ public:
             out[i] = rgba[i] + 0.0f;
     }
     // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
-    // each, and to these depths.
+    // each, and to these depths, which may be null if the image has none.
     void setStored(int x, int y, int count, const std::byte* stored, const float* depth)
     {
         const std::size_t first = pixelAt(x, y), pixels = static_cast<std::size_t>(count);
         overwrites(x, y, count);
-        if (float* out = detail::floatsOf(to_.at[detail::Depth]))
+        if (float* out = detail::floatsOf(to_.at[detail::Depth]); out && depth)
             std::copy(depth, depth + count, out + first);
         if (std::byte* color = to_.at[detail::Color])
             std::memcpy(color + first * bytesPerPixel(format_), stored, pixels * bytesPerPixel(format_));

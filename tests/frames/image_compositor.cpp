@@ -267,22 +267,25 @@ struct BytesAndFloats {
     {
         Result result;
         const auto connection = dfb::connect<Transport>(communicator);
-        dfb::FrameBufferConfig config(imageWidth, imageHeight, dfb::OutputFormat::RGBA32F);
-        config.executor = std::make_shared<dfb::ThreadExecutor>(2);
-        for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
-            dfb::ImageCompositor compositor(connection, blend, config);
-            const int place = blend == dfb::ImageBlend::InOrder ? compositor.rank() : -1;
-            std::vector<std::vector<std::byte>> pictures;
-            std::vector<std::int64_t> bytes;
-            for (const bool isFloat : {false, true}) {
-                const OwnImage own(compositor.rank(), {"", isFloat, false, false, false}, true);
-                bytes.push_back(compositor.composite(own.image, place).bytesSent);
-                const dfb::Image& image = compositor.image();
-                pictures.emplace_back(image.bytes(), image.bytes() + (image.empty() ? 0 : 16 * image.pixelCount()));
+        const auto executor = std::make_shared<dfb::ThreadExecutor>(2);
+        for (const auto format : {dfb::OutputFormat::RGBA32F, dfb::OutputFormat::RGBA8})
+            for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
+                dfb::FrameBufferConfig config(imageWidth, imageHeight, format);
+                config.executor = executor;
+                dfb::ImageCompositor compositor(connection, blend, config);
+                const int place = blend == dfb::ImageBlend::InOrder ? compositor.rank() : -1;
+                std::vector<std::vector<std::byte>> pictures;
+                std::vector<std::int64_t> bytes;
+                for (const bool isFloat : {false, true}) {
+                    const OwnImage own(compositor.rank(), {"", isFloat, false, false, false}, true);
+                    bytes.push_back(compositor.composite(own.image, place).bytesSent);
+                    const dfb::Image& image = compositor.image();
+                    const std::size_t size = image.empty() ? 0 : image.pixelCount() * dfb::bytesPerPixel(format);
+                    pictures.emplace_back(image.bytes(), image.bytes() + size);
+                }
+                result.expect(pictures[0] == pictures[1], "floats give another picture");
+                result.expect(compositor.size() == 1 || bytes[0] < bytes[1], "8 bits are no fewer bytes");
             }
-            result.expect(pictures[0] == pictures[1], "floats give another picture");
-            result.expect(compositor.size() == 1 || bytes[0] < bytes[1], "8 bits are no fewer bytes");
-        }
         return result;
     }
 };

@@ -1,5 +1,6 @@
-// The kernels of blending: layers under pixels, in double. Each is there in plain C++ and, for processors that have it,
-// by hand for AVX2; the two give the same bits, as products and sums are the same and rounded one by one.
+// The kernels of blending: layers under pixels, in double, and two layers of levels in integers. Each is there in plain
+// C++ and, for processors that have it, by hand for AVX2; the two give the same bits, as products and sums are the same
+// and rounded one by one.
 //
 // A pixel that nothing comes through any more is blended like the others, unless its whole block is opaque: then the
 // layers behind are left out. That is checked after the first layer and every fourth from there. So an infinity or a
@@ -132,6 +133,19 @@ inline void takeNearestPlain(float* nearest, int count, const float* color, cons
     for (int i = 0; i < count; ++i) {
         const bool isNearer = color[4 * i + 3] > 0.0f && depth[i] < nearest[i];
         nearest[i] = isNearer ? depth[i] : nearest[i];
+    }
+}
+
+// `levels` and a layer under them, both 8 bits a channel, become the nearest levels of what is seen, up to 255. That is
+// exact if `levels` are those of one layer, or of none: another layer behind would need the fractions.
+inline void blendLevelsPlain(std::uint8_t* levels, int begin, int end, const std::uint8_t* layer)
+{
+    for (int i = 4 * begin; i < 4 * end; i += 4) {
+        const int through = 255 - levels[i + 3];
+        for (int c = i; c < i + 4; ++c) {
+            const int product = through * layer[c] + 128;
+            levels[c] = static_cast<std::uint8_t>(std::min(255, levels[c] + (product + product / 256) / 256));
+        }
     }
 }
 
@@ -282,6 +296,28 @@ DFB_AVX2 void blendFourAvx2(double* rgba, double* transmittance, const float* co
     block.store(rgba, transmittance);
 }
 
+DFB_AVX2 inline void blendLevelsAvx2(std::uint8_t* levels, int count, const std::uint8_t* layer)
+{
+    const __m256i zero = _mm256_setzero_si256(), half = _mm256_set1_epi16(128), all = _mm256_set1_epi8(-1);
+    const __m256i alphas = _mm256_set_epi32(0x0f0f0f0f, 0x0b0b0b0b, 0x07070707, 0x03030303, 0x0f0f0f0f, 0x0b0b0b0b,
+                                            0x07070707, 0x03030303);
+    int i = 0;
+    for (; i + 8 <= count; i += 8) {
+        auto* to = reinterpret_cast<__m256i*>(levels + 4 * i);
+        const __m256i front = _mm256_loadu_si256(to);
+        const __m256i behind = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(layer + 4 * i));
+        const __m256i through = _mm256_xor_si256(_mm256_shuffle_epi8(front, alphas), all);
+        __m256i seen[2] = {_mm256_mullo_epi16(_mm256_unpacklo_epi8(through, zero), _mm256_unpacklo_epi8(behind, zero)),
+                           _mm256_mullo_epi16(_mm256_unpackhi_epi8(through, zero), _mm256_unpackhi_epi8(behind, zero))};
+        for (__m256i& product : seen) { // over 255
+            product = _mm256_add_epi16(product, half);
+            product = _mm256_srli_epi16(_mm256_add_epi16(product, _mm256_srli_epi16(product, 8)), 8);
+        }
+        _mm256_storeu_si256(to, _mm256_adds_epu8(front, _mm256_packus_epi16(seen[0], seen[1])));
+    }
+    blendLevelsPlain(levels, i, count, layer);
+}
+
 #endif
 
 // ---- the faster one
@@ -343,6 +379,17 @@ inline void takeNearest(float* nearest, int count, const float* color, const flo
     }
 #endif
     takeNearestPlain(nearest, count, color, depth);
+}
+
+inline void blendLevels(std::uint8_t* levels, int count, const std::uint8_t* layer)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2()) {
+        blendLevelsAvx2(levels, count, layer);
+        return;
+    }
+#endif
+    blendLevelsPlain(levels, 0, count, layer);
 }
 
 } // namespace detail

@@ -96,6 +96,23 @@ public:
         }
     }
 
+    // Blends the next row of all fragments, of which there are two at most, and which keep their bytes, into `levels`,
+    // which are 0.
+    void nextRow(std::uint8_t* levels)
+    {
+        ByteRow r;
+        for (FragmentCursor& cursor : cursors_) {
+            if (!cursor.nextBytes(r))
+                continue;
+            const auto* layer = reinterpret_cast<const std::uint8_t*>(r.bytes);
+            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+                detail::blendLevels(levels + 4 * span->x, span->count, layer);
+                layer += 4 * static_cast<std::ptrdiff_t>(span->count);
+            }
+            cursor.advance(r);
+        }
+    }
+
     // Where there is anything in a row.
     struct Run {
         int x = 0, count = 0;

@@ -157,6 +157,7 @@ private:
         CompositeRow row;
         std::vector<std::uint8_t> isUndefined;
         NearestBytes nearest;
+        std::vector<std::uint8_t> levels; // of a row
     };
 
     struct Exact {
@@ -177,6 +178,8 @@ private:
     Scratch& start();
     void finishRuns(FinishedTile& out);
     void finishBytes(FinishedTile& out);
+    bool hasExactLevels(OutputFormat format) const;
+    void finishLevels(FinishedTile& out);
     void roundExactly(FinishedTile& out, int y, double farthest);
     const std::vector<DoubleDouble>& exactRow(int y);
 
@@ -342,9 +345,13 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
     static thread_local PixelSums sums;
     const int last = info_.passes - 1;
     if (last == 0 && tracked_ == 0 && !out.isDithered()) {
-        const auto isOfBytes = [](const Fragment& f) { return f.keepsBytes() && f.hasDepth(); };
-        if (rule_ == BlendRule::Nearest && std::all_of(fragments_.begin(), fragments_.end(), isOfBytes))
+        const bool isNearest = rule_ == BlendRule::Nearest;
+        const auto isOfBytes = [&](const Fragment& f) { return f.keepsBytes() && (f.hasDepth() || !isNearest); };
+        const bool areOfBytes = std::all_of(fragments_.begin(), fragments_.end(), isOfBytes);
+        if (areOfBytes && isNearest)
             finishBytes(out);
+        else if (areOfBytes && hasExactLevels(out.format()))
+            finishLevels(out);
         else
             finishRuns(out);
         return;
@@ -475,6 +482,38 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
         }
         out.fillPixels(end, y, out.width() - end, background.data());
         roundExactly(out, y, farthest);
+    }
+    fragments_.clear();
+}
+
+// Whether integers are enough to blend inputs of 8 bits a channel.
+DFB_COMPILED_ONCE bool FragmentStore::hasExactLevels(OutputFormat format) const
+{
+    return rule_ == BlendRule::InOrder && fragments_.size() <= 2 && (info_.wanted & depthChannel) == 0
+           && format == OutputFormat::RGBA8 && info_.background == std::array<float, 4>{}
+           && info_.minTransmittance == 0.0f;
+}
+
+// Two inputs of 8 bits a channel, one under the other and over nothing, become 8 bits: integers are exact.
+DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
+{
+    Scratch& scratch = start();
+    const std::array<std::byte, 4> background{};
+    for (int y = 0; y < out.height(); ++y) {
+        scratch.levels.assign(4 * static_cast<std::size_t>(out.width()), 0);
+        scratch.compositors.front().nextRow(scratch.levels.data());
+        const auto* levels = reinterpret_cast<const std::byte*>(scratch.levels.data());
+        int end = 0;
+        for (int x0 = 0; x0 < out.width(); x0 += 64) {
+            const int some = std::min(64, out.width() - x0);
+            forEachRun(activeByteBits(levels + 4 * x0, some), [&](int at, int count) {
+                const int x = x0 + at;
+                out.fillPixels(end, y, x - end, background.data());
+                out.setStored(x, y, count, levels + 4 * x, nullptr);
+                end = x + count;
+            });
+        }
+        out.fillPixels(end, y, out.width() - end, background.data());
     }
     fragments_.clear();
 }

@@ -140,6 +140,28 @@ TEST_CASE("A constant under pixels, and the nearest depths: by hand as in plain 
     CHECK(different == 0);
 }
 
+TEST_CASE("A layer of levels under another is rounded to the nearest, by hand as in plain C++", "[kernels]")
+{
+    Random random(5);
+    for (int alpha = 0; alpha < 256; ++alpha) {
+        constexpr int width = 261; // all levels behind, and a rest
+        std::vector<std::uint8_t> front(4 * width), behind(4 * width);
+        for (int i = 0; i < 4 * width; ++i) {
+            const auto at = static_cast<std::size_t>(i);
+            front[at] = static_cast<std::uint8_t>(i % 4 == 3 ? alpha : static_cast<int>(below(random, 256)));
+            behind[at] = static_cast<std::uint8_t>(i / 4);
+        }
+        std::vector<std::uint8_t> exact(front), plain(front), fast(front);
+        for (std::size_t i = 0; i < exact.size(); ++i)
+            exact[i] = static_cast<std::uint8_t>(
+                std::min(255.0, std::round(front[i] + (255 - alpha) / 255.0 * static_cast<double>(behind[i]))));
+        d::blendLevelsPlain(plain.data(), 0, width, behind.data());
+        d::blendLevels(fast.data(), width, behind.data());
+        REQUIRE(plain == exact);
+        REQUIRE(fast == exact);
+    }
+}
+
 TEST_CASE("Layers in order are what over() makes of them one by one", "[kernels]")
 {
     Random random(4);
