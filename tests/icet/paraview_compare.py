@@ -91,14 +91,13 @@ def compare_blending():
 
 
 def print_times():
-    print("\n%-18s %21s %21s" % ("medians, ms", "a frame: IceT, dfb", "compositing: IceT, dfb"))
-    times = {}
-    for side in ("icet", "dfb"):
-        with open("%s/%s/times.txt" % (FOLDER, side)) as file:
-            for line in file:
-                times.setdefault(line.split()[0], []).extend(line.split()[1:])
-    for name, (frame_icet, icet, frame_dfb, dfb) in times.items():
-        print("%-18s %10s %10s %10s %11s" % (name, frame_icet, frame_dfb, icet, dfb))
+    print("\n%-18s %-28s %-28s" % ("ms: quartile, median, quartile", "a frame", "compositing it"))
+    for name in "opaque volume transparent".split():
+        for side in ("icet", "dfb"):
+            with open("%s/%s/times.txt" % (FOLDER, side)) as file:
+                figures = next((line.split()[1:] for line in file if line.split()[0] == name), None)
+            check(name, figures, "%s was not timed" % side)
+            print("%-30s %8s %8s %8s   %8s %8s %8s" % (name + " " + side, *figures or 6 * "?"))
 
 
 compare_pictures()

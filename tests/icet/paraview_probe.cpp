@@ -1,11 +1,15 @@
-// Preloaded before IceT, or before libdfb_icet, whichever composites. Adds to $DFB_PROBE/times how long each frame
-// takes on rank 0, without its own rendering. While there is a file $DFB_PROBE/wanted it also writes what goes into a
-// frame that is blended, to input_RANK beside it, and what comes out, to output; the last frame stays.
+// Preloaded before IceT, or before libdfb_icet, whichever composites. Adds to $DFB_PROBE/times how long each frame takes,
+// from the moment when the last rank has rendered until rank 0 has the picture. Ranks that render for different times
+// wait for each other, and on a machine with fewer cores than ranks even more: that is no time of who composites. All
+// ranks have one clock, so they must be on one machine.
+// While there is a file $DFB_PROBE/wanted it also writes what goes into a frame that is blended, to input_RANK beside it,
+// and what comes out, to output; the last frame stays.
 //
 //   mpirun -n 3 env DFB_PROBE=FOLDER LD_PRELOAD="paraview_probe.so libdfb_icet.so" pvbatch movie.py
 #include <IceT.h>
 
 #include <dlfcn.h>
+#include <mpi.h>
 
 #include <chrono>
 #include <cstdio>
@@ -25,7 +29,7 @@ Function* behind(const char* name, Function*)
 struct Call {
     IceTDrawCallbackType draw = nullptr;
     IceTInt order[64] = {};
-    double renderMs = 0;
+    double renderedMs = 0; // when this rank had rendered
 } call;
 
 double msNow()
@@ -70,14 +74,13 @@ void write(const std::string& name, IceTImage image, IceTInt place, const IceTIn
 void draw(const IceTDouble* projection, const IceTDouble* modelview, const IceTFloat* background,
           const IceTInt* readback, IceTImage result)
 {
-    const double before = msNow();
     call.draw(projection, modelview, background, readback, result);
     const IceTInt rank = state(ICET_RANK), ranks = state(ICET_NUM_PROCESSES);
     IceTInt place = 0;
     while (place < ranks && call.order[place] != rank)
         ++place;
     write("input_" + std::to_string(rank), result, place, readback);
-    call.renderMs += msNow() - before;
+    call.renderedMs = msNow();
 }
 
 } // namespace
@@ -100,16 +103,17 @@ extern "C" IceTImage icetDrawFrame(const IceTDouble* projection, const IceTDoubl
 {
     static const auto drawFrame = DFB_BEHIND(icetDrawFrame);
     static const auto isNull = DFB_BEHIND(icetImageIsNull);
-    call.renderMs = 0;
-    const double before = msNow();
+    call.renderedMs = msNow(); // if it has nothing to render
     const IceTImage image = drawFrame(projection, modelview, background);
-    const double ms = msNow() - before - call.renderMs;
+    const double endMs = msNow();
+    double lastMs = 0;
+    MPI_Reduce(&call.renderedMs, &lastMs, 1, MPI_DOUBLE, MPI_MAX, 0, MPI_COMM_WORLD);
     if (state(ICET_RANK) == 0) {
         const IceTInt all[4] = {0, 0, 0, 0};
         if (!isNull(image))
             write("output", image, 0, all);
         if (std::FILE* file = open("times", "a")) {
-            std::fprintf(file, "%.3f\n", ms);
+            std::fprintf(file, "%.3f\n", endMs - lastMs);
             std::fclose(file);
         }
     }

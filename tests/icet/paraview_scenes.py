@@ -1,6 +1,6 @@
 # pvbatch paraview_scenes.py FOLDER [SCENE...]
 # Draws scenes that are composited in different ways: FOLDER/SCENE.png. FOLDER/times.txt says how long frames take, and
-# how much of it compositing, and FOLDER/SCENE_input_RANK and SCENE_output have what was blended in two of them: with
+# how long compositing, and FOLDER/SCENE_input_RANK and SCENE_output have what was blended in two of them: with
 # paraview_probe.so and its DFB_PROBE=FOLDER.
 import glob
 import os
@@ -42,11 +42,11 @@ def save(view, name, blended=False):
 
 
 def measure(view, name):
-    """Appends the median times of a frame and of compositing it, ms."""
+    """Appends how long a frame takes, and compositing it: quartile, median, quartile, in ms."""
     frames = []
     open(folder + "/times", "w").close()
-    for turn in range(12):
-        view.CameraPosition = [40, 30 + turn, 55]
+    for turn in range(32):
+        view.CameraPosition = [40, 30 + turn / 3, 55]
         started = time.perf_counter()
         Render(view)
         frames.append(1e3 * (time.perf_counter() - started))
@@ -54,7 +54,8 @@ def measure(view, name):
     with open(folder + "/times") as file:
         compositing = [float(line) for line in file]
     with open(folder + "/times.txt", "a") as file:
-        file.write("%s %.2f %.2f\n" % (name, statistics.median(frames[2:]), statistics.median(compositing[2:])))
+        figures = statistics.quantiles(frames[2:]) + statistics.quantiles(compositing[2:])
+        file.write("%s %.2f %.2f %.2f %.2f %.2f %.2f\n" % (name, *figures))
 
 
 def show_surfaces(view, opacity=1):
