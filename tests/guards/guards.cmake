@@ -133,7 +133,8 @@ if(TARGET dfb::mpi AND TARGET dfb::tbb AND TARGET dfb::snappy)
   endforeach()
 endif()
 
-# Two translation units that use everything make one program; the headers stay quiet under stricter warnings.
+# Two translation units that include everything make one program; what the first uses stays quiet under stricter
+# warnings.
 add_executable(test_odr guards/odr/first.cpp guards/odr/second.cpp)
 target_link_libraries(test_odr PRIVATE dfb_developer_headers)
 target_compile_options(test_odr PRIVATE -Wconversion)

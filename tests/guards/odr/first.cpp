@@ -1,5 +1,6 @@
 // With second.cpp: a function in a header that is neither a template nor inline would be defined twice.
 #include <dfb/dfb.hpp>
+#include <dfb/trace_file.hpp>
 
 template class dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
 #if defined(DFB_HAS_MPI)
