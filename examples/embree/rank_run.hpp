@@ -60,8 +60,8 @@ inline constexpr bool is_deep_v = (TileOp::channels & dfb::farChannel) != 0;
 // Unless 8 bits per channel are all that is written. They lose too much to divide by alpha, as a PNG with alpha wants.
 inline bool wantsFloat(const Options& o)
 {
-    return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background)
-           || endingOf(o.output) == ".pfm" || o.isExr() || o.pngBits == 16;
+    return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background) || endingOf(o.output) == ".pfm"
+           || o.isExr() || o.pngBits == 16;
 }
 
 inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
