@@ -45,7 +45,7 @@ step test
 
 install_there mpich slurm-wlm munge
 name=$(hostname)
-mkdir -p "$root/etc/slurm" "$root/var/spool/slurm" "$root/var/log/slurm" "$root/run/munge" "$root/work"
+mkdir -p "$root/etc/slurm" "$root/var/spool/slurm" "$root/var/log/slurm" "$root/run/munge" "$root/scratch"
 cat >"$root/etc/slurm/slurm.conf" <<END
 ClusterName=dfb
 SlurmctldHost=$name(127.0.0.1)
@@ -70,15 +70,15 @@ in_root runuser -u munge -- munged || give_up "munge does not start"
 in_root slurmctld || give_up "slurmctld does not start: see $root/var/log/slurm"
 in_root slurmd || give_up "slurmd does not start: see $root/var/log/slurm"
 say "Slurm $(in_root sinfo --version | sed 's/.* //'): job.sh with 3 ranks"
-mkdir "$root/work/slurm" "$root/work/mpiexec"
+mkdir "$root/scratch/slurm" "$root/scratch/mpiexec"
 # shellcheck disable=SC2016 # expands there
-if ! in_root timeout 120 sh -c 'cd /work/slurm && sbatch --wait --ntasks-per-node=3 -o job.log /dfb/examples/cluster/job.sh minimal' ||
-    ! [ -s "$root/work/slurm/minimal.ppm" ]; then
+if ! in_root timeout 120 sh -c 'cd /scratch/slurm && sbatch --wait --ntasks-per-node=3 -o job.log /dfb/examples/cluster/job.sh minimal' ||
+    ! [ -s "$root/scratch/slurm/minimal.ppm" ]; then
     cp -r "$root/var/log/slurm" "$output"
-    [ ! -e "$root/work/slurm/job.log" ] || cat "$root/work/slurm/job.log"
+    [ ! -e "$root/scratch/slurm/job.log" ] || cat "$root/scratch/slurm/job.log"
     give_up "FAILED: the job; logs of Slurm are in $output/slurm"
 fi
-in_root sh -c "cd /work/mpiexec && timeout 60 mpiexec -n 3 minimal" || give_up "FAILED: minimal on 3 ranks of mpiexec"
-cmp "$root/work/slurm/minimal.ppm" "$root/work/mpiexec/minimal.ppm" ||
+in_root sh -c "cd /scratch/mpiexec && timeout 60 mpiexec -n 3 minimal" || give_up "FAILED: minimal on 3 ranks of mpiexec"
+cmp "$root/scratch/slurm/minimal.ppm" "$root/scratch/mpiexec/minimal.ppm" ||
     give_up "FAILED: the picture of 3 ranks under Slurm is not that of 3 ranks under mpiexec"
 say "passed"

@@ -74,7 +74,7 @@ public:
         sink_->add(*event_);
     }
 
-    // What is to be told. Null: there is no sink.
+    // The event, to be filled in. Null: there is no sink.
     TraceEvent* event() noexcept { return event_ ? &*event_ : nullptr; }
 
 private:

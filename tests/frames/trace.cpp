@@ -1,4 +1,4 @@
-// What a TraceSink is told: it agrees with the report of the frame, on every rank; messages pair up; clocks that differ
+// A TraceSink's events: they agree with the report of the frame, on every rank; messages pair up; clocks that differ
 // are put on one; frames that fail end their spans.
 
 #include "everywhere.hpp"

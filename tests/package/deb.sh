@@ -50,23 +50,23 @@ for mpi in mpich openmpi; do
         install_there "/tmp/$package" libopenmpi-dev openmpi-bin
         [ ! -e "$root/usr/include/$(in_root gcc -print-multiarch)/mpich" ] || give_up "MPICH came beside Open MPI"
     fi
-    rm -rf "$root/work"
-    mkdir "$root/work"
-    cp -r "$source/tests/package" "$source/examples/minimal.cpp" "$root/work"
+    rm -rf "$root/scratch"
+    mkdir "$root/scratch"
+    cp -r "$source/tests/package" "$source/examples/minimal.cpp" "$root/scratch"
 
     say "by find_package, with $mpi"
     # shellcheck disable=SC2015 # either step may fail
-    in_root cmake -S /work/package -B /work/build -DHOW=find_package -DVERSION="${version%.*}" -DEXPECT="mpi;tbb;snappy" \
+    in_root cmake -S /scratch/package -B /scratch/build -DHOW=find_package -DVERSION="${version%.*}" -DEXPECT="mpi;tbb;snappy" \
         -DFRAME=ON -DCOMPILED=ON -DCMAKE_CXX_FLAGS=-O0 >"$root/build.log" 2>&1 &&
-        in_root cmake --build /work/build >>"$root/build.log" 2>&1 ||
+        in_root cmake --build /scratch/build >>"$root/build.log" 2>&1 ||
         give_up "FAILED: it does not build by find_package: see $root/build.log"
-    in_root /work/build/stranger || give_up "FAILED: the program that was built by find_package"
+    in_root /scratch/build/stranger || give_up "FAILED: the program that was built by find_package"
 
     say "by pkg-config, with $mpi"
     # shellcheck disable=SC2016 # expands there
-    in_root sh -c 'cd /work && g++ -std=c++17 -O0 minimal.cpp $(pkg-config --cflags --libs dfb) -o minimal && ./minimal' ||
+    in_root sh -c 'cd /scratch && g++ -std=c++17 -O0 minimal.cpp $(pkg-config --cflags --libs dfb) -o minimal && ./minimal' ||
         give_up "FAILED: it does not build or run by pkg-config"
-    [ "$(wc -c <"$root/work/minimal.ppm")" -eq $((15 + 640 * 320 * 3)) ] || give_up "FAILED: no picture of minimal.cpp"
+    [ "$(wc -c <"$root/scratch/minimal.ppm")" -eq $((15 + 640 * 320 * 3)) ] || give_up "FAILED: no picture of minimal.cpp"
 done
 remove_package
 say "passed; the package is $output/$package"
