@@ -97,7 +97,7 @@ def print_times():
             with open("%s/%s/times.txt" % (FOLDER, side)) as file:
                 figures = next((line.split()[1:] for line in file if line.split()[0] == name), None)
             check(name, figures, "%s was not timed" % side)
-            print("%-30s %8s %8s %8s   %8s %8s %8s" % (name + " " + side, *figures or 6 * "?"))
+            print("%-30s %8s %8s %8s   %8s %8s %8s" % (name + " " + side, *(figures or 6 * "?")))
 
 
 compare_pictures()

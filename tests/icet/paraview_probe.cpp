@@ -1,9 +1,8 @@
-// Preloaded before IceT, or before libdfb_icet, whichever composites. Adds to $DFB_PROBE/times how long each frame takes,
-// from the moment when the last rank has rendered until rank 0 has the picture. Ranks that render for different times
-// wait for each other, and on a machine with fewer cores than ranks even more: that is no time of who composites. All
-// ranks have one clock, so they must be on one machine.
-// While there is a file $DFB_PROBE/wanted it also writes what goes into a frame that is blended, to input_RANK beside it,
-// and what comes out, to output; the last frame stays.
+// Preloaded before IceT, or before libdfb_icet, whichever composites. Adds to $DFB_PROBE/times how long each frame
+// takes, from the moment when the last rank has rendered until rank 0 has the picture. Ranks that render for different
+// times wait for each other, and on a machine with fewer cores than ranks even more: that is no time of who composites.
+// All ranks have one clock, so they must be on one machine. While there is a file $DFB_PROBE/wanted it also writes what
+// goes into a frame that is blended, to input_RANK beside it, and what comes out, to output; the last frame stays.
 //
 //   mpirun -n 3 env DFB_PROBE=FOLDER LD_PRELOAD="paraview_probe.so libdfb_icet.so" pvbatch movie.py
 #include <IceT.h>
