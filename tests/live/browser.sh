@@ -6,33 +6,11 @@
 # With --only-if-installed: exits with 77 where something is missing.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
-modules=${DFB_LIVE_NODE_MODULES:-}
-[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
-
-only_if_installed=
-if [ "${1:-}" = --only-if-installed ]; then
-    only_if_installed=1
-    shift
-fi
+script=tests/live/browser.sh
+packages=puppeteer-core@24 # the last major version for node 18 and 20
+# shellcheck source=tests/support/chromium.sh
+. "$root/tests/support/chromium.sh"
 output=${1:-$root/build/live_browser}
-
-missing() {
-    echo "browser.sh: skipped: $1 is missing; sh tests/live/browser.sh installs what the test needs"
-    exit 77
-}
-
-if [ -n "$only_if_installed" ]; then
-    command -v chromium >/dev/null 2>&1 || missing chromium
-    command -v node >/dev/null 2>&1 || missing node
-    [ -d "$modules/node_modules/puppeteer-core" ] || missing puppeteer-core
-else
-    sh "$root/cmake/install_packages.sh" browser
-    if [ ! -d "$modules/node_modules/puppeteer-core" ]; then
-        mkdir -p "$modules"
-        # The last major version for node 18 and 20.
-        npm install --prefix "$modules" --no-audit --no-fund puppeteer-core@24
-    fi
-fi
 
 if [ -z "${DFB_RENDER:-}" ]; then
     (

@@ -6,34 +6,11 @@
 # With --only-if-installed: exits with 77 where something is missing.
 set -eu
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
-modules=${DFB_LIVE_NODE_MODULES:-}
-[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
-
-only_if_installed=
-if [ "${1:-}" = --only-if-installed ]; then
-    only_if_installed=1
-    shift
-fi
+script=tests/trace/speedscope.sh
+packages="puppeteer-core@24 speedscope@1"
+# shellcheck source=tests/support/chromium.sh
+. "$root/tests/support/chromium.sh"
 output=${1:-$root/build/speedscope}
-
-missing() {
-    echo "speedscope.sh: skipped: $1 is missing; sh tests/trace/speedscope.sh installs what the test needs"
-    exit 77
-}
-
-if [ -n "$only_if_installed" ]; then
-    command -v chromium >/dev/null 2>&1 || missing chromium
-    command -v node >/dev/null 2>&1 || missing node
-    for package in puppeteer-core speedscope; do
-        [ -d "$modules/node_modules/$package" ] || missing $package
-    done
-else
-    sh "$root/cmake/install_packages.sh" browser
-    if [ ! -d "$modules/node_modules/puppeteer-core" ] || [ ! -d "$modules/node_modules/speedscope" ]; then
-        mkdir -p "$modules"
-        npm install --prefix "$modules" --no-audit --no-fund puppeteer-core@24 speedscope@1
-    fi
-fi
 
 mkdir -p "$output"
 trace=${DFB_TRACE:-}

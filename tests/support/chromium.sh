@@ -1,0 +1,30 @@
+# Sourced by scripts of tests that drive Debian's Chromium, with their arguments. The caller sets script (its path in the
+# tree), root (the working tree) and packages (of npm, each NAME@VERSION). Takes --only-if-installed from the arguments:
+# then exits with 77 where something is missing; else installs it. Sets modules: the folder that has the packages.
+# shellcheck shell=sh disable=SC2154
+
+modules=${DFB_LIVE_NODE_MODULES:-}
+[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
+lacking=
+for package in $packages; do
+    [ -d "$modules/node_modules/${package%@*}" ] || lacking="$lacking $package"
+done
+
+missing() {
+    echo "${script##*/}: skipped: $1 is missing; sh $script installs what the test needs"
+    exit 77
+}
+
+if [ "${1:-}" = --only-if-installed ]; then
+    shift
+    command -v chromium >/dev/null 2>&1 || missing chromium
+    command -v node >/dev/null 2>&1 || missing node
+    [ -z "$lacking" ] || missing "${lacking# }"
+else
+    sh "$root/cmake/install_packages.sh" browser
+    if [ -n "$lacking" ]; then
+        mkdir -p "$modules"
+        # shellcheck disable=SC2086 # one word per package
+        npm install --prefix "$modules" --no-audit --no-fund $lacking
+    fi
+fi
