@@ -138,9 +138,9 @@ public:
             DependencyTracker& tree = slot.trees[static_cast<std::size_t>(h.pass)];
             tree.arrive(h.generation, h.source, h.part, h.children, from);
             slot.touched = true;
-            if (slot.ready) {
+            if (slot.ready || slot.spoilt) {
                 ++arrived_;
-                return; // the op had enough
+                return; // the op had enough, or is of no use
             }
             slot.hasPixels = slot.hasPixels || !fragment.empty();
             slot.op->add(std::move(fragment));
