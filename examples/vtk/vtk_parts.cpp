@@ -11,36 +11,11 @@
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
-#include <cstddef>
 #include <cstdint>
 #include <cstdio>
 #include <exception>
 #include <string>
 #include <vector>
-
-namespace {
-
-using example::width, example::height;
-
-// The ranks, as dfb::SharedWorld asks a framebuffer for them.
-struct Ranks {
-    MPI_Comm communicator;
-    int count, number;
-
-    int rank() const { return number; }
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& mine) const // as much from each rank
-    {
-        std::vector<std::byte> all(mine.size() * static_cast<std::size_t>(count));
-        MPI_Allgather(mine.data(), static_cast<int>(mine.size()), MPI_BYTE, all.data(), static_cast<int>(mine.size()),
-                      MPI_BYTE, communicator);
-        std::vector<std::vector<std::byte>> result;
-        for (auto from = all.begin(); from != all.end(); from += static_cast<std::ptrdiff_t>(mine.size()))
-            result.emplace_back(from, from + static_cast<std::ptrdiff_t>(mine.size()));
-        return result;
-    }
-};
-
-} // namespace
 
 int main(int argc, char** argv)
 try {
@@ -74,19 +49,18 @@ try {
     MPI_Allreduce(least, all, 8, MPI_DOUBLE, MPI_MIN, mpi.communicator());
     example::Renderer renderer(isVolume, {all[0], -all[1], all[2], -all[3], all[4], -all[5]}, {all[6], -all[7]});
 
+    dfb::ImageCompositor compositor(mpi.communicator(), isVolume ? dfb::ImageBlend::InOrder : dfb::ImageBlend::Nearest,
+                                    {example::width, example::height});
     const auto corner = [&](int side) {
         return dfb::Vec3{static_cast<float>(box[side]), static_cast<float>(box[2 + side]),
                          static_cast<float>(box[4 + side])};
     };
     const auto rank = static_cast<std::uint32_t>(mpi.rank());
-    const Ranks ranks{mpi.communicator(), mpi.size(), mpi.rank()};
-    const dfb::SharedWorld world(ranks, dfb::World({{rank, {corner(0), corner(1)}}}));
+    const dfb::SharedWorld world(compositor, dfb::World({{rank, {corner(0), corner(1)}}}));
     const std::vector<int> order = dfb::visibilityOrder(world, renderer.eye());
     const auto place = std::find(order.begin(), order.end(), mpi.rank()) - order.begin();
 
     const example::Pixels pixels = renderer.render(mine);
-    dfb::ImageCompositor compositor(mpi.communicator(), isVolume ? dfb::ImageBlend::InOrder : dfb::ImageBlend::Nearest,
-                                    {width, height});
     dfb::InputImage image(pixels.colors.data(), isVolume ? nullptr : pixels.depths.data());
     image.bottomUp = true;
     image.farDepth = 1;
