@@ -13,6 +13,12 @@ say() {
     echo "demo.sh: $*"
 }
 
+usage() {
+    echo "usage: sh examples/demo.sh [--live] [SCENE FILE...]"
+    echo "scene files: volumes (NAME_XxYxZ_TYPE.raw, .nrrd, .nhdr, .mha, .mhd, .h5:/DATASET), meshes (.ply, .obj, .stl," \
+        ".gltf, .glb), particles (.xyz); several make one scene"
+}
+
 live=
 if [ "${1:-}" = --live ]; then
     live=--live
@@ -20,14 +26,19 @@ if [ "${1:-}" = --live ]; then
 fi
 for argument in "$@"; do
     case $argument in
+    --help)
+        usage
+        exit 0
+        ;;
     -*)
-        echo "usage: sh examples/demo.sh [--live] [SCENE FILE...]" >&2
-        echo "scene files: NAME_XxYxZ_TYPE.raw volumes, .ply and .obj meshes, .xyz particles; several make one scene" >&2
+        usage >&2
         exit 2
         ;;
     esac
-    if [ ! -f "$argument" ] || [ ! -r "$argument" ]; then
-        echo "demo.sh: cannot read the file '$argument'" >&2
+    file=$argument
+    [ -f "$file" ] || file=${argument%%:*} # behind a colon: how it looks, or a data set
+    if [ ! -f "$file" ] || [ ! -r "$file" ]; then
+        echo "demo.sh: cannot read the file '$file'" >&2
         exit 1
     fi
 done

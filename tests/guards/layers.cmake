@@ -22,7 +22,7 @@ set(level_8 frame/declarations.hpp frame/frame_terms.hpp ops/sort_last.hpp pixel
             render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
 set(level_9 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
             render/loops.hpp testing/tile_op_test.hpp testing/verified.hpp)
-set(level_10 frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/shared_world.hpp
+set(level_10 frame/accumulation.hpp frame/engine.hpp frame/tile_table.hpp frame/verdict.hpp render/deep_parallel.hpp render/shared_world.hpp
             testing/adversarial.hpp)
 set(level_11 frame/frame_figures.hpp frame/tile_pipeline.hpp gather/wall.hpp render/mixed_parallel.hpp)
 set(level_12 display_wall.hpp frame/outcome.hpp)

@@ -1,4 +1,4 @@
-// Codec: the contract of a lossless compressor for message payloads; and whether compressing pays, found out by trying.
+// Codec: the contract of a lossless compressor for message payloads; and which messages are compressed.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -8,6 +8,8 @@
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <memory>
+#include <utility>
 #include <vector>
 
 // Codec: the contract of a lossless compressor for message payloads. A flag in each message tells whether it
@@ -200,6 +202,47 @@ private:
     std::size_t frames_ = 0, interval_ = firstInterval, strange_ = 0; // frames in this phase
     double usual_ = 0;                                                // when it was last looked at
     std::array<std::vector<double>, 2> times_;                        // without, with
+};
+
+// Compression: which messages of a rank are compressed in a frame. sent() and codecFor() may be called from any thread,
+// endFrame() between frames.
+class Compression {
+public:
+    // `codec` may be null: none are.
+    Compression(std::shared_ptr<const Codec> codec, CompressionMode mode, int rankCount)
+        : codec_(std::move(codec)), mode_(mode), gains_(codec_ ? rankCount : 0)
+    {
+    }
+
+    // Whether any may be.
+    bool isOn() const { return codec_ && (mode_ == CompressionMode::Always || trial_.compresses()); }
+
+    // For messages with pixels to that rank, or null. `isNear`: it sees this rank's memory.
+    const Codec* codecFor(int other, bool isNear) const
+    {
+        const bool isLeftOut = !isOn() || (mode_ == CompressionMode::Auto && (isNear || !gains_.isWorthwhile(other)));
+        return isLeftOut ? nullptr : codec_.get();
+    }
+
+    // A message to that rank had `raw` bytes before the codec, and `sent` after it.
+    void sent(int other, std::size_t raw, std::size_t sent) { gains_.add(other, raw, sent); }
+
+    // For how many ranks something was compressed in this frame.
+    std::int64_t links() const { return gains_.links(); }
+
+    // The frame has not failed, and took so long on the slowest rank.
+    void endFrame(double time)
+    {
+        if (codec_)
+            trial_.took(time);
+        gains_.endFrame();
+    }
+
+private:
+    std::shared_ptr<const Codec> codec_;
+    CompressionMode mode_;
+    CompressionTrial trial_;
+    CompressionGains gains_;
 };
 
 } // namespace detail

@@ -5,6 +5,7 @@
 #include <dfb/comm/compression.hpp>
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/accumulation.hpp>
 #include <dfb/frame/declarations.hpp>
 #include <dfb/frame/engine.hpp>
 #include <dfb/frame/frame_figures.hpp>
@@ -46,7 +47,7 @@ public:
         MailboxOwner& self = *this;
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self,
                                              config_.trace.get());
-        gains_.emplace(config_.messages.codec ? size() : 0);
+        compression_.emplace(config_.messages.codec, config_.messages.compression, size());
         mailbox_->start();
         Agreement mine;
         try {
@@ -128,20 +129,21 @@ public:
             failArgument("a frame has at least 1 pass, not %d", params.passes);
         if (params.maxLayers < 0)
             failArgument("at most %d layers", params.maxLayers);
-        checkSamples(params);
+        const bool lastFailed = outcome_->lastFailed();
+        accumulation_.check(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
         if (const long long ms = params.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
             failArgument("a time-out of %lld ms", ms);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         params_ = params;
         terms_ = FrameTerms::of(params, rank());
-        declarations_.newFrame(!outcome_->lastFailed()); // after one that failed, owners may know of different ones
+        declarations_.newFrame(!lastFailed); // after one that failed, owners may know of different ones
 
         TileInfo info;
         info.rank = rank();
         info.frame = open_.next();
         info.passes = params.passes;
-        info.firstSample = firstSampleOf(params);
+        info.firstSample = accumulation_.firstSample(params, traits(), lastFailed);
         info.accumulationId = params.accumulationId;
         info.wanted = TilePipeline::imageChannels(config_);
         info.background = params.background;
@@ -331,14 +333,11 @@ public:
         const Verdict verdict = outcome_->conclude();
         if (verdict.error && !outcome_->isPartial(verdict))
             throw FrameError(*verdict.error);
-        const bool compressed = compresses();
+        const bool compressed = compression_->isOn();
         pipeline_->fillBackground();
         if (!verdict.error) {
-            if (config_.messages.codec)
-                compressionTrial_.took(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
-            gains_->endFrame();
-            lastAccumulationId_ = params_.accumulationId;
-            nextSample_ = params_.samples ? 0 : pipeline_->table().frameInfo().firstSample + params_.passes;
+            compression_->endFrame(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
+            accumulation_.ended(params_, pipeline_->table().frameInfo().firstSample);
         }
 
         const double nsPerMs = 1e6;
@@ -417,20 +416,10 @@ private:
 
     using Clock = std::chrono::steady_clock;
 
-    bool compresses() const
-    {
-        return config_.messages.codec
-               && (config_.messages.compression == CompressionMode::Always || compressionTrial_.compresses());
-    }
-
     // Returns the codec for messages with pixels to that rank in this frame, or null for none.
     const Codec* codecFor(int other) const
     {
-        if (other == rank() || !compresses())
-            return nullptr;
-        const bool isLeftOut = config_.messages.compression == CompressionMode::Auto
-                               && (mailbox_->connection().isSeenBy(other) || !gains_->isWorthwhile(other));
-        return isLeftOut ? nullptr : config_.messages.codec.get();
+        return other == rank() ? nullptr : compression_->codecFor(other, mailbox_->connection().isSeenBy(other));
     }
 
     // Tells the trace of the frame when it has ended, in whatever way.
@@ -522,7 +511,7 @@ private:
     {
         if (mailbox_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
             if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
-                gains_->add(config_.image.displayRank, raw, message.size());
+                compression_->sent(config_.image.displayRank, raw, message.size());
             mailbox_->sendWithCredit(config_.image.displayRank, std::move(message));
         } else
             mailbox_->send(config_.image.displayRank, std::move(message));
@@ -643,7 +632,7 @@ private:
         const Codec* codec = codecFor(owner);
         Buffer message = pipeline_->encode(tile, codec, isFar(owner));
         if (codec)
-            gains_->add(owner, rawFragmentBytes(message), message.size());
+            compression_->sent(owner, rawFragmentBytes(message), message.size());
         return message;
     }
 
@@ -802,7 +791,7 @@ private:
         v.sums[Verdict::RepeatedMessages] = repeated - repeatedBefore_;
         v.sums[Verdict::OrderUndefinedPixels] = reports.orderUndefinedPixels;
         v.sums[Verdict::AlphaOutsidePixels] = pipeline_->faults().alphaOutside;
-        v.sums[Verdict::CompressedLinks] = gains_->links();
+        v.sums[Verdict::CompressedLinks] = compression_->links();
         v.sums[Verdict::InputsLeft] = inputsSent_ - pipeline_->table().arrivedCount();
         v.sums[Verdict::TilesEndedEarly] = pipeline_->table().endedEarlyCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
@@ -836,52 +825,6 @@ private:
             failArgument("a least transmittance of %f", config_.minTransmittance);
     }
 
-    // Whether the state that the last frame left is of use.
-    bool accumulates(const FrameConfig& params) const
-    {
-        return traits().keepsState && !outcome_->lastFailed() && params.accumulationId == lastAccumulationId_;
-    }
-
-    // Without a plan: of each tile.
-    int firstSampleOf(const FrameConfig& params) const
-    {
-        return !params.samples && accumulates(params) ? nextSample_ : 0;
-    }
-
-    // Throws InvalidArgument for samples that this framebuffer cannot take.
-    void checkSamples(const FrameConfig& params) const
-    {
-        if (!params.samples) {
-            if (params.passes > std::numeric_limits<int>::max() - firstSampleOf(params))
-                failArgument("a tile cannot have %d samples from %d on: take another accumulationId", params.passes,
-                             firstSampleOf(params));
-            return;
-        }
-        if (params.samples->size() != static_cast<std::size_t>(layout().tileCount()))
-            failArgument("a plan of the samples of %zu tiles for an image of %d", params.samples->size(),
-                         layout().tileCount());
-        for (const TileSamples& t : *params.samples) {
-            if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
-                failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
-            if (traits().keepsState) {
-                if ((t.first > 0 || t.count == 0) && !accumulates(params))
-                    failArgument("what was accumulated is of no use, as the last frame failed or had another "
-                                 "accumulationId: begin again with sample 0 of each tile");
-                continue;
-            }
-            if (t.first > 0)
-                failArgument("this tile operation keeps nothing over frames: samples of a tile begin with 0");
-            if (t.count > 0)
-                continue;
-            if (outcome_->lastFailed())
-                failArgument("a tile without samples keeps its pixels, but the last frame failed: render all tiles");
-            if (config_.framesInFlight > 1)
-                failArgument("a tile without samples keeps its pixels: this needs framesInFlight = 1");
-            if (!traits().pixelOpIsPointwise)
-                failArgument("a tile without samples keeps its pixels, but the pixel operation wants all tiles");
-        }
-    }
-
     std::shared_ptr<MemoryPool> pool_;
     FrameBufferConfig config_;
     Operations& operations_;
@@ -896,11 +839,9 @@ private:
     std::optional<JobExchange> jobs_;
     FrameConfig params_;
     FrameTerms terms_; // of params_
-    std::uint64_t lastAccumulationId_ = 0;
-    int nextSample_ = 0; // of each tile, if the next frame has no plan and accumulates
+    Accumulation accumulation_;
     FrameFigures figures_;
-    CompressionTrial compressionTrial_;
-    std::optional<CompressionGains> gains_;   // per rank that this one sends to
+    std::optional<Compression> compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{0};
     bool isEnding_ = false; // beginEnd() was called

@@ -1,0 +1,76 @@
+// Accumulation: which samples of its pixels a frame takes, and whether they go on where those of the last one ended.
+#pragma once
+
+#include <dfb/frame.hpp>
+#include <dfb/frame/operations.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+
+DFB_NAMESPACE_BEGIN
+namespace detail {
+
+class Accumulation {
+public:
+    // Throws InvalidArgument for samples that this framebuffer cannot take. `lastFailed`: the last frame has.
+    void check(const FrameConfig& params, const OperationTraits& traits, int tileCount, int framesInFlight,
+               bool lastFailed) const
+    {
+        if (!params.samples) {
+            const int first = firstSample(params, traits, lastFailed);
+            if (params.passes > std::numeric_limits<int>::max() - first)
+                failArgument("a tile cannot have %d samples from %d on: take another accumulationId", params.passes,
+                             first);
+            return;
+        }
+        if (params.samples->size() != static_cast<std::size_t>(tileCount))
+            failArgument("a plan of the samples of %zu tiles for an image of %d", params.samples->size(), tileCount);
+        for (const TileSamples& t : *params.samples) {
+            if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
+                failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
+            if (traits.keepsState) {
+                if ((t.first > 0 || t.count == 0) && !goesOn(params, traits, lastFailed))
+                    failArgument("what was accumulated is of no use, as the last frame failed or had another "
+                                 "accumulationId: begin again with sample 0 of each tile");
+                continue;
+            }
+            if (t.first > 0)
+                failArgument("this tile operation keeps nothing over frames: samples of a tile begin with 0");
+            if (t.count > 0)
+                continue;
+            if (lastFailed)
+                failArgument("a tile without samples keeps its pixels, but the last frame failed: render all tiles");
+            if (framesInFlight > 1)
+                failArgument("a tile without samples keeps its pixels: this needs framesInFlight = 1");
+            if (!traits.pixelOpIsPointwise)
+                failArgument("a tile without samples keeps its pixels, but the pixel operation wants all tiles");
+        }
+    }
+
+    // Of each tile in a frame without a plan of samples.
+    int firstSample(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
+    {
+        return !params.samples && goesOn(params, traits, lastFailed) ? next_ : 0;
+    }
+
+    // The frame has ended well, and began with that sample.
+    void ended(const FrameConfig& params, int firstSample)
+    {
+        lastId_ = params.accumulationId;
+        next_ = params.samples ? 0 : firstSample + params.passes;
+    }
+
+private:
+    // Whether what the last frame left is of use.
+    bool goesOn(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
+    {
+        return traits.keepsState && !lastFailed && params.accumulationId == lastId_;
+    }
+
+    std::uint64_t lastId_ = 0;
+    int next_ = 0; // sample of each tile, if the next frame has no plan and goes on
+};
+
+} // namespace detail
+DFB_NAMESPACE_END
