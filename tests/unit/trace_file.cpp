@@ -1,0 +1,108 @@
+// TraceFile: what it keeps, what it counts when it is full, and that it begins anew after it has written.
+#include "catch.hpp"
+
+#include <dfb/trace_file.hpp>
+
+#include <cstddef>
+#include <cstdio>
+#include <fstream>
+#include <iterator>
+#include <string>
+#include <vector>
+
+namespace trace_file_cases {
+
+namespace {
+
+using Bytes = std::vector<std::byte>;
+
+// A rank of a job in which nobody else is: what others give to allGather() is there already.
+struct LoneRank {
+    int number = 0;
+    std::vector<Bytes> ofOthers{}; // the parts of the ranks after it
+    Bytes given{};                 // the last that was not empty
+
+    int rank() const { return number; }
+    std::vector<Bytes> allGather(const Bytes& mine)
+    {
+        if (mine.empty())
+            return std::vector<Bytes>(1 + ofOthers.size());
+        given = mine;
+        std::vector<Bytes> all{mine};
+        all.insert(all.end(), ofOthers.begin(), ofOthers.end());
+        return all;
+    }
+};
+
+void addEvents(dfb::TraceFile& trace, int count)
+{
+    for (int i = 0; i < count; ++i)
+        trace.add({});
+}
+
+// What has been written to the file, which is removed.
+struct Written {
+    explicit Written(const std::string& path)
+    {
+        std::ifstream file(path);
+        const std::string text{std::istreambuf_iterator<char>(file), {}};
+        std::remove(path.c_str());
+        const std::string dropped = "\"dropped\": ";
+        if (const auto at = text.find(dropped); at != std::string::npos)
+            missing = std::stoi(text.substr(at + dropped.size()));
+        for (auto at = text.find("\"ph\": \"X\""); at != std::string::npos; at = text.find("\"ph\": \"X\"", at + 1))
+            ++spans;
+    }
+    int missing = -1, spans = 0;
+};
+
+} // namespace
+
+TEST_CASE("A trace file keeps what it has room for and counts the rest", "[trace]")
+{
+    const std::string path = "trace_file_full.json";
+    dfb::TraceFile trace(3);
+    LoneRank rank;
+    addEvents(trace, 3);
+    trace.write(rank, path);
+    Written all(path);
+    CHECK(all.spans == 3);
+    CHECK(all.missing == 0);
+
+    // It has made room for 10,000 more than it had, for what comes while it writes.
+    addEvents(trace, 10'003 + 4);
+    trace.write(rank, path);
+    Written most(path);
+    CHECK(most.spans == 10'003);
+    CHECK(most.missing == 4);
+
+    addEvents(trace, 1);
+    trace.write(rank, path);
+    Written one(path);
+    CHECK(one.spans == 1);
+    CHECK(one.missing == 0);
+}
+
+TEST_CASE("A trace file says how many events of all ranks are missing", "[trace]")
+{
+    dfb::TraceFile first(2), second(5);
+    addEvents(first, 5);
+    addEvents(second, 12);
+    LoneRank other{1};
+    second.write(other, "trace_file_of_no_rank.json");
+    CHECK(Written("trace_file_of_no_rank.json").missing == -1); // rank 0 writes
+    LoneRank rank{0, {other.given}};
+    first.write(rank, "trace_file_of_two.json");
+    const Written written("trace_file_of_two.json");
+    CHECK(written.spans == 2 + 5);
+    CHECK(written.missing == 3 + 7);
+}
+
+TEST_CASE("A trace file that cannot be written is an error", "[trace]")
+{
+    dfb::TraceFile trace(1);
+    LoneRank rank;
+    CHECK_THROWS_AS(trace.write(rank, "no such folder/trace.json"), dfb::InvalidArgument);
+}
+
+} // namespace trace_file_cases
