@@ -61,7 +61,11 @@ program test_module
 
   call dfb_config_init(config, width, height)
   call expect(config%width == width .and. config%blend == DFB_BY_DEPTH .and. config%format == DFB_SRGBA8 &
-    .and. config%threads == 1 .and. all(config%background == 0), 'the defaults')
+    .and. config%threads == 1 .and. all(config%background == 0) .and. config%timeout_ms == 0, 'the defaults')
+  if (rank == ranks - 1) config%timeout_ms = -7
+  status = dfb_create(MPI_COMM_WORLD, config, fb)
+  call expect(status == DFB_INVALID_ARGUMENT .and. index(dfb_last_error(), 'a timeout_ms of -7') > 0, 'a time-out')
+  config%timeout_ms = 100000
   if (rank == ranks - 1) config%blend = 7
   status = dfb_create(MPI_COMM_WORLD, config, fb) ! not within the next: who knows what is called first there
   call expect(status == DFB_INVALID_ARGUMENT .and. .not. c_associated(fb) &

@@ -1,14 +1,21 @@
 /* A program in C99 on dfb.h:
-     mpirun -n 3 test_c_pictures write FILE [multiple]   writes pictures, which test_c_twin must make bit for bit as
-   well mpirun -n 3 test_c_pictures errors [multiple]       calls that are wrong, on one rank or on all With "multiple"
-   at MPI_THREAD_MULTIPLE, else with plain MPI_Init. Returns 0 if all is well. */
+     mpirun -n 3 test_c_pictures write FILE [multiple]
+       writes pictures, which test_c_twin must make bit for bit as well
+     mpirun -n 3 test_c_pictures errors [multiple]
+       calls that are wrong, on one rank or on all
+     mpirun -n 3 test_c_pictures lost [multiple]
+       a rank that is stopped while it draws; it goes on when the others have been told
+   With "multiple" at MPI_THREAD_MULTIPLE, else with plain MPI_Init. Returns 0 if all is well. */
+#define _POSIX_C_SOURCE 200809L /* for SIGSTOP */
 #include "scene.h"
 
 #include <dfb.h>
 
+#include <signal.h>
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <unistd.h>
 
 static int rank = 0, ranks = 1, failures = 0;
 
@@ -230,7 +237,7 @@ static void check_creation(void)
     const int bad = ranks - 1; /* the rank that is wrong */
     char name[20];
     snprintf(name, sizeof name, "rank %d", bad);
-    for (int wrong = 0; wrong < 8; ++wrong) {
+    for (int wrong = 0; wrong < 9; ++wrong) {
         dfb_config config;
         dfb_framebuffer *fb = NULL, *const unset = (dfb_framebuffer*)&config;
         const dfb_config* given = &config;
@@ -248,16 +255,18 @@ static void check_creation(void)
         if (wrong == 4)
             given = rank == bad ? NULL : given, text = "a null dfb_config";
         if (wrong == 5)
-            config.width = rank == bad ? 0 : config.width, text = "0x90";
+            config.timeout_ms = rank == bad ? -1 : 0, text = "a timeout_ms of -1";
         if (wrong == 6)
+            config.width = rank == bad ? 0 : config.width, text = "0x90";
+        if (wrong == 7)
             config.display_rank = ranks, text = "the display rank is";
-        if (wrong == 7) {
+        if (wrong == 8) {
             if (ranks == 1)
                 continue;
             config.height += rank == bad;
             text = "height";
         }
-        expect_error(dfb_create(MPI_COMM_WORLD, given, &fb), DFB_INVALID_ARGUMENT, text, wrong < 6 ? name : "rank",
+        expect_error(dfb_create(MPI_COMM_WORLD, given, &fb), DFB_INVALID_ARGUMENT, text, wrong < 7 ? name : "rank",
                      "dfb_create");
         expect(!fb, "there is no framebuffer after an error");
     }
@@ -394,6 +403,47 @@ static void check_errors(void)
     dfb_destroy(fb);
 }
 
+static int draw_and_stop(const dfb_brick* brick, const dfb_tile* tile, void* user)
+{
+    int* is_to_stop = user;
+    if (*is_to_stop)
+        raise(SIGSTOP);
+    *is_to_stop = 0;
+    return draw(brick, tile, NULL);
+}
+
+/* The last rank is stopped, as by a batch system, and says nothing then. */
+static void check_lost(void)
+{
+    enum { limit_ms = 1000, margin_ms = 5000 }; /* margin: for a machine that is busy with other things */
+    const int lost = ranks - 1;
+    int is_to_stop = rank == lost, pid = (int)getpid();
+    MPI_Comm others = MPI_COMM_NULL;
+    dfb_config config;
+    dfb_framebuffer* fb = NULL;
+    dfb_brick bricks[2];
+    MPI_Bcast(&pid, 1, MPI_INT, lost, MPI_COMM_WORLD);
+    MPI_Comm_split(MPI_COMM_WORLD, rank == lost, rank, &others);
+    dfb_config_init(&config, scene_width, scene_height);
+    config.timeout_ms = limit_ms;
+    require(dfb_create(MPI_COMM_WORLD, &config, &fb), "dfb_create");
+    get_bricks(bricks);
+    require(dfb_render(fb, bricks, 2, scene_view, scene_projection, draw, NULL), "bricks");
+
+    const double start = MPI_Wtime();
+    const int status = dfb_render(fb, bricks, 2, scene_view, scene_projection, draw_and_stop, &is_to_stop);
+    const double ms = 1e3 * (MPI_Wtime() - start);
+    expect_error(status, DFB_TRANSPORT_FAILED, "no verdict after 2000 ms", "", "dfb_render");
+    expect(rank == lost || ms <= 2 * limit_ms + margin_ms, "told in time");
+    expect(!dfb_image_rgba8(fb), "no picture");
+    expect(dfb_render(fb, bricks, 2, scene_view, scene_projection, draw, NULL) == DFB_TRANSPORT_FAILED, "no other one");
+    dfb_destroy(fb); /* which waits for nobody */
+    MPI_Barrier(others);
+    if (rank == 0)
+        kill((pid_t)pid, SIGCONT);
+    MPI_Comm_free(&others);
+}
+
 int main(int argc, char** argv)
 {
     int level = MPI_THREAD_SINGLE, all_failures = 0;
@@ -410,6 +460,8 @@ int main(int argc, char** argv)
     MPI_Comm_size(MPI_COMM_WORLD, &ranks);
     if (argc > 2 && strcmp(argv[1], "write") == 0)
         write_all(argv[2]);
+    else if (argc > 1 && strcmp(argv[1], "lost") == 0)
+        check_lost();
     else
         check_errors();
     MPI_Allreduce(&failures, &all_failures, 1, MPI_INT, MPI_SUM, MPI_COMM_WORLD);

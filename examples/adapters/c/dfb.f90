@@ -20,6 +20,7 @@ module dfb
     integer(c_size_t) :: struct_size
     integer(c_int) :: width, height, blend, format, depth, display_rank, threads
     real(c_float) :: background(4)
+    integer(c_int) :: timeout_ms
   end type
 
   ! The pointers by c_loc() of arrays of integer(c_int8_t) or real(c_float).

@@ -64,6 +64,10 @@ typedef struct dfb_config {
     // thread-safe. 0: one for each core that this rank has for itself. 1 by default.
     int threads;
     float background[4]; // premultiplied linear RGBA behind everything; 0, 0, 0, 0
+    // 0: a picture may take for ever. Else the limit in milliseconds, from when this rank has drawn or given its part:
+    // DFB_FRAME_FAILED if it is not complete by then; DFB_TRANSPORT_FAILED after twice the time if a rank does not
+    // answer at all, as one that is lost. The error says whom it waited for. 0 by default. Other calls have no limit.
+    int timeout_ms;
 } dfb_config;
 
 // Sets `config` to the defaults above, for a picture of this size.
@@ -73,7 +77,7 @@ void dfb_config_init_sized(dfb_config* config, size_t struct_size, int width, in
 // Makes a framebuffer on a duplicate of the communicator, with the calling thread, and stores it in *framebuffer; NULL
 // if there was an error. MPI must have been initialised, at any thread level. Collective; waits for all ranks.
 // DFB_INVALID_ARGUMENT on all ranks if the configuration is wrong on any rank or differs between ranks. Backgrounds
-// that differ fail each picture.
+// or time-outs that differ fail each picture.
 int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
 // Does so with a handle of Fortran: that of `use mpi`, or the mpi_val of one of `use mpi_f08`.
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer);

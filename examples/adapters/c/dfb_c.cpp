@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -237,6 +238,9 @@ struct dfb_framebuffer {
             frameBufferConfig = configOf(config);
             frameBufferConfig.executor = executorOf(config, *connection);
             std::copy_n(config.background, 4, frame.background.begin());
+            if (config.timeout_ms < 0)
+                refuse("a timeout_ms of " + std::to_string(config.timeout_ms));
+            frame.timeout = std::chrono::milliseconds(config.timeout_ms);
         } catch (const std::exception& e) {
             // The library tells all ranks what an owner map has thrown on one.
             frameBufferConfig = dfb::FrameBufferConfig(1, 1);
