@@ -207,7 +207,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
             e.poolBytes += batches * batchBytes + blockOf(record);
             if (owns[static_cast<std::size_t>(rank)])
                 e.done.add(32);
-            e.verdict.add(173);
+            e.verdict.add(241);
             e.consensus.add(28);
         } else {
             e.poolBytes += blockOf(bytesPerOutput * layout.width() * layout.height());
@@ -223,7 +223,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         }
         for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1) // those below it in the tree
             if (rank + bit < ranks) {
-                e.verdict.add(173);
+                e.verdict.add(241);
                 e.consensus.add(28);
             }
         e.poolBytes += blockOf(mostInput) + (64 << 10); // and what is small, in blocks
