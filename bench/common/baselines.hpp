@@ -236,6 +236,7 @@ inline std::vector<double> collect(MPI_Comm comm, const std::vector<double>& sam
 struct Arguments {
     bool quick = false;
     std::string only; // digits of the parts to run; empty: all
+    std::string trace;
 
     Arguments(int argc, char** argv, const char* usage)
     {
@@ -243,6 +244,8 @@ struct Arguments {
             const std::string argument = argv[i];
             if (argument == "--quick") {
                 quick = true;
+            } else if (argument == "--trace" && i + 1 < argc) {
+                trace = argv[++i];
             } else if (argument.find_first_not_of("123456789") == std::string::npos) {
                 only += argument;
             } else {

@@ -2,7 +2,8 @@
 // and a plain loop in float, on the same partial images in the same run, frame by frame in turn. And what samples cost
 // in a scene with noise.
 //   mpirun -n 4 bench_error_time [--size 1024x1024] [--frames 21] [--json FILE] [--table FILE] [--commit
-//   ID]
+//   ID] [--trace FILE]
+// --trace: of dfb's first system.
 #include "systems.hpp"
 
 #include <fstream>

@@ -7,13 +7,13 @@
 #include "memory_limit.hpp"
 #include "radix_k.hpp"
 #include "results.hpp"
+#include "trace.hpp"
 #ifdef DFB_BENCH_HAS_ICET
 #include "icet.hpp"
 #endif
 
 #include <dfb/dfb.hpp>
 #include <dfb/testing/error_report.hpp>
-#include <dfb/trace_file.hpp>
 
 #include <algorithm>
 #include <array>
@@ -81,7 +81,7 @@ struct Compositor {
     std::function<std::pair<std::int64_t, std::int64_t>()> traffic; // of this rank: bytes, messages
     bool trafficIsOfAll = false;
     std::function<double()> peakMemory;
-    std::function<void(const std::string& path)> writeTrace; // collective; none without a trace
+    std::function<void()> writeTrace; // collective; none without a trace
 };
 
 struct System {
@@ -235,8 +235,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
                 ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
             else if (!settings.hasDefaultThreads)
                 ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
-            const auto trace = inputs.trace.empty() ? nullptr : std::make_shared<dfb::TraceFile>();
-            ownConfig.trace = trace;
+            const Trace trace(inputs.trace);
+            ownConfig.trace = trace.sink;
             const auto r = std::make_shared<Renderer>(connection, ownConfig);
             for (const View& view : inputs.views)
                 r->images.emplace_back(r->fb, view.image, settings);
@@ -271,8 +271,8 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
             compositor.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
             compositor.trafficIsOfAll = true;
             compositor.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
-            if (trace)
-                compositor.writeTrace = [r, trace](const std::string& path) { trace->write(r->fb, path); };
+            if (trace.sink)
+                compositor.writeTrace = [r, trace] { trace.write(r->fb); };
             return compositor;
         };
         systems.push_back(std::move(s));
@@ -523,8 +523,10 @@ inline void measureInTurns(Inputs& inputs, std::vector<System>& systems, int fra
         takeResult(comm, s, exact);
     const auto traced = std::find_if(systems.begin(), systems.end(),
                                      [](const System& s) { return s.compositor.writeTrace != nullptr; });
-    if (traced != systems.end())
-        traced->compositor.writeTrace(std::exchange(inputs.trace, std::string()));
+    if (traced != systems.end()) {
+        traced->compositor.writeTrace();
+        inputs.trace.clear();
+    }
     for (System& s : systems) {
         s.compositor = {};
         s.start = {}; // may hold memory too

@@ -2,10 +2,10 @@
 // holds more than its part (in figure 6 each has all of it, as is the nature of image-parallel rendering).
 //   mpirun -n 8 bench_paper --figure 6|7|8|9|10 [--ranks 1,2,4,8] [--size 512x512,...] [--views 12] [--repeats 1]
 //     [--scale 1] [--seed 1] [--threads 1] [--compress never|always|auto] [--check VIEWS] [--json FILE] [--svg FILE]
-//     [--table FILE] [--ppm FILE] [--commit ID]
+//     [--table FILE] [--ppm FILE] [--trace FILE] [--commit ID]
 // Each number of ranks is measured on the first so many of those that there are; the others sleep meanwhile. --check
 // compares the images from so many views with those of another distribution of the same scene. --scale: of the data's
-// resolution along each side.
+// resolution along each side. --trace: of dfb, with the last number of ranks and size.
 #include "marched_bricks.hpp"
 #include "paper_figures.hpp"
 #include "paper_particles.hpp"
@@ -34,16 +34,17 @@ struct Options {
     double scale = 1;
     std::vector<int> ranks; // ascending
     std::vector<std::array<int, 2>> sizes{{512, 512}};
-    std::string json, svg, table, ppm, commit, compress = "never";
+    std::string json, svg, table, ppm, trace, commit, compress = "never";
 
     int scaled(int count) const { return std::max(8, static_cast<int>(std::lround(count * scale))); }
 
-    dfb::FrameBufferConfig config(int width, int height) const
+    dfb::FrameBufferConfig config(int width, int height, const bench::Trace& traced) const
     {
         dfb::FrameBufferConfig c;
         c.image.width = width;
         c.image.height = height;
         c.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+        c.trace = traced.sink;
 #if defined(DFB_HAS_SNAPPY)
         if (compress != "never")
             c.messages.codec = std::make_shared<dfb::SnappyCodec>();
@@ -133,7 +134,8 @@ private:
         }
         const PaperScene scene = this->scene();
         sceneName_ = scene.name;
-        bench::PaperStage stage(comm, scene, o_.config(width, height), o_.views);
+        const bench::Trace trace(o_.trace);
+        bench::PaperStage stage(comm, scene, o_.config(width, height, trace), o_.views);
         std::vector<PaperWay> ways = waysOf(stage, ranks, dfb::OutputFormat::SRGBA8);
         if (o_.checked > 0 || !o_.ppm.empty()) {
             std::vector<PaperWay> exact = waysOf(stage, ranks, dfb::OutputFormat::RGBA32F);
@@ -145,6 +147,7 @@ private:
                 stage.forgetUncut();
         }
         bench::measureWays(comm, ways, o_.views, o_.repeats);
+        stage.write(trace);
         keep(ways, scene.name, ranks, width, height);
     }
 
@@ -169,7 +172,8 @@ private:
     void measureMarched(MPI_Comm comm, int ranks, int width, int height)
     {
         sceneName_ = "64^3 bricks";
-        bench::MarchedBricks bricks(comm, o_.config(width, height), o_.views);
+        const bench::Trace trace(o_.trace);
+        bench::MarchedBricks bricks(comm, o_.config(width, height, trace), o_.views);
         std::vector<bench::MarchedSystem> systems{bricks.sorted("dfb: sorted"), bricks.inOrder("dfb: in order")};
 #ifdef DFB_BENCH_HAS_ICET
         for (const bench::IceTStrategy& strategy : bench::icetStrategies())
@@ -209,6 +213,7 @@ private:
         };
         check(ways, ranks, width, height, reference, 2e-5, false);
         bench::measureWays(comm, ways, o_.views, o_.repeats);
+        bricks.write(trace);
         keep(ways, sceneName_, ranks, width, height);
     }
 
@@ -302,7 +307,7 @@ Options optionsOf(int argc, char** argv)
         "usage: mpirun -n RANKS bench_paper --figure 6|7|8|9|10 [--ranks N,...] [--size WxH,...] [--views N] "
         "[--repeats N] [--scale S] [--seed K] [--threads N] [--compress never|always|auto] [--check VIEWS] [--json "
         "FILE] [--svg FILE] "
-        "[--table FILE] [--ppm FILE] [--commit ID]";
+        "[--table FILE] [--ppm FILE] [--trace FILE] [--commit ID]";
     bench::readOptions(
         argc, argv, usage,
         {{"--figure", number(o.figure, 6)},
@@ -324,6 +329,7 @@ Options optionsOf(int argc, char** argv)
          {"--svg", bench::readText(o.svg)},
          {"--table", bench::readText(o.table)},
          {"--ppm", bench::readText(o.ppm)},
+         {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}});
     if (o.figure < 6 || o.figure > 10) {
         std::printf("%s\n", usage);

@@ -5,6 +5,7 @@
 #include "brick_grid.hpp"
 #include "paper_brick.hpp"
 #include "paper_measure.hpp"
+#include "trace.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -12,6 +13,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <functional>
 #include <limits>
 #include <map>
 #include <memory>
@@ -27,8 +29,8 @@ public:
     // The communicator remains the caller's; `config` has all but the format.
     PaperStage(MPI_Comm comm, PaperScene scene, dfb::FrameBufferConfig config, int views)
         : scene_(std::move(scene)), connection_(dfb::connect<dfb::MpiTransport>(comm)), config_(std::move(config)),
-          cameras_(orbitOf(views, unit, 1.5f)), width_(config_.image.width), height_(config_.image.height), grid_(sizeOf(comm)),
-          ranks_(sizeOf(comm))
+          cameras_(orbitOf(views, unit, 1.5f)), width_(config_.image.width), height_(config_.image.height),
+          grid_(sizeOf(comm)), ranks_(sizeOf(comm))
     {
         MPI_Comm_rank(comm, &rank_);
     }
@@ -105,6 +107,9 @@ public:
 
     void forgetUncut() { bricks_.erase(whole); }
 
+    // Of what all ways did, if its sink is in `config`. Collective.
+    void write(const Trace& trace) const { write_(trace); }
+
 private:
     static constexpr dfb::Vec3 unit{1, 1, 1};
     static constexpr std::uint32_t whole = std::numeric_limits<std::uint32_t>::max(); // the id of an uncut scene
@@ -156,6 +161,7 @@ private:
         config.image.format = format;
         const auto fb = std::make_shared<FrameBuffer>(connection_, config);
         const auto report = std::make_shared<dfb::FrameReport>();
+        write_ = [fb](const Trace& trace) { trace.write(*fb); };
         PaperWay way;
         way.system = system;
         way.config = name;
@@ -185,6 +191,7 @@ private:
     BrickGrid grid_;
     int ranks_;
     std::map<std::uint32_t, std::unique_ptr<PaperBrick>> bricks_; // that this rank holds, by id
+    std::function<void(const Trace&)> write_;                     // through the last framebuffer that was made
 };
 
 } // namespace bench

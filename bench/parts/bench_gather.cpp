@@ -1,7 +1,9 @@
 // The way of finished tiles to the display rank: in batches while others still render, or with one MPI_Gatherv.
 // Each rank renders the tiles that it owns, with renderers that cost nothing, time or only patience.
 //   mpirun -n 2 bench_gather        or -n 4, -n 8; --quick; a list of parts such as 12 takes only those image sizes
+// --trace FILE: of dfb, with the last renderer and size.
 #include "baselines.hpp"
+#include "trace.hpp"
 
 #include <dfb/comm/mpi_transport.hpp>
 #include <dfb/distributed_framebuffer.hpp>
@@ -86,8 +88,8 @@ private:
 class GathervImage {
 public:
     GathervImage(const FrameBuffer& fb, MPI_Comm comm)
-        : comm_(comm), layout_(fb.layout()), format_(fb.config().image.format), own_(fb.ownedTiles()), tilesOf_(fb.size()),
-          display_(fb.isDisplayRank())
+        : comm_(comm), layout_(fb.layout()), format_(fb.config().image.format), own_(fb.ownedTiles()),
+          tilesOf_(fb.size()), display_(fb.isDisplayRank())
     {
         int offset = 0;
         for (int tile = 0; tile < layout_.tileCount(); ++tile)
@@ -203,9 +205,9 @@ struct Case {
 
 class GatherBench {
 public:
-    GatherBench(MPI_Comm comm, bool quick)
-        : comm_(comm), quick_(quick), stepsPerSecond_(stepsPerSecond(comm)), tails_(head()), frames_(head()),
-          cpu_(head())
+    GatherBench(MPI_Comm comm, bool quick, std::string trace)
+        : comm_(comm), quick_(quick), trace_(std::move(trace)), stepsPerSecond_(stepsPerSecond(comm)), tails_(head()),
+          frames_(head()), cpu_(head())
     {
         MPI_Comm_rank(comm, &rank_);
     }
@@ -219,6 +221,8 @@ public:
         config.image.width = config.image.height = c.side;
         config.image.format = c.format;
         config.executor = executor;
+        const bench::Trace trace(trace_);
+        config.trace = trace.sink;
         FrameBuffer fb(connection, config);
         dfb::ImageParallelLoop loop(fb);
         GathervImage plain(fb, comm_);
@@ -250,6 +254,7 @@ public:
             if (round < 0)
                 requireSame(fb, plain);
         }
+        trace.write(fb);
         const std::string image =
             std::to_string(c.side) + "² " + (c.format == dfb::OutputFormat::RGBA8 ? "RGBA8" : "RGBA32F");
         tails_.add(rowOf(image, c.cost, tails));
@@ -306,6 +311,7 @@ private:
     MPI_Comm comm_;
     int rank_ = 0;
     bool quick_;
+    std::string trace_;
     double stepsPerSecond_;
     Table tails_, frames_, cpu_;
 };
@@ -314,9 +320,9 @@ private:
 
 int main(int argc, char** argv)
 {
-    const bench::Arguments arguments(
-        argc, argv,
-        "usage: mpirun -n RANKS bench_gather [--quick] [PARTS]   PARTS: 1 for 1024², 2 for 2048², 3 for 4096²");
+    const bench::Arguments arguments(argc, argv,
+                                     "usage: mpirun -n RANKS bench_gather [--quick] [--trace FILE] [PARTS]   PARTS: 1 "
+                                     "for 1024², 2 for 2048², 3 for 4096²");
     int level = 0;
     MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
     bench::shortenNaps();
@@ -326,7 +332,7 @@ int main(int argc, char** argv)
         if (rank == 0)
             std::printf("bench_gather: %s. Medians ± median absolute deviations. A worker per rank.\n",
                         bench::environment(MPI_COMM_WORLD).c_str());
-        GatherBench benchmark(MPI_COMM_WORLD, arguments.quick);
+        GatherBench benchmark(MPI_COMM_WORLD, arguments.quick, arguments.trace);
         for (int part = 0; part < 3; ++part)
             if (arguments.wants(static_cast<char>('1' + part)))
                 for (const auto format : {dfb::OutputFormat::RGBA8, dfb::OutputFormat::RGBA32F})

@@ -1,10 +1,13 @@
 // What the messaging layer costs beside plain MPI: latency and bandwidth, the processor time of waiting, what is taken
 // from a thread that computes, and how messages move when there are more ranks than cores.
 //   mpirun -n 2 bench_messaging        or -n 8; --quick; a list of parts such as 14 runs only those
+// --trace FILE: of what goes with credit in part 1; the other messages are below what a trace is told of.
 #include "baselines.hpp"
+#include "trace.hpp"
 
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/comm/mpi_transport.hpp>
+#include <dfb/image_compositor.hpp>
 
 #include <array>
 #include <atomic>
@@ -267,10 +270,10 @@ std::vector<double> streamConnection(const Group& pair, Connection& connection, 
 class CreditEnd final : private dfb::detail::MailboxOwner {
 public:
     CreditEnd(const std::shared_ptr<Connection>& connection, const std::shared_ptr<dfb::Executor>& executor,
-              const Stream& stream)
+              const Stream& stream, dfb::TraceSink* trace)
         : stream_(stream), connection_(connection),
           mailbox_(connection, executor,
-                   std::max(std::size_t{64} << 20, 4 * (stream.byteCount + sizeof(MessageHeader))), *this)
+                   std::max(std::size_t{64} << 20, 4 * (stream.byteCount + sizeof(MessageHeader))), *this, trace)
     {
         connection_->expectMessages(true);
         mailbox_.start();
@@ -326,9 +329,10 @@ private:
 };
 
 std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Connection>& connection,
-                                 const std::shared_ptr<dfb::Executor>& executor, const Stream& stream)
+                                 const std::shared_ptr<dfb::Executor>& executor, const Stream& stream,
+                                 dfb::TraceSink* trace)
 {
-    CreditEnd end(connection, executor, stream);
+    CreditEnd end(connection, executor, stream, trace);
     const Connection::Hurry hurry(*connection); // as in Frame::end()
     bench::meet(pair.comm);
     const double start = bench::now();
@@ -340,7 +344,7 @@ std::vector<double> streamCredit(const Group& pair, const std::shared_ptr<Connec
     return {rate};
 }
 
-void latencyAndBandwidth(const Group& pair, bool quick)
+void latencyAndBandwidth(const Group& pair, bool quick, const bench::Trace& trace)
 {
     const auto connection = dfb::connect<dfb::MpiTransport>(pair.comm);
     const auto executor = std::make_shared<dfb::ThreadExecutor>(1);
@@ -362,7 +366,7 @@ void latencyAndBandwidth(const Group& pair, bool quick)
             append(times[3], pingPongInReceive(pair, *connection, byteCount, trips));
             append(times[4], pingPongInThread(pair, *connection, byteCount, trips));
             append(speeds[3], streamConnection(pair, *connection, stream));
-            append(speeds[4], streamCredit(pair, connection, executor, stream));
+            append(speeds[4], streamCredit(pair, connection, executor, stream, trace.sink.get()));
         }
         std::vector<std::string> timeRow{bench::byteText(byteCount)}, speedRow = timeRow;
         for (std::size_t i = 0; i < times.size(); ++i) {
@@ -375,6 +379,12 @@ void latencyAndBandwidth(const Group& pair, bool quick)
     if (pair.rank == 0) {
         latency.print("1a. Latency, ranks 0 and 1, one way [us]");
         rates.print("1b. Bandwidth, rank 0 to rank 1, up to 16 messages or 64 MiB under way [MB/s]");
+    }
+    if (trace.sink) { // which is written through something that makes pictures
+        dfb::FrameBufferConfig config(64, 64);
+        config.trace = trace.sink;
+        dfb::ImageCompositor compositor(connection, dfb::ImageBlend::Nearest, config);
+        trace.write(compositor);
     }
 }
 
@@ -781,7 +791,8 @@ void hops(const Group& all, bool quick)
 int main(int argc, char** argv)
 {
     const bench::Arguments arguments(
-        argc, argv, "usage: mpirun -n RANKS bench_messaging [--quick] [PARTS]   2 ranks at least; PARTS as in 14");
+        argc, argv,
+        "usage: mpirun -n RANKS bench_messaging [--quick] [--trace FILE] [PARTS]   2 ranks at least; PARTS as in 14");
     int level = 0;
     MPI_Init_thread(&argc, &argv, MPI_THREAD_MULTIPLE, &level);
     bench::shortenNaps();
@@ -802,7 +813,7 @@ int main(int argc, char** argv)
                 MPI_Group_incl(everybody, 2, members.data(), &firstTwo);
                 MPI_Comm pair = MPI_COMM_NULL;
                 MPI_Comm_create_group(all.comm, firstTwo, 0, &pair);
-                latencyAndBandwidth(Group(pair), arguments.quick);
+                latencyAndBandwidth(Group(pair), arguments.quick, bench::Trace(arguments.trace));
                 MPI_Comm_free(&pair);
                 MPI_Group_free(&firstTwo);
                 MPI_Group_free(&everybody);

@@ -3,9 +3,9 @@
 // rendering without any compositing, which both are compared with: on cores that are all busy what is done while others
 // render only moves the end of rendering.
 //   mpirun -n 4 bench_overlap [--size 512x512,...] [--views 12] [--json FILE] [--table FILE] [--commit ID] [--only
-//   TEXT] [--in-a-row TIMES]
+//   TEXT] [--trace FILE] [--in-a-row TIMES]
 // --in-a-row: how many frames a second come out where all views follow each other without a pause, with 1, 2 and 3 of
-// dfb's frames open at once, so many times in turns.
+// dfb's frames open at once, so many times in turns. --trace: of single frames, in the last size.
 #include "marched_bricks.hpp"
 
 #include <array>
@@ -44,8 +44,8 @@ public:
         config.image.width = width;
         config.image.height = height;
         config.executor = std::make_shared<dfb::CallerExecutor>(); // one thread per rank, as IceT has
-        const auto trace = o_.trace.empty() ? nullptr : std::make_shared<dfb::TraceFile>();
-        config.trace = trace;
+        const bench::Trace trace(o_.trace);
+        config.trace = trace.sink;
         bench::MarchedBricks bricks(comm_, config, o_.views, false);
         std::vector<MarchedSystem> systems{bricks.alone(), bricks.inOrder("dfb")};
 #ifdef DFB_BENCH_HAS_ICET
@@ -82,8 +82,7 @@ public:
         for (const MarchedSystem& s : systems)
             traffic.push_back(s.traffic ? s.traffic() : std::array<double, 2>{});
         report(systems, traffic, width, height, largest);
-        if (trace)
-            bricks.writeTrace(*trace, o_.trace);
+        bricks.write(trace);
     }
 
     // All views in a row.

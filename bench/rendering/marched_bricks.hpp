@@ -158,8 +158,8 @@ public:
     }
 
     const std::vector<MarchedView>& views() const { return views_; }
-    // Of what inOrder() and inFlight() did, if `trace` is in `config`. Collective.
-    void writeTrace(dfb::TraceFile& trace, const std::string& path) { trace.write(*ordered_, path); }
+    // Of what dfb did, if its sink is in `config`. Collective.
+    void write(const Trace& trace) { trace.write(*ordered_); }
     dfb::Box3 boxOf(int rank) const { return grid_.box(rank, grid_.size()); }
 
     MarchedSystem alone()

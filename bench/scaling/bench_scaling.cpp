@@ -2,15 +2,17 @@
 // ranks that are threads of this process, beside the formulas of bench/README.md, of which they must not differ; then
 // an estimate of a frame's time on up to 16,384 ranks in the LogGP model, beside binary swap and radix-k. No MPI.
 //   bench_scaling [--ranks 2,4,...] [--size 2048x2048] [--scenes bricks,discs] [--frames 3] [--quick]
-//   [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
+//   [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] [--trace FILE]
+//   [--commit ID]
 // `bricks`: each rank one brick of a cube, whose image is the smaller the more ranks there are. `discs`: each rank a
-// disc that is as large whatever their number. L, o and g are in us, G in ns a byte. The exit status is 1 if a count is
-// not that of its formula.
+// disc that is as large whatever their number. L, o and g are in us, G in ns a byte. --trace: of the first scene, with
+// the first number of ranks. The exit status is 1 if a count is not that of its formula.
 #include "counted_transport.hpp"
 #include "options.hpp"
 #include "plot.hpp"
 #include "results.hpp"
 #include "scenes.hpp"
+#include "trace.hpp"
 
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/sort_last.hpp>
@@ -268,7 +270,9 @@ struct PixelCamera {
     }
 };
 
-Measured measure(const std::vector<bench::PartialImage>& images, int width, int height, int frames)
+// `tracePath`: empty without a trace.
+Measured measure(const std::vector<bench::PartialImage>& images, int width, int height, int frames,
+                 const std::string& tracePath)
 {
     const auto ranks = static_cast<int>(images.size());
     const auto counters = std::make_shared<bench::Counters>(ranks);
@@ -284,6 +288,8 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         config.image.width = width;
         config.image.height = height;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        const bench::Trace trace(tracePath);
+        config.trace = trace.sink;
         FrameBuffer fb(connection, config);
         dfb::World world;
         const auto& v = image.viewport;
@@ -315,6 +321,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
             counted.poolBytes = static_cast<std::int64_t>(connection->pool()->peakBytes());
         }
         counters->meet();
+        trace.write(fb);
     });
     return result;
 }
@@ -450,7 +457,7 @@ struct Options {
     Network hpc{"hpc", 3.7, 0.2, 0.005, 0.04e-3};
     // CPU time of bench_compositing, 4 ranks, bricks, to 8 bit, by the pixels that are worked on: float32, and radix-k.
     PixelCosts costs{13, 7};
-    std::string json, svg, table, commit;
+    std::string json, svg, table, trace, commit;
 };
 
 class Bench {
@@ -529,7 +536,7 @@ private:
             }
             const std::vector<Expected> expected =
                 expectedOf(inputs, layout, dfb::FrameBufferConfig().messages.poolBytes);
-            const Measured m = measure(images, width(), height(), std::max(2, o_.frames));
+            const Measured m = measure(images, width(), height(), std::max(2, o_.frames), std::exchange(o_.trace, {}));
             MessageCount all, formula, credits;
             std::int64_t mostCredits = 0;
             for (std::size_t r = 0; r < images.size(); ++r) {
@@ -699,7 +706,7 @@ Options optionsOf(int argc, char** argv)
         argc, argv,
         "usage: bench_scaling [--ranks 2,4,...] [--size WxH, multiples of 64] [--scenes bricks,discs] [--frames N] "
         "[--quick] [--rig L,o,g,G] [--hpc L,o,g,G] [--pixel-ns DFB,PLAIN] [--json FILE] [--svg FILE] [--table FILE] "
-        "[--commit ID]",
+        "[--trace FILE] [--commit ID]",
         {{"--ranks", readRanks},
          {"--size", readSize},
          {"--scenes", readScenes},
@@ -713,6 +720,7 @@ Options optionsOf(int argc, char** argv)
          {"--json", bench::readText(o.json)},
          {"--svg", bench::readText(o.svg)},
          {"--table", bench::readText(o.table)},
+         {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}},
         {{"--quick", &o.quick}});
     if (o.ranks.empty())

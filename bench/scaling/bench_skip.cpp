@@ -1,12 +1,14 @@
 // What a frame does not do: what it costs as less of the image is active, and which work is left out altogether. Each
 // claim is a line: what was measured, its limit, and whether it holds. 4 ranks are threads of this process; no MPI.
 //   bench_skip [--size 1024x1024] [--frames 11] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit ID]
-//   bench_skip --frames-of full|empty [--frames N] [--size ...]     N frames of that and nothing else, for profilers
+//   bench_skip --frames-of full|empty [--frames N] [--size ...] [--trace FILE]
+//                                                       N frames of that and nothing else, for profilers
 // The exit status is 1 if a claim of counts does not hold. Times are shown, as a machine may have other work.
 #include "counted_transport.hpp"
 #include "options.hpp"
 #include "plot.hpp"
 #include "results.hpp"
+#include "trace.hpp"
 
 #include <dfb/distributed_framebuffer.hpp>
 #include <dfb/ops/progressive.hpp>
@@ -123,6 +125,7 @@ struct Settings {
     bool knowsBounds = true; // a renderer knows where it has pixels; else it has a look at every tile
     dfb::ChannelMask aux = 0;
     double renderUs = 0; // CPU time of rendering a tile
+    std::string trace{}; // the file for one; empty: none
 };
 
 MessageCount countOf(const bench::Counters& counters, std::initializer_list<Kind> kinds)
@@ -157,6 +160,8 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
         config.image.height = s.height;
         config.image.aux = s.aux;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        const bench::Trace trace(s.trace);
+        config.trace = trace.sink;
         FrameBuffer fb(bench::CountedTransport::Communicator{communicator, counters}, config);
         const dfb::World world = worldOf(rank, s.knowsBounds ? picture.region() : dfb::Region{0, 0, s.width, s.height});
         dfb::DataParallelLoop loop(fb, world);
@@ -199,6 +204,8 @@ FrameCost framesOf(const Picture& picture, const Settings& s)
             for (const bench::Traffic& traffic : counters->sent)
                 cost.all += frame + 1 == s.frames ? traffic.all() : MessageCount();
         }
+        counters->meet();
+        trace.write(fb);
     });
     cost.inputs = countOf(*counters, {Kind::Fragment});
     cost.manifests = countOf(*counters, {Kind::Manifest, Kind::ManifestAck});
@@ -415,7 +422,7 @@ struct Options {
     std::vector<std::array<int, 2>> sizes{{1024, 1024}};
     int frames = 0;
     bool quick = false;
-    std::string framesOf, json, svg, table, commit;
+    std::string framesOf, json, svg, table, trace, commit;
 };
 
 std::string text(const char* form, double value)
@@ -651,14 +658,16 @@ Options optionsOf(int argc, char** argv)
     };
     bench::readOptions(
         argc, argv,
-        "usage: bench_skip [--size WxH] [--frames N] [--quick] [--frames-of full|empty] [--json FILE] [--svg FILE] "
-        "[--table FILE] [--commit ID]",
+        "usage: bench_skip [--size WxH] [--frames N] [--quick] [--json FILE] [--svg FILE] [--table FILE] [--commit "
+        "ID]\n"
+        "       bench_skip --frames-of full|empty [--size WxH] [--frames N] [--trace FILE]",
         {{"--size", readSize},
          {"--frames", [&o](const std::string& value) { return (o.frames = std::atoi(value.c_str())) > 0; }},
          {"--frames-of", readContent},
          {"--json", bench::readText(o.json)},
          {"--svg", bench::readText(o.svg)},
          {"--table", bench::readText(o.table)},
+         {"--trace", bench::readText(o.trace)},
          {"--commit", bench::readText(o.commit)}},
         {{"--quick", &o.quick}});
     if (o.frames == 0)
@@ -675,6 +684,7 @@ int main(int argc, char** argv)
         return Bench(o).run();
     Settings s;
     s.width = o.sizes.front()[0], s.height = o.sizes.front()[1], s.frames = o.frames;
+    s.trace = o.trace;
     const FrameCost cost = framesOf<dfb::AlphaBlend>(Picture(s.width, s.height, o.framesOf == "full" ? 1 : 0), s);
     std::printf("%d frames, %s: the last sent %lld bytes in %lld messages\n", o.frames, o.framesOf.c_str(),
                 static_cast<long long>(cost.all.bytes), static_cast<long long>(cost.all.messages));
