@@ -344,7 +344,7 @@ public:
         FrameReport report;
         report.frame = open_.number();
         ending.time = Clock::now();
-        report.totalMs = static_cast<double>(std::chrono::nanoseconds(*ending.time - beginTime_).count()) / nsPerMs;
+        report.totalMs = static_cast<double>(std::chrono::nanoseconds(ending.time - beginTime_).count()) / nsPerMs;
         report.renderMs = static_cast<double>(renderNs_) / nsPerMs;
         report.compositingOverheadMs = report.totalMs - report.renderMs;
         report.tilesTotal = layout().tileCount();
@@ -425,12 +425,12 @@ private:
     // Tells the trace of the frame when it has ended, in whatever way.
     struct EndOfFrame {
         FrameEngine& engine;
-        std::optional<Clock::time_point> time{}; // nothing: when this is destroyed
+        Clock::time_point time{}; // not set: when this is destroyed
 
         ~EndOfFrame()
         {
             if (engine.config_.trace)
-                engine.traceFrame(time.value_or(Clock::now()));
+                engine.traceFrame(time == Clock::time_point() ? Clock::now() : time);
         }
     };
 
