@@ -115,58 +115,60 @@ public:
     }
 
     // Collective: `parts` has one for each rank and, behind these, one for all. Returns what each rank has sent to this
-    // one, by rank: its part and then that for all. They travel in rounds, so that a rank does not hold what is for
-    // others; but all see them pass by.
+    // one, by rank: its part and then that for all. They travel in rounds, of which a rank keeps what is for it, and
+    // parts that are through are gone. What a rank has for itself stays where it is.
     std::vector<Bytes> exchange(std::vector<Bytes> parts) const
     {
-        const std::size_t ranks = static_cast<std::size_t>(size_);
-        std::vector<std::uint64_t> sizes;
-        for (const Bytes& part : parts)
-            sizes.push_back(part.size());
-        Bytes stream;
-        const std::vector<std::uint64_t> all = gatherOf<std::uint64_t>([&] {
-            stream.reserve(static_cast<std::size_t>(std::accumulate(sizes.begin(), sizes.end(), std::uint64_t{0})));
-            for (Bytes& part : parts) {
-                stream.insert(stream.end(), part.begin(), part.end());
-                part = Bytes();
-            }
-            return sizes;
+        const std::size_t ranks = static_cast<std::size_t>(size_), own = static_cast<std::size_t>(rank_);
+        std::vector<Bytes> received(ranks);
+        // The parts of all ranks, which of each are one stream.
+        const std::vector<std::uint64_t> sizes = gatherOf<std::uint64_t>([&] {
+            received[own] = std::exchange(parts[own], Bytes());
+            received[own].insert(received[own].end(), parts.back().begin(), parts.back().end());
+            std::vector<std::uint64_t> mine;
+            for (const Bytes& part : parts)
+                mine.push_back(part.size());
+            return mine;
         });
         if (size_ == 1)
-            return {stream};
-        std::vector<Bytes> received(ranks);
-        std::vector<std::array<std::uint64_t, 2>> wanted; // of the stream of each rank, two sections
+            return received;
         std::uint64_t longest = 0;
-        for (std::size_t source = 0; source < ranks; ++source) {
-            const auto first = all.begin() + static_cast<std::ptrdiff_t>(source * (ranks + 1));
-            const std::uint64_t whole = std::accumulate(first, first + size_ + 1, std::uint64_t{0}),
-                                begin = std::accumulate(first, first + rank_, std::uint64_t{0});
-            wanted.push_back({begin, begin + first[rank_]});
-            wanted.push_back({whole - first[size_], whole});
-            longest = std::max(longest, whole);
-        }
         gatherOf<char>([&] { // nobody waits for a rank without memory
-            for (std::size_t source = 0; source < ranks; ++source)
-                received[source].reserve(static_cast<std::size_t>(wanted[2 * source][1] - wanted[2 * source][0]
-                                                                  + wanted[2 * source + 1][1]
-                                                                  - wanted[2 * source + 1][0]));
+            for (std::size_t source = 0; source < ranks; ++source) {
+                const auto first = sizes.begin() + static_cast<std::ptrdiff_t>(source * (ranks + 1));
+                longest = std::max(longest, std::accumulate(first, first + size_ + 1, std::uint64_t{0}));
+                if (source != own)
+                    received[source].reserve(static_cast<std::size_t>(first[rank_] + first[size_]));
+            }
             return std::vector<char>();
         });
-        const std::uint64_t most = std::max<std::uint64_t>(std::uint64_t{1} << 16, (std::uint64_t{8} << 20) / ranks);
+        // Calls f(part, from, to) for the bytes of parts of `source` that are [begin, end) of its stream.
+        const auto forParts = [&](std::size_t source, std::uint64_t begin, std::uint64_t end, const auto& f) {
+            std::uint64_t first = 0;
+            for (std::size_t part = 0; part <= ranks; ++part) {
+                const std::uint64_t size = sizes[source * (ranks + 1) + part];
+                const std::uint64_t from = std::max(begin, first), to = std::min(end, first + size);
+                if (from < to)
+                    f(part, static_cast<std::ptrdiff_t>(from - first), static_cast<std::ptrdiff_t>(to - first));
+                first += size;
+            }
+        };
+        const std::uint64_t most = std::max<std::uint64_t>(std::uint64_t{1} << 16, (std::uint64_t{1} << 20) / ranks);
         for (std::uint64_t done = 0; done < longest; done += most) {
-            const auto sliceOf = [done](const Bytes& bytes, std::uint64_t begin, std::uint64_t end) {
-                const auto at = [&](std::uint64_t i) {
-                    return bytes.begin() + static_cast<std::ptrdiff_t>(std::min<std::uint64_t>(i - done, bytes.size()));
-                };
-                return std::pair(at(std::max(begin, done)), at(std::max(end, done)));
-            };
-            const std::uint64_t begin = std::min<std::uint64_t>(done, stream.size()),
-                                end = std::min<std::uint64_t>(done + most, stream.size());
-            const std::vector<Bytes> slices = gather_(Bytes(stream.begin() + static_cast<std::ptrdiff_t>(begin),
-                                                            stream.begin() + static_cast<std::ptrdiff_t>(end)));
-            for (std::size_t i = 0; i < wanted.size(); ++i) {
-                const auto [from, to] = sliceOf(slices[i / 2], wanted[i][0], wanted[i][1]);
-                received[i / 2].insert(received[i / 2].end(), from, to);
+            Bytes slice;
+            forParts(own, done, done + most, [&](std::size_t part, std::ptrdiff_t from, std::ptrdiff_t to) {
+                slice.insert(slice.end(), parts[part].begin() + from, parts[part].begin() + to);
+                if (static_cast<std::size_t>(to) == parts[part].size())
+                    parts[part] = Bytes();
+            });
+            const std::vector<Bytes> slices = gather_(slice);
+            for (std::size_t source = 0; source < ranks; ++source) {
+                auto at = slices[source].begin();
+                forParts(source, done, done + most, [&](std::size_t part, std::ptrdiff_t from, std::ptrdiff_t to) {
+                    if (source != own && (part == own || part == ranks))
+                        received[source].insert(received[source].end(), at, at + (to - from));
+                    at += to - from;
+                });
             }
         }
         return received;

@@ -5,6 +5,7 @@
 #include <bricks.hpp>
 #include <scene_files.hpp>
 
+#include <algorithm>
 #include <cmath>
 #include <cstring>
 #include <limits>
@@ -59,6 +60,47 @@ TEST_CASE("Shares are equal runs that are all of it", "[loading]")
             }
             CHECK(next == count);
         }
+}
+
+TEST_CASE("What ranks send each other travels in short rounds, and what stays does not travel", "[loading]")
+{
+    const int ranks = 3;
+    const std::size_t forAll = 70000;
+    const auto part = [](int from, int to) { // of all, if `to` is the number of ranks
+        const std::size_t size = to == ranks ? forAll : from == to ? 3000000 : from == 1 && to == 2 ? 0 : 400000;
+        return Loaders::Bytes(size + static_cast<std::size_t>(from), static_cast<std::byte>(1 + from * 16 + to));
+    };
+    test::Exchange way(ranks);
+    struct Counts {
+        bool areRight = true;
+        std::size_t sent = 0, longest = 0;
+    };
+    const auto counts = ofRanks<Counts>(ranks, [&](const Loaders& loaders) {
+        Counts mine;
+        const auto gather = [&](const Loaders::Bytes& own) {
+            mine.sent += own.size();
+            mine.longest = std::max(mine.longest, own.size());
+            return way.gather(loaders.rank(), own);
+        };
+        const Loaders counted(loaders.rank(), ranks, gather, nullptr);
+        std::vector<Loaders::Bytes> parts;
+        for (int to = 0; to <= ranks; ++to)
+            parts.push_back(part(loaders.rank(), to));
+        const std::vector<Loaders::Bytes> received = counted.exchange(std::move(parts));
+        for (int from = 0; from < ranks; ++from) {
+            Loaders::Bytes expected = part(from, loaders.rank());
+            const Loaders::Bytes ofAll = part(from, ranks);
+            expected.insert(expected.end(), ofAll.begin(), ofAll.end());
+            mine.areRight = mine.areRight && received[static_cast<std::size_t>(from)] == expected;
+        }
+        return mine;
+    });
+    for (std::size_t rank = 0; rank < counts.size(); ++rank) {
+        CHECK(counts[rank].areRight);
+        CHECK(counts[rank].longest <= (std::size_t{1} << 20) / ranks);
+        // The sizes, and whether all is well, besides.
+        CHECK(counts[rank].sent <= (rank == 1 ? 1 : 2) * std::size_t{400000} + forAll + 1000);
+    }
 }
 
 TEST_CASE("A volume is the same for any number of ranks, and none reads more than its part", "[loading]")
