@@ -116,11 +116,12 @@ inline LatticeRows readLattice(const VolumeSource& source, const Loaders& loader
     };
     loaders.gatherOf<char>([&] {
         std::vector<std::byte> row(static_cast<std::size_t>(info.dims[0]) * size);
-        const RowReader read = source.open();
+        const BoxReader read = source.open();
         const auto [begin, end] = loaders.shareOf(rows(1) * rows(2));
         for (std::uint64_t i = begin; i < end; ++i) {
-            read(0, info.dims[0], static_cast<int>(i % rows(1)) * latticeStride(info, 1),
-                 static_cast<int>(i / rows(1)) * latticeStride(info, 2), row.data());
+            const int y = static_cast<int>(i % rows(1)) * latticeStride(info, 1),
+                      z = static_cast<int>(i / rows(1)) * latticeStride(info, 2);
+            read({0, y, z}, {info.dims[0], y + 1, z + 1}, row.data());
             for (std::size_t x = 0; x < lattice.length; ++x)
                 lattice.values.push_back(
                     voxelValue(info.type, row.data() + x * static_cast<std::size_t>(lattice.stride) * size));

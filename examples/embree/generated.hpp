@@ -51,9 +51,11 @@ VolumeSource generatedVolume(const Index3& dims, Field field)
     VolumeSource source;
     source.info.dims = dims;
     source.open = [field] {
-        return [field](int x0, int x1, int y, int z, std::byte* out) {
-            for (int x = x0; x < x1; ++x)
-                *out++ = static_cast<std::byte>(static_cast<unsigned char>(field(x, y, z) * 255.0f + 0.5f));
+        return [field](const Index3& lo, const Index3& hi, std::byte* out) {
+            for (int z = lo[2]; z < hi[2]; ++z)
+                for (int y = lo[1]; y < hi[1]; ++y)
+                    for (int x = lo[0]; x < hi[0]; ++x)
+                        *out++ = static_cast<std::byte>(static_cast<unsigned char>(field(x, y, z) * 255.0f + 0.5f));
         };
     };
     return source;

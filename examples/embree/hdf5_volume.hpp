@@ -112,7 +112,7 @@ private:
         if (!file_.isThere())
             fail("cannot be opened as an HDF5 file");
         const Hdf5Object access(H5Pcreate(H5P_DATASET_ACCESS), H5Pclose);
-        // Chunks of a layer or so, as rows are read one after the other.
+        // Chunks of a layer or so, as slabs of some layers are read one after the other.
         H5Pset_chunk_cache(access.id(), 12421, std::size_t{64} << 20, 1.0);
         data_ = Hdf5Object(H5Dopen2(file_.id(), name.c_str(), access.id()), H5Dclose);
         if (!data_.isThere())
@@ -238,11 +238,12 @@ inline VolumeSource openHdf5(const std::string& path, const Loaders& loaders = {
     source.name = path;
     source.info = info;
     source.open = [volume, info, isFloat, counter = loaders.readCounter()] {
-        return [volume, info, isFloat, counter](int x0, int x1, int y, int z, std::byte* out) {
-            volume->read({x0, y, z}, {x1 - x0, 1, 1}, out);
-            *counter += static_cast<std::uint64_t>(x1 - x0) * volume->fileBytes();
+        return [volume, info, isFloat, counter](const Index3& lo, const Index3& hi, std::byte* out) {
+            volume->read(lo, {hi[0] - lo[0], hi[1] - lo[1], hi[2] - lo[2]}, out);
+            const std::size_t voxels = voxelsOfBox(lo, hi);
+            *counter += voxels * volume->fileBytes();
             if (isFloat)
-                replaceNotFinite(out, x1 - x0, info.minimum);
+                replaceNotFinite(out, voxels, info.minimum);
         };
     };
     lookInto(source, loaders, lookOf);

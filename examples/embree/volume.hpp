@@ -1,7 +1,7 @@
 // Volume: a regular grid of scalars in a file, of which each rank reads a part.
 //
 // Files are headerless, with a name that tells what is in them, or have a header: volume_file.hpp, nrrd.hpp,
-// meta_image.hpp. Only the rows that are asked for are read: a rank reads its bricks, and its share of what
+// meta_image.hpp. Only the voxels that are asked for are read: a rank reads its bricks, and its share of what
 // all ranks must know of the whole volume (least and greatest value, where there is something to see).
 //
 // Values are normalised to [0, 1] over a range that is a function of the whole file, and so the same on all ranks:
@@ -49,8 +49,8 @@ struct VolumeInfo {
     Vec3 origin;                      // of the centre of the first voxel
 };
 
-// Copies the voxels [x0, x1) of row (y, z) to `out`. Throws std::runtime_error. Called by one thread at a time.
-using RowReader = std::function<void(int x0, int x1, int y, int z, std::byte* out)>;
+// Copies the voxels [lo, hi) to `out`, x fastest. Throws std::runtime_error. Called by one thread at a time.
+using BoxReader = std::function<void(const Index3& lo, const Index3& hi, std::byte* out)>;
 
 // Where there is something to see, as far as some rows of the volume show it, on a lattice of about 64^3 voxels.
 struct VisibleVoxels {
@@ -71,7 +71,7 @@ struct VoxelGrid {
 struct VolumeSource {
     VolumeInfo info;
     VolumeLook look;
-    std::function<RowReader()> open; // each call gives a reader of its own
+    std::function<BoxReader()> open; // each call gives a reader of its own
     std::string name;                // of the file
     Notes notes;                     // for the user
     // If they are known; the second only if there are no visible points.
@@ -125,10 +125,16 @@ inline void setRange(VolumeInfo& info, const VoxelRange& range, bool isFloat, co
     }
 }
 
-// Of floats in memory, `count` of them.
-inline void replaceNotFinite(std::byte* voxels, int count, float replacement)
+inline std::size_t voxelsOfBox(const Index3& lo, const Index3& hi)
 {
-    for (int i = 0; i < count; ++i, voxels += sizeof(float)) {
+    const auto extent = [&](std::size_t axis) { return static_cast<std::size_t>(hi[axis] - lo[axis]); };
+    return extent(0) * extent(1) * extent(2);
+}
+
+// Of floats in memory, `count` of them.
+inline void replaceNotFinite(std::byte* voxels, std::size_t count, float replacement)
+{
+    for (std::size_t i = 0; i < count; ++i, voxels += sizeof(float)) {
         float value;
         std::memcpy(&value, voxels, sizeof value);
         if (!std::isfinite(value))
@@ -156,32 +162,38 @@ inline VolumeInfo describeVolume(std::istream& stream, VolumeFile& file, const L
     return info;
 }
 
-// Reads rows of a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
-inline RowReader rowReader(std::shared_ptr<std::istream> stream, const VolumeFile& file, const VolumeInfo& info,
+// Reads from a stream that describeVolume() has accepted. Adds what it reads to the counter, if there is one.
+inline BoxReader boxReader(std::shared_ptr<std::istream> stream, const VolumeFile& file, const VolumeInfo& info,
                            std::shared_ptr<std::uint64_t> bytesRead = nullptr)
 {
-    std::streamoff position = -1;
-    return [stream, file, minimum = info.minimum, bytesRead, position,
-            stored = std::vector<std::byte>()](int x0, int x1, int y, int z, std::byte* out) mutable {
-        const auto wide = [](int i) { return static_cast<std::streamoff>(i); };
+    return [stream, file, minimum = info.minimum, bytesRead, position = std::streamoff(-1),
+            stored = std::vector<std::byte>()](const Index3& lo, const Index3& hi, std::byte* out) mutable {
         const VoxelFormat& format = file.format;
-        const auto size = static_cast<std::streamoff>(format.bytes());
-        const std::streamoff begin = ((wide(z) * file.dims[1] + y) * file.dims[0] + x0) * size + file.begin;
-        const std::streamsize bytes = (wide(x1) - x0) * size;
-        if (!format.isAsInMemory())
-            stored.resize(static_cast<std::size_t>(bytes));
-        if (position != begin) // a seek throws the stream's buffer away
-            stream->seekg(begin);
-        if (!stream->read(reinterpret_cast<char*>(format.isAsInMemory() ? out : stored.data()), bytes))
-            throw std::runtime_error(file.path + ": reading row y=" + std::to_string(y) + " z=" + std::to_string(z)
-                                     + " failed");
-        position = begin + bytes;
-        if (bytesRead)
-            *bytesRead += static_cast<std::uint64_t>(bytes);
-        if (!format.isAsInMemory())
-            format.convert(stored.data(), static_cast<std::size_t>(x1 - x0), out);
-        if (format.isFloat())
-            replaceNotFinite(out, x1 - x0, minimum);
+        const bool areWhole = lo[0] == 0 && hi[0] == file.dims[0]; // rows, which then follow one another
+        for (int z = lo[2]; z < hi[2]; ++z)
+            for (int y = lo[1]; y < hi[1]; y = areWhole ? hi[1] : y + 1) {
+                const std::size_t voxels = voxelsOfBox({lo[0], y, z}, {hi[0], areWhole ? hi[1] : y + 1, z + 1}),
+                                  bytes = voxels * format.bytes();
+                const std::streamoff row = static_cast<std::streamoff>(z) * file.dims[1] + y;
+                const std::streamoff begin =
+                    (row * file.dims[0] + lo[0]) * static_cast<std::streamoff>(format.bytes()) + file.begin;
+                if (!format.isAsInMemory())
+                    stored.resize(bytes);
+                if (position != begin) // a seek throws the stream's buffer away
+                    stream->seekg(begin);
+                if (!stream->read(reinterpret_cast<char*>(format.isAsInMemory() ? out : stored.data()),
+                                  static_cast<std::streamsize>(bytes)))
+                    throw std::runtime_error(file.path + ": reading row y=" + std::to_string(y)
+                                             + " z=" + std::to_string(z) + " failed");
+                position = begin + static_cast<std::streamoff>(bytes);
+                if (bytesRead)
+                    *bytesRead += bytes;
+                if (!format.isAsInMemory())
+                    format.convert(stored.data(), voxels, out);
+                if (format.isFloat())
+                    replaceNotFinite(out, voxels, minimum);
+                out += voxels * voxelBytes(format.inMemory());
+            }
     };
 }
 
@@ -219,12 +231,12 @@ inline VisibleVoxels visibleVoxels(const VolumeSource& source, const Loaders& lo
     const TransferFunction transferFunction(1, look.points);
     std::vector<std::uint8_t> seenInRows; // for each block along a row
     visible.points = loaders.gatherOf<Vec3>([&] {
-        const RowReader read = source.open();
+        const BoxReader read = source.open();
         std::vector<Vec3> points;
         const auto [begin, end] = loaders.shareOf(rows(1) * rows(2));
         for (std::uint64_t i = begin; i < end; ++i) {
             const int y = static_cast<int>(i % rows(1)) * stride(1), z = static_cast<int>(i / rows(1)) * stride(2);
-            read(0, info.dims[0], y, z, row.data());
+            read({0, y, z}, {info.dims[0], y + 1, z + 1}, row.data());
             int first = -1, last = -1;
             for (int x = 0; x < info.dims[0]; x += stride(0))
                 if (look.standsOut(value(x))) {
@@ -272,14 +284,15 @@ inline std::array<float, 2> rangeOf(const VolumeSource& source, const Loaders& l
 {
     const VoxelRange all = VoxelRange::of(loaders.gatherOf<VoxelRange>([&] {
         const VolumeInfo& info = source.info;
-        const RowReader read = source.open();
+        const BoxReader read = source.open();
         const std::size_t count = static_cast<std::size_t>(info.dims[0]);
         std::vector<std::byte> row(count * voxelBytes(info.type));
         VoxelRange range;
         const auto rows = static_cast<std::uint64_t>(info.dims[1]);
         const auto [begin, end] = loaders.shareOf(rows * static_cast<std::uint64_t>(info.dims[2]));
         for (std::uint64_t i = begin; i < end; ++i) {
-            read(0, info.dims[0], static_cast<int>(i % rows), static_cast<int>(i / rows), row.data());
+            const int y = static_cast<int>(i % rows), z = static_cast<int>(i / rows);
+            read({0, y, z}, {info.dims[0], y + 1, z + 1}, row.data());
             range.grow(info.type, row.data(), count);
         }
         return std::vector<VoxelRange>{range};
@@ -339,7 +352,7 @@ inline VolumeSource openVolume(const std::string& path, const Loaders& loaders =
     source.notes = file.notes;
     source.info = describeVolume(*open(), file, loaders);
     source.open = [open, file, info = source.info, counter = loaders.readCounter()] {
-        return rowReader(open(), file, info, counter);
+        return boxReader(open(), file, info, counter);
     };
     lookInto(source, loaders, lookOf);
     return source;

@@ -15,33 +15,39 @@ public:
     {
         const std::size_t size = voxelBytes(info_.type);
         bytes_.resize(nxy_ * static_cast<std::size_t>(hi[2] - lo[2]) * size);
-        const RowReader read = source.open();
-        const int x0 = std::max(lo[0], 0), x1 = std::min(hi[0], info_.dims[0]);
-        const std::size_t rowBytes = nx_ * size;
-        // Calls f(y, z, the row in the block) for the rows whose voxels are in the volume, or for the others.
-        const auto forRows = [&](bool areInside, const auto& f) {
-            for (int z = lo[2]; z < hi[2]; ++z)
-                for (int y = lo[1]; y < hi[1]; ++y)
-                    if (areInside == (y >= 0 && y < info_.dims[1] && z >= 0 && z < info_.dims[2]))
-                        f(y, z, bytes_.data() + index(lo[0], y, z) * size);
-        };
-        const auto readRow = [&](int y, int z, std::byte* row) {
-            std::byte* inside = row + static_cast<std::size_t>(x0 - lo[0]) * size;
-            read(x0, x1, y, z, inside);
-            for (int x = lo[0]; x < x0; ++x)
-                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size, inside, size);
-            for (int x = x1; x < hi[0]; ++x)
-                std::memcpy(row + static_cast<std::size_t>(x - lo[0]) * size,
-                            inside + static_cast<std::size_t>(x1 - 1 - x0) * size, size);
-        };
-        forRows(true, readRow);
-        forRows(false, [&](int y, int z, std::byte* row) {
-            const int nearY = std::clamp(y, 0, info_.dims[1] - 1), nearZ = std::clamp(z, 0, info_.dims[2] - 1);
-            if (nearY >= lo[1] && nearY < hi[1] && nearZ >= lo[2] && nearZ < hi[2])
-                std::memcpy(row, bytes_.data() + index(lo[0], nearY, nearZ) * size, rowBytes);
-            else
-                readRow(nearY, nearZ, row);
-        });
+        // What the volume has of it, or is nearest to it, in slabs of some MB.
+        Index3 first, behind;
+        for (std::size_t axis = 0; axis < 3; ++axis) {
+            first[axis] = std::clamp(lo[axis], 0, info_.dims[axis] - 1);
+            behind[axis] = std::clamp(hi[axis] - 1, 0, info_.dims[axis] - 1) + 1;
+        }
+        const std::size_t rowVoxels = static_cast<std::size_t>(behind[0] - first[0]),
+                          layerVoxels = rowVoxels * static_cast<std::size_t>(behind[1] - first[1]);
+        const int layers = static_cast<int>(std::max<std::size_t>(1, (std::size_t{4} << 20) / (layerVoxels * size)));
+        std::vector<std::byte> slab;
+        const BoxReader read = source.open();
+        int slabZ = first[2], slabEnd = slabZ; // of what is in the slab
+        for (int z = lo[2]; z < hi[2]; ++z) {
+            const int nearZ = std::clamp(z, first[2], behind[2] - 1);
+            if (nearZ >= slabEnd) {
+                slabZ = slabEnd;
+                slabEnd = std::min(slabZ + layers, behind[2]);
+                slab.resize(layerVoxels * static_cast<std::size_t>(slabEnd - slabZ) * size);
+                read({first[0], first[1], slabZ}, {behind[0], behind[1], slabEnd}, slab.data());
+            }
+            for (int y = lo[1]; y < hi[1]; ++y) {
+                const auto nearY = static_cast<std::size_t>(std::clamp(y, first[1], behind[1] - 1) - first[1]);
+                const std::byte* from =
+                    slab.data() + (static_cast<std::size_t>(nearZ - slabZ) * layerVoxels + nearY * rowVoxels) * size;
+                std::byte* to = bytes_.data() + index(lo[0], y, z) * size;
+                for (int x = lo[0]; x < first[0]; ++x, to += size)
+                    std::memcpy(to, from, size);
+                std::memcpy(to, from, rowVoxels * size);
+                to += rowVoxels * size;
+                for (int x = behind[0]; x < hi[0]; ++x, to += size)
+                    std::memcpy(to, from + (rowVoxels - 1) * size, size);
+            }
+        }
     }
 
     const VolumeInfo& info() const { return info_; }

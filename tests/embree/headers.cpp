@@ -317,12 +317,14 @@ TEST_CASE("Voxels that are no cubes have the light and opacity of cubes", "[head
         source.info.maximum = 80;
         source.info.spacing = {1, 1, thickness};
         source.open = [thickness] {
-            return [thickness](int x0, int x1, int y, int z, std::byte* out) {
-                for (int x = x0; x < x1; ++x, out += sizeof(float)) {
-                    const float value =
-                        static_cast<float>(x) + 0.25f * static_cast<float>(y) + static_cast<float>(z) * thickness;
-                    std::memcpy(out, &value, sizeof value);
-                }
+            return [thickness](const Index3& lo, const Index3& hi, std::byte* out) {
+                for (int z = lo[2]; z < hi[2]; ++z)
+                    for (int y = lo[1]; y < hi[1]; ++y)
+                        for (int x = lo[0]; x < hi[0]; ++x, out += sizeof(float)) {
+                            const float value = static_cast<float>(x) + 0.25f * static_cast<float>(y)
+                                                + static_cast<float>(z) * thickness;
+                            std::memcpy(out, &value, sizeof value);
+                        }
             };
         };
         const VolumeObject object(source, true);

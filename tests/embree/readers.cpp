@@ -47,7 +47,7 @@ VolumeSource sourceOf(const std::string& name, const std::string& bytes)
     VolumeFile file = parseVolumeName(name);
     source.info = describeVolume(stream, file);
     source.open = [bytes, file, info = source.info] {
-        return rowReader(std::make_shared<std::istringstream>(bytes), file, info);
+        return boxReader(std::make_shared<std::istringstream>(bytes), file, info);
     };
     return source;
 }

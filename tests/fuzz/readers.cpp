@@ -117,7 +117,7 @@ void useVolume(VolumeSource& source, const VolumeFile& file, const std::string& 
                   "a volume has as many voxels as its name says");
     fuzz::require(std::isfinite(info.minimum) && std::isfinite(info.maximum) && info.minimum < info.maximum,
                   "the range of a volume is finite and not empty");
-    source.open = [&] { return rowReader(std::make_shared<std::istringstream>(bytes), file, info); };
+    source.open = [&] { return boxReader(std::make_shared<std::istringstream>(bytes), file, info); };
     const VoxelBlock block(source, {-1, -1, -1}, {d[0] + 2, d[1] + 2, d[2] + 2});
     for (int z = -1; z < d[2] + 2; ++z)
         for (int x = -1; x < d[0] + 2; ++x)
