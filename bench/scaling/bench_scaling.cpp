@@ -166,7 +166,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         for (const Input& input : some)
             if (input.activePixels > 0)
                 isTouched[static_cast<std::size_t>(input.tile)] = true;
-    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40;
+    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40, verdictBytes = 241, consensusBytes = 28;
     constexpr std::int64_t record = 16 + bytesPerOutput * tileSize * tileSize;
     constexpr std::int64_t perBatch = (batchBytes - batchPrefix) / record;
     std::vector<std::int64_t> finished(inputs.size());
@@ -209,8 +209,8 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
             e.poolBytes += batches * batchBytes + blockOf(record);
             if (owns[static_cast<std::size_t>(rank)])
                 e.done.add(32);
-            e.verdict.add(241);
-            e.consensus.add(28);
+            e.verdict.add(verdictBytes);
+            e.consensus.add(consensusBytes);
         } else {
             e.poolBytes += blockOf(bytesPerOutput * layout.width() * layout.height());
         }
@@ -225,8 +225,8 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         }
         for (int bit = 1; bit < ranks && !(rank & bit); bit <<= 1) // those below it in the tree
             if (rank + bit < ranks) {
-                e.verdict.add(241);
-                e.consensus.add(28);
+                e.verdict.add(verdictBytes);
+                e.consensus.add(consensusBytes);
             }
         e.poolBytes += blockOf(mostInput) + (64 << 10); // and what is small, in blocks
     }

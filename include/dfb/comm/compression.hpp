@@ -208,16 +208,17 @@ private:
 // endFrame() between frames.
 class Compression {
 public:
-    // `codec` may be null: none are.
+    // `codec` may be null: then no message is compressed.
     Compression(std::shared_ptr<const Codec> codec, CompressionMode mode, int rankCount)
         : codec_(std::move(codec)), mode_(mode), gains_(codec_ ? rankCount : 0)
     {
     }
 
-    // Whether any may be.
+    // Whether messages of this frame may be compressed.
     bool isOn() const { return codec_ && (mode_ == CompressionMode::Always || trial_.compresses()); }
 
-    // For messages with pixels to that rank, or null. `isNear`: it sees this rank's memory.
+    // Returns the codec for messages with pixels to another rank in this frame, or null for none. `isNear`: that rank
+    // sees this one's memory.
     const Codec* codecFor(int other, bool isNear) const
     {
         const bool isLeftOut = !isOn() || (mode_ == CompressionMode::Auto && (isNear || !gains_.isWorthwhile(other)));

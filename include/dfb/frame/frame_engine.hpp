@@ -416,7 +416,7 @@ private:
 
     using Clock = std::chrono::steady_clock;
 
-    // Returns the codec for messages with pixels to that rank in this frame, or null for none.
+    // See Compression.
     const Codec* codecFor(int other) const
     {
         return other == rank() ? nullptr : compression_->codecFor(other, mailbox_->connection().isSeenBy(other));
