@@ -85,13 +85,13 @@ public:
     {
         const std::lock_guard<std::mutex> lock(hdf5Mutex());
         std::vector<hsize_t> start(extent_.size(), 0), size(extent_.size(), 1);
-        hsize_t voxels = 1;
         for (std::size_t axis = 0; axis < 3; ++axis) {
             start[axes_[axis]] = static_cast<hsize_t>(lo[axis]);
             size[axes_[axis]] = static_cast<hsize_t>(count[axis]);
-            voxels *= static_cast<hsize_t>(count[axis]);
         }
-        const Hdf5Object in(H5Scopy(space_.id()), H5Sclose), memory(H5Screate_simple(1, &voxels, nullptr), H5Sclose);
+        // Of the same shape, or the library goes from voxel to voxel where there are chunks.
+        const Hdf5Object in(H5Scopy(space_.id()), H5Sclose),
+            memory(H5Screate_simple(static_cast<int>(size.size()), size.data(), nullptr), H5Sclose);
         const hid_t type = type_ == VoxelType::UInt8    ? H5T_NATIVE_UINT8
                            : type_ == VoxelType::UInt16 ? H5T_NATIVE_UINT16
                            : type_ == VoxelType::Int16  ? H5T_NATIVE_INT16
