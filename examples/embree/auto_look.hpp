@@ -326,6 +326,7 @@ inline VolumeLook lookOf(const VolumeSource& source, const FileLook& choice, con
         map = nullptr;
         preset = &tissuePresets().back();
     }
+    look.isTomography = range && range->isTomography;
     const float noise = range ? range->noise : 0;
     if (map) {
         const double depth = detail::meanDepth(source, lattice, loaders, [&](float value) {

@@ -17,11 +17,13 @@ enum class CameraKind { Perspective, DepthOfField, MotionBlur, Stereo, Dome };
 // The user's choice of view. Angles are in degrees, lengths in units of the largest extent of the visible scene, points
 // in the coordinates of the world.
 struct View {
-    float azimuth = 30;            // around the axis `up`: with y up from +z towards +x, with z up from -y towards +x
+    float azimuth = 30;            // around the axis `up`: with y up from +z towards +x, with z up from -y towards +x,
+                                   // with -z up from +y towards +x
     float elevation = 20;          // above the plane at right angles to `up`
     float fieldOfView = 35;        // full vertical angle, before `zoom`
     float zoom = 1;                // the image is so many times as large, seen from the same place
     Vec3 up{0, 1, 0};              // of any length but 0
+    bool isUpGiven = false;        // or may be found out from the scene
     std::optional<Vec3> eye;       // none: by azimuth, elevation and distance
     std::optional<Vec3> target;    // none: the centre of what there is to see
     std::optional<float> distance; // from the centre of what there is to see; none: so that all of it is in the image
@@ -42,7 +44,7 @@ struct OrbitAxes {
 
     explicit OrbitAxes(const View& view) : up(unit(Vec3d(view.up)))
     {
-        const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, -1, 0) : Vec3d(0, 0, 1);
+        const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, up.z > 0 ? -1 : 1, 0) : Vec3d(0, 0, 1);
         front = unit(towards - up * dot(towards, up));
         side = cross(up, front);
     }

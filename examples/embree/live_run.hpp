@@ -74,7 +74,7 @@ private:
         Options fromAllSides = o_; // bricks are cut for a camera that goes around
         fromAllSides.frames = 36;
         scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
-        o_.view = withoutEye(scene_->info.focus, o_.view);
+        o_.view = withoutEye(scene_->info.focus, scene_->view);
         settings_ = renderSettings(o_);
         world_ = worldOf(*scene_, settings_);
         params_.maxLayers = static_cast<int>(scene_->bounds.size());

@@ -25,9 +25,9 @@ public:
             camera);
         add("--target", target_, "X,Y,Z", "Where it looks; default: the centre of what there is to see", camera);
         add("--up", up_, "X,Y,Z|x|y|z|-x|-y|-z",
-            "What is up in the image, and the axis of the orbit. Files of volumes have y and z run downwards, so that "
-            "a "
-            "head in a CT whose slices go from the feet to the head stands with --up=-z; default y",
+            "What is up in the image, and the axis of the orbit. Files of volumes have y and z run downwards; default "
+            "y, and -z for what looks like computed tomography, so that it stands if its slices go from the feet to "
+            "the head",
             camera);
         const char* look = "Look";
         std::string names = "auto";
@@ -76,6 +76,7 @@ public:
             }
             if (isZero(view.up) || !isUsable(view.up))
                 throw CLI::ValidationError("--up", "'" + up_ + "' is no direction");
+            view.isUpGiven = true;
         }
         if (view.eye && view.target && isZero(*view.eye - *view.target))
             throw CLI::ValidationError("--eye", "is where --target is");

@@ -287,6 +287,7 @@ private:
     {
         const Loaders loaders = loadersOf(*fb_);
         scene_ = std::make_unique<RankScene>(loadRankScene(o_, loaders));
+        o_.view = scene_->view;
         bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
     }
 

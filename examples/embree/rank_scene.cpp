@@ -46,6 +46,14 @@ bool holdsBrick(int rank, int brick, int brickCount, int rankCount, int copies)
     return (rank - first + rankCount) % rankCount < copies;
 }
 
+// A body in computed tomography stands: along z, as its slices go from the feet to the head by the usual convention.
+bool stands(const Scene& scene)
+{
+    return !scene.volumes.empty()
+           && std::all_of(scene.volumes.begin(), scene.volumes.end(),
+                          [](const VolumeObject& volume) { return volume.source.look.isTomography; });
+}
+
 // Of surfaces without secondary rays, a brick's work is what its box covers of the image, so that equal boxes are best.
 bool cutsByContent(const Options& options, const Scene& scene)
 {
@@ -80,8 +88,14 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
     Scene scene = makeScene(options, sceneBricks, loaders);
-    const RenderSettings settings = renderSettings(options);
-    RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes};
+    RenderSettings settings = renderSettings(options);
+    RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes, {}};
+    if (!settings.view.isUpGiven && stands(scene)) {
+        settings.view.up = {0, 0, -1};
+        result.notes.push_back(
+            "this looks like computed tomography, with the last slice at the top: --up z turns it over");
+    }
+    result.view = settings.view;
     if (scene.volumes.empty())
         for (const auto& [option, isGiven] : {std::pair{"--transfer", !options.look.transfer.empty()},
                                               std::pair{"--range", options.look.range.has_value()},

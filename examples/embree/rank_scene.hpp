@@ -29,6 +29,7 @@ struct RankScene {
     // For each of brickIds one per cell: a brick has one, or with --interleave several that are apart.
     std::vector<std::vector<Renderer>> renderers;
     Notes notes; // for the user, the same on all ranks
+    View view;   // the user's, and where it says nothing what suits the scene
 
     const std::vector<Renderer>& of(std::uint32_t brickId) const
     {

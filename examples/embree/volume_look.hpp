@@ -16,6 +16,7 @@ struct VolumeLook {
     std::vector<Vec3> isoColors;     // of each, linear RGB
     std::optional<float> isoOpacity; // none: that of the run's surfaces
     float standsOutFrom = 0.006f;    // the opacity of what a camera has to show
+    bool isTomography = false;       // of a body, as far as the values tell
 
     float scale() const { return 1 / (hi - lo); }
     bool hasIsovalueIn(float least, float greatest) const

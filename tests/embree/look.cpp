@@ -326,7 +326,10 @@ TEST_CASE("What looks like a body in a scanner is shown as one", "[look][transfe
     const VolumeLook head = lookFor("head", 10, 1060, 1900);
     CHECK(head.lo == 0.0f);
     CHECK(head.hi == 4095.0f);
+    CHECK(head.isTomography);
+    CHECK(lookFor("bone", 10, 1060, 1900, lookWith({{"transfer", "bone"}})).isTomography);
     CHECK(lookFor("dim", 10, 500, 1900).hi < 2000.0f); // no water
+    CHECK_FALSE(lookFor("dim", 10, 500, 1900).isTomography);
     CHECK(lookFor("bright", 10, 1060, 60000).lo > 10.0f);
     CHECK(lookFor("set", 10, 1060, 1900, lookWith({{"transfer", "viridis"}})).hi < 2000.0f);
     CHECK(lookFor("range", 10, 1060, 1900, lookWith({{"range", "5,6"}})).hi == 6.0f);
@@ -562,6 +565,10 @@ TEST_CASE("The camera is where it is told to be", "[look][camera]")
     z.azimuth = z.elevation = 0;
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().forward(), {0, 1, 0})); // from -y
     CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().right(), {1, 0, 0}));
+    z.up = {0, 0, -1}; // the other way up, in front of what faces that way
+    CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().forward(), {0, -1, 0}));
+    CHECK(near(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().right(), {1, 0, 0}));
+    z.up = {0, 0, 1};
     z.elevation = 90;
     CHECK(FrameCamera(focus, z, 0, 1, 9, 9).pinhole().forward().z < -0.999f);
     View same;
