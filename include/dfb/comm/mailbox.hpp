@@ -328,11 +328,14 @@ public:
         } else {
             // Messages that were just queued must leave also when this is over, such as results for ranks below in the
             // tree.
+            Alertness alertness(std::chrono::microseconds(30)); // a nap is not much longer
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
                 // Before a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
-                if (!executor_->help() && !moved && !over())
+                if (executor_->help() || moved)
+                    alertness.renew();
+                else if (!over() && !alertness.yield())
                     connection_->nap(std::chrono::microseconds(50));
                 handler_.polled();
                 lock.lock();
@@ -458,24 +461,39 @@ private:
         return damage_.has_value();
     }
 
+    // How long a thread that waits stays awake: until nothing has come for `patience`, or others need the core.
+    class Alertness {
+    public:
+        explicit Alertness(std::chrono::microseconds patience) : patience_(patience) {}
+
+        void renew() { last_ = Clock::now(); } // something has come
+
+        // Offers the core to others. Returns false if it is time to sleep.
+        bool yield() const
+        {
+            constexpr std::chrono::microseconds taken{50};
+            const auto now = Clock::now();
+            if (now - last_ > patience_)
+                return false;
+            std::this_thread::yield();
+            return Clock::now() - now <= taken;
+        }
+
+    private:
+        const std::chrono::microseconds patience_;
+        Clock::time_point last_ = Clock::now();
+    };
+
     // For a moment a waiting thread runs tasks and moves messages itself: threads that it would have to wake may wait
-    // for a core. Gives up when nothing has come for some time, or when others need the core.
+    // for a core.
     void waitAwake(FunctionRef<bool()> over)
     {
         if (!connection_->hasProgressThread())
             return;
-        constexpr std::chrono::microseconds patience{200}, taken{50};
-        for (auto last = Clock::now(); !over();) {
-            const bool did = executor_->help() || connection_->helpProgress();
-            const auto now = Clock::now();
-            if (did) {
-                last = now;
-                continue;
-            }
-            if (now - last > patience)
-                return;
-            std::this_thread::yield();
-            if (Clock::now() - now > taken)
+        for (Alertness alertness(std::chrono::microseconds(200)); !over();) {
+            if (executor_->help() || connection_->helpProgress())
+                alertness.renew();
+            else if (!alertness.yield())
                 return;
         }
     }
