@@ -82,6 +82,17 @@ DFB_AVX2 inline void toFloatsAvx2(const Real* values, int count, float* out) noe
     toFloats(values, count, out);
 }
 
+// A float -0 becomes 0.
+DFB_INLINE void copyFloats(const float* values, int count, float* out) noexcept
+{
+    for (int i = 0; i < count; ++i)
+        out[i] = values[i] + 0.0f;
+}
+DFB_AVX2 inline void copyFloatsAvx2(const float* values, int count, float* out) noexcept
+{
+    copyFloats(values, count, out);
+}
+
 // A pixel as four floats; a float -0 becomes 0.
 #if defined(__SSE2__)
 inline __m128 pixelOf(const double* rgba) noexcept

@@ -159,8 +159,9 @@ public:
             return;
         }
         float* out = detail::floatsOf(color);
-        for (int i = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0; i < 4 * count; ++i)
-            out[i] = rgba[i] + 0.0f;
+        const int stored = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0;
+        (detail::cpuHasAvx2() ? detail::copyFloatsAvx2 : detail::copyFloats)(rgba + stored, 4 * count - stored,
+                                                                             out + stored);
     }
     // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
     // each, and to these depths, which may be null if the image has none.

@@ -17,8 +17,13 @@
 #if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
 #include <immintrin.h>
 #define DFB_HAS_AVX2_CLONES 1
+#if defined(__clang__)
 #define DFB_AVX2 __attribute__((target("avx2")))
 #define DFB_AVX2_F16C __attribute__((target("avx2,f16c")))
+#else // GCC 12 vectorizes few loops at -O2
+#define DFB_AVX2 __attribute__((target("avx2"), optimize("O3")))
+#define DFB_AVX2_F16C __attribute__((target("avx2,f16c"), optimize("O3")))
+#endif
 #define DFB_INLINE inline __attribute__((always_inline))
 #include <cpuid.h>
 #else

@@ -150,6 +150,14 @@ inline DepthBits depthBits(const float* depth, int count, float limit)
     return findDepths(depth, count, limit);
 }
 
+inline bool hasNan(const float* depth, std::size_t count)
+{
+    std::uint64_t nan = 0;
+    for (std::size_t i = 0; i < count; i += 64)
+        nan |= depthBits(depth + i, static_cast<int>(std::min<std::size_t>(64, count - i)), 0).nan;
+    return nan != 0;
+}
+
 // Which pixels of a row are active.
 struct Activity {
     bool byDepth = false; // those with a depth; else those with a colour

@@ -416,13 +416,9 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
     const bool keepsBytes = coder.keeps(h.colorFormat);
     const PlaneFormat format(h.channels, keepsBytes ? 1 : sizeof(float));
     SparseBody body = decodeSparse(format, h.shape, width, in);
-    if (const float* depth = floatsOf(body.planes.at[Depth])) {
-        std::uint32_t isNan = 0;
-        for (std::size_t i = 0; i < h.shape.stored(); ++i)
-            isNan |= static_cast<std::uint32_t>(depth[i] != depth[i]);
-        if (isNan != 0)
-            failMalformed("a depth is NaN");
-    }
+    const float* depth = floatsOf(body.planes.at[Depth]);
+    if (depth && hasNan(depth, h.shape.stored()))
+        failMalformed("a depth is NaN");
     if (h.shape.encoding == FragmentEncoding::Constant) { // one row that every row reads
         message = rowOf(pool, format, body.planes, static_cast<std::size_t>(width));
         body.planes = format.planesAt(std::as_const(message).data(), static_cast<std::size_t>(width));
