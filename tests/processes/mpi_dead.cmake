@@ -33,6 +33,11 @@ else()
       continue()
     endif()
     set(pattern "told of rank ${VICTIM} after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank ${VICTIM}: this rank is lost")
+    # A rank that ends while it sends can leave a place in the queue of MPI's shared memory that it never fills. Its
+    # receiver then gets nothing of others either, and may name one of those.
+    if(WHERE MATCHES "^(pixels|shared)$")
+      set(pattern "told of rank [0-9]+ after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank [0-9]+: this rank is lost")
+    endif()
     if(NETWORK)
       set(pattern "told of rank [0-9]+ after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: (rank ${VICTIM}: this rank is lost|rank [0-9]+: MPI_[A-Za-z]+ with rank ${VICTIM}: )")
     endif()
