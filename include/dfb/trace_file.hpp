@@ -278,7 +278,8 @@ private:
         const std::lock_guard<std::mutex> lock(mutex_);
         std::vector<std::byte> bytes(sizeof dropped_ + records_.size() * sizeof(detail::TraceRecord));
         std::memcpy(bytes.data(), &dropped_, sizeof dropped_);
-        std::memcpy(bytes.data() + sizeof dropped_, records_.data(), bytes.size() - sizeof dropped_);
+        if (!records_.empty())
+            std::memcpy(bytes.data() + sizeof dropped_, records_.data(), bytes.size() - sizeof dropped_);
         dropped_ = 0;
         records_.clear();
         return bytes;
@@ -290,8 +291,10 @@ private:
         std::vector<std::vector<detail::TraceRecord>> ranks;
         for (const std::vector<std::byte>& part : parts) {
             dropped += detail::loadAs<std::int64_t>(part.data());
-            ranks.emplace_back((part.size() - sizeof dropped) / sizeof(detail::TraceRecord));
-            std::memcpy(ranks.back().data(), part.data() + sizeof dropped, part.size() - sizeof dropped);
+            const std::size_t bytes = part.size() - sizeof dropped;
+            std::vector<detail::TraceRecord>& records = ranks.emplace_back(bytes / sizeof(detail::TraceRecord));
+            if (bytes > 0)
+                std::memcpy(records.data(), part.data() + sizeof dropped, bytes);
         }
         detail::TraceWriter(std::move(ranks)).write(out, dropped);
     }
