@@ -32,12 +32,13 @@ else()
     if(rank EQUAL VICTIM AND NOT BACK)
       continue()
     endif()
-    set(pattern "told of rank ${VICTIM} after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank ${VICTIM}: this rank is lost")
-    # A rank that ends while it sends can leave a place in the queue of MPI's shared memory that it never fills. Its
-    # receiver then gets nothing of others either, and may name one of those.
-    if(WHERE MATCHES "^(pixels|shared)$")
-      set(pattern "told of rank [0-9]+ after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank [0-9]+: this rank is lost")
+    # A rank that ends while it sends may leave a place in the queue of MPI's shared memory that it never fills. Its
+    # receiver then gets nothing of others either, and may name one of those. Only there has that been seen.
+    set(named ${VICTIM})
+    if(WHERE STREQUAL "shared" AND "${out}" MATCHES "mpi_dead: rank ${rank} told of rank ([0-9]+) ")
+      set(named ${CMAKE_MATCH_1})
     endif()
+    set(pattern "told of rank ${named} after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank ${named}: this rank is lost")
     if(NETWORK)
       set(pattern "told of rank [0-9]+ after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: (rank ${VICTIM}: this rank is lost|rank [0-9]+: MPI_[A-Za-z]+ with rank ${VICTIM}: )")
     endif()

@@ -91,20 +91,14 @@ async function drag(page, from, to, steps, options = {}) {
 
 // How long the browser alone takes to get and show a picture that is there, after a pause: median of 15, in ms.
 async function ownTime(page) {
-  return median(await page.evaluate(async () => {
-    const token = new URLSearchParams(location.search).get("token"), times = [];
-    const to = document.getElementById("picture").getContext("2d"), nextFrame = () => new Promise(requestAnimationFrame);
+  return median(await look(page, async () => {
+    const times = [];
     for (let i = 0; i < 15; ++i) {
       for (let paused = 0; paused < 20; ++paused)
-        await nextFrame();
+        await new Promise(requestAnimationFrame);
       const begin = performance.now();
-      to.drawImage(await createImageBitmap(await (await fetch("/frame?after=0&token=" + token)).blob()), 0, 0);
-      await nextFrame();
-      await new Promise(isShown => { // a message comes when that frame is on the screen
-        const channel = new MessageChannel();
-        channel.port1.onmessage = isShown;
-        channel.port2.postMessage(0);
-      });
+      context.drawImage(await createImageBitmap(await (await fetch(address("/frame", {after: 0}))).blob()), 0, 0);
+      await onScreen();
       times.push(performance.now() - begin);
     }
     return times;
