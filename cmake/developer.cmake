@@ -25,3 +25,50 @@ endif()
 
 # Where bench/get_icet.sh puts IceT, for the adapter in its place, for its test and for benchmarks.
 set(DFB_ICET_DIR ${PROJECT_SOURCE_DIR}/build/peers/icet CACHE PATH "IceT: where include/IceT.h and lib are")
+
+# dfb.hpp is parsed once for all programs that have the same flags: half of what a small one takes to compile. A file that
+# forgets a header may compile all the same; the preset clang, which does without, finds it.
+option(DFB_PRECOMPILE "Precompile dfb.hpp for dfb's own tests and programs" OFF)
+
+# _dfb_reuse(<folder>): its targets, and those of the folders below
+function(_dfb_reuse folder)
+  get_property(targets DIRECTORY ${folder} PROPERTY BUILDSYSTEM_TARGETS)
+  foreach(target IN LISTS targets)
+    get_target_property(libraries ${target} LINK_LIBRARIES)
+    get_target_property(type ${target} TYPE)
+    get_target_property(options ${target} COMPILE_OPTIONS)
+    if(target MATCHES "^dfb_precompiled" OR NOT libraries MATCHES "(^|;)dfb_(developer|catch)(;|$)")
+      continue()
+    elseif(options OR "OpenMP::OpenMP_CXX" IN_LIST libraries
+        OR NOT type MATCHES "^(EXECUTABLE|OBJECT_LIBRARY|STATIC_LIBRARY)$")
+      continue() # other flags
+    elseif("dfb_catch" IN_LIST libraries OR "Catch2::Catch2" IN_LIST libraries)
+      set(header dfb_precompiled_tests)
+    else()
+      set(header dfb_precompiled)
+    endif()
+    set_target_properties(${target} PROPERTIES PRECOMPILE_HEADERS_REUSE_FROM ${header})
+  endforeach()
+  get_property(folders DIRECTORY ${folder} PROPERTY SUBDIRECTORIES)
+  foreach(below IN LISTS folders)
+    _dfb_reuse(${below})
+  endforeach()
+endfunction()
+
+# Call it when all targets are there. With ccache it does nothing, as ccache does not keep what uses a precompiled header.
+function(dfb_precompile)
+  if(NOT DFB_PRECOMPILE OR CMAKE_CXX_COMPILER_LAUNCHER)
+    return()
+  endif()
+  file(WRITE ${PROJECT_BINARY_DIR}/precompiled.cpp "")
+  add_library(dfb_precompiled OBJECT ${PROJECT_BINARY_DIR}/precompiled.cpp)
+  target_link_libraries(dfb_precompiled PRIVATE dfb_developer)
+  target_precompile_headers(dfb_precompiled PRIVATE <dfb/dfb.hpp>)
+  if(TARGET dfb_catch)
+    add_library(dfb_precompiled_tests OBJECT ${PROJECT_BINARY_DIR}/precompiled.cpp)
+    target_link_libraries(dfb_precompiled_tests PRIVATE dfb_catch)
+    target_precompile_headers(dfb_precompiled_tests PRIVATE
+      ${PROJECT_SOURCE_DIR}/tests/support/catch.hpp <dfb/dfb.hpp>)
+  endif()
+  _dfb_reuse(${PROJECT_SOURCE_DIR})
+endfunction()
