@@ -180,13 +180,17 @@ public:
         const detail::PixelsInPlace& pixels = parts_->inPlace;
         if (row < pixels.valid.y0 || row >= pixels.valid.y1)
             return false;
-        pixels.prefetchAfter(row);
-        const std::ptrdiff_t first = row * pixels.stride + pixels.valid.x0;
-        result.valid = {static_cast<std::uint16_t>(pixels.valid.x0), static_cast<std::uint16_t>(pixels.valid.width())};
+        const detail::RowPlace first = pixels.at(pixels.valid.x0, row);
+        const auto width = static_cast<std::size_t>(pixels.valid.width());
+        const detail::RowPlace ahead = pixels.at(pixels.valid.x0, pixels.rowAhead(row));
+        detail::prefetch(ahead.color, 4 * width);
+        if (ahead.depth)
+            detail::prefetch(reinterpret_cast<const std::byte*>(ahead.depth), sizeof(float) * width);
+        result.valid = {static_cast<std::uint16_t>(pixels.valid.x0), static_cast<std::uint16_t>(width)};
         result.spans = &result.valid;
         result.spanCount = 1;
-        result.bytes = pixels.color + 4 * first;
-        result.depth = pixels.depth ? pixels.depth + first : nullptr;
+        result.bytes = first.color;
+        result.depth = first.depth;
         result.depthLimit = pixels.activity.depthLimit;
         return true;
     }

@@ -26,6 +26,21 @@ struct Span {
 
 namespace detail {
 
+// Loads a piece of a row into the cache. No processor knows by itself where the next row begins. Inlined always, as GCC
+// leaves out calls of functions that do nothing else.
+DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
+{
+#if defined(__GNUC__)
+    for (std::size_t i = 0; i < bytes; i += 64)
+        __builtin_prefetch(from + i);
+#else
+    (void)from, (void)bytes;
+#endif
+}
+// How many rows of this width to load ahead: 4 KiB of colours were best where it was measured. A few lines at a time,
+// in between the work on a row that is here: a whole row at once takes up to a quarter longer.
+inline int rowsAhead(int width) { return width < 64 ? 1 : std::max(1, 256 / width); }
+
 // Of up to 64 pixels, bit by bit: those with a colour channel that is not 0.
 DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
 {
@@ -39,12 +54,14 @@ DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
 }
 
 #if defined(DFB_HAS_AVX2_CLONES)
-DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, int count)
+DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahead, int count)
 {
     const __m256i zero = _mm256_setzero_si256(), allButSign = _mm256_set1_epi32(0x7fffffff);
     std::uint64_t bits = 0;
     int i = 0;
     for (; i + 8 <= count; i += 8) {
+        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i), _MM_HINT_T0);
+        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i + 16), _MM_HINT_T0);
         __m256i isZero[4]; // of 2 pixels each
         for (int k = 0; k < 4; ++k) {
             const auto* from = reinterpret_cast<const __m256i*>(rgba + 4 * i + 8 * k);
@@ -61,12 +78,14 @@ DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, int count)
 }
 #endif
 
-inline std::uint64_t activePixelBits(const float* rgba, int count)
+// `ahead`: where to load as many pixels from, meanwhile.
+inline std::uint64_t activePixelBits(const float* rgba, const float* ahead, int count)
 {
 #if defined(DFB_HAS_AVX2_CLONES)
     if (cpuHasAvx2())
-        return findActivePixelsAvx2(rgba, count);
+        return findActivePixelsAvx2(rgba, ahead, count);
 #endif
+    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
     return findActivePixels(rgba, count);
 }
 
@@ -158,23 +177,36 @@ inline bool hasNan(const float* depth, std::size_t count)
     return nan != 0;
 }
 
+// Where pixels of a row lie. `depth` may be null.
+struct RowPlace {
+    const std::byte* color = nullptr;
+    const float* depth = nullptr;
+};
+
 // Which pixels of a row are active.
 struct Activity {
     bool byDepth = false; // those with a depth; else those with a colour
     bool hasBytes = false;
     float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
 
-    // Up to 64 pixels, bit by bit. `depth` may be null unless byDepth. Counts NaNs that keep a pixel from being active.
-    std::uint64_t bits(const std::byte* color, const float* depth, int count, std::uint64_t& nanDepths) const
+    // Up to 64 pixels, bit by bit. Their depth may be null unless byDepth. Loads those at `ahead`, which the next call
+    // has or a later one. Counts NaNs that keep a pixel from being active.
+    std::uint64_t bits(const RowPlace& pixels, const RowPlace& ahead, int count, std::uint64_t& nanDepths) const
     {
-        const bool hasLimit = depth && depthLimit < std::numeric_limits<float>::infinity();
-        const DepthBits depths = byDepth || hasLimit ? depthBits(depth, count, depthLimit) : DepthBits();
+        const bool hasLimit = pixels.depth && depthLimit < std::numeric_limits<float>::infinity();
+        const auto size = static_cast<std::size_t>(count);
+        if (ahead.depth)
+            prefetch(reinterpret_cast<const std::byte*>(ahead.depth), sizeof(float) * size);
+        const DepthBits depths = byDepth || hasLimit ? depthBits(pixels.depth, count, depthLimit) : DepthBits();
+        if (byDepth || hasBytes)
+            prefetch(ahead.color, (hasBytes ? 4 : 16) * size);
         if (byDepth) {
             for (std::uint64_t nan = depths.nan; nan != 0; nan &= nan - 1)
                 ++nanDepths;
             return depths.active;
         }
-        const std::uint64_t colors = hasBytes ? activeByteBits(color, count) : activePixelBits(floatsOf(color), count);
+        const std::uint64_t colors = hasBytes ? activeByteBits(pixels.color, count)
+                                              : activePixelBits(floatsOf(pixels.color), floatsOf(ahead.color), count);
         return hasLimit ? colors & (depths.active | depths.nan) : colors;
     }
 };
@@ -261,20 +293,6 @@ inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t c
     std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));
     return true;
 }
-
-// Loads a row of an image into the cache. No processor knows by itself where the next row begins. Inlined always, as
-// GCC leaves out calls of functions that do nothing else.
-DFB_INLINE void prefetchRow(const std::byte* row, std::size_t bytes)
-{
-#if defined(__GNUC__)
-    for (std::size_t i = 0; i < bytes; i += 64)
-        __builtin_prefetch(row + i);
-#else
-    (void)row, (void)bytes;
-#endif
-}
-// How many rows of this width to load ahead: 6 KiB were best where it was measured.
-inline int rowsAhead(int width) { return width < 64 ? 1 : std::max(1, 384 / width); }
 
 // Faults in the pixels of an input.
 struct InputFaults {
@@ -393,18 +411,17 @@ struct PixelsInPlace {
     // Reads row y. Adds to `faults`.
     void readRow(int y, RowPixels& row, InputFaults& faults) const;
 
-    std::ptrdiff_t colorBytes() const noexcept { return activity.hasBytes ? 4 : 4 * sizeof(float); } // of a pixel
-    // Before row y is read: loads one that follows into the cache.
-    DFB_INLINE void prefetchAfter(int y) const
+    // Of pixel x of row y.
+    RowPlace at(int x, int y) const noexcept
     {
-        const int width = valid.width(), ahead = y + rowsAhead(width);
-        if (ahead >= valid.y1)
-            return;
-        const std::ptrdiff_t first = ahead * stride + valid.x0;
-        prefetchRow(color + colorBytes() * first, static_cast<std::size_t>(colorBytes() * width));
-        if (depth)
-            prefetchRow(reinterpret_cast<const std::byte*>(depth + first),
-                        sizeof(float) * static_cast<std::size_t>(width));
+        const std::ptrdiff_t pixel = y * stride + x;
+        return {color + (activity.hasBytes ? 4 : 16) * pixel, depth ? depth + pixel : nullptr};
+    }
+    // The row to load while row y is read; the last ones load themselves.
+    int rowAhead(int y) const noexcept
+    {
+        const int ahead = y + rowsAhead(valid.width());
+        return ahead < valid.y1 ? ahead : y;
     }
 
     // Whether alpha is 1 in all pixels of a region of this size.
@@ -427,9 +444,8 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     row.active.clear();
     if (y < valid.y0 || y >= valid.y1)
         return;
-    const bool hasBytes = activity.hasBytes;
-    const std::ptrdiff_t bytes = colorBytes(), begin = y * stride;
-    prefetchAfter(y);
+    const std::ptrdiff_t begin = y * stride;
+    const int ahead = rowAhead(y);
     const auto most = static_cast<std::size_t>(valid.width());
     row.color.resize(std::max(row.color.size(), 4 * most));
     row.depth.resize(std::max(row.depth.size(), depth ? most : 0));
@@ -437,14 +453,14 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     planes.at[Color] = color;
     planes.at[Depth] = reinterpret_cast<const std::byte*>(depth);
     const auto bitsOf = [&](int x, int count) {
-        return activity.bits(color + bytes * (begin + x), depth ? depth + begin + x : nullptr, count, faults.nonFinite);
+        return activity.bits(at(x, y), at(x, ahead), count, faults.nonFinite);
     };
-    std::size_t at = 0;
+    std::size_t done = 0;
     row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
         const std::ptrdiff_t first = begin + span.x;
-        float *toColor = row.color.data() + 4 * at, *toDepth = depth ? row.depth.data() + at : nullptr;
+        float *toColor = row.color.data() + 4 * done, *toDepth = depth ? row.depth.data() + done : nullptr;
         bool isClean = true;
-        if (hasBytes)
+        if (activity.hasBytes)
             bytesToFloats(color + 4 * first, span.count, toColor);
         else
             isClean = copyAndCheck(planes, false, Color, first, span.count, reinterpret_cast<std::byte*>(toColor));
@@ -452,7 +468,7 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
             isClean &= copyAndCheck(planes, false, Depth, first, span.count, reinterpret_cast<std::byte*>(toDepth));
         if (!isClean)
             countFaults(toColor, depth ? depth + first : nullptr, span.count, faults);
-        at += span.count;
+        done += span.count;
     });
 }
 

@@ -326,20 +326,16 @@ private:
         const Activity activity{byDepth, tile.hasBytes, tile.depthLimit};
         const Region valid = tile.valid;
         const int x0 = valid.x0 - tile.region.x0, width = planes.at[Color] ? valid.width() : 0;
-        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0, ahead = rowsAhead(width);
+        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0, rows = rowsAhead(width);
+        const auto at = [&](int x, int y) {
+            return RowPlace{tile.colorAt(x, y), depths ? depths + y * tile.stride + x : nullptr};
+        };
         for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const std::ptrdiff_t begin = y * tile.stride;
-            if (y + ahead < yEnd)
-                prefetchRow(tile.colorAt(x0, y + ahead), static_cast<std::size_t>(width) * tile.pixelBytes(Color));
-            if (depths && y + ahead < yEnd)
-                prefetchRow(reinterpret_cast<const std::byte*>(depths + begin + ahead * tile.stride + x0),
-                            static_cast<std::size_t>(width) * sizeof(float));
+            const int ahead = y + rows < yEnd ? y + rows : y;
             findRow(
                 y, x0, x0 + width,
-                [&](int x, int count) {
-                    return activity.bits(tile.colorAt(x, y), depths ? depths + begin + x : nullptr, count, nanDepths_);
-                },
-                [&](Span span) { f(begin + span.x, static_cast<int>(span.count)); });
+                [&](int x, int count) { return activity.bits(at(x, y), at(x, ahead), count, nanDepths_); },
+                [&](Span span) { f(y * tile.stride + span.x, static_cast<int>(span.count)); });
         }
         endRows();
     }

@@ -41,7 +41,7 @@ TEST_CASE("A pixel is active if any of its channels is not 0, whatever the sign"
                 const bool isActive = p[0] != 0 || p[1] != 0 || p[2] != 0 || p[3] != 0;
                 expected |= std::uint64_t{isActive} << i;
             }
-            CHECK(dfb::detail::activePixelBits(rgba, pixels) == expected);
+            CHECK(dfb::detail::activePixelBits(rgba, rgba, pixels) == expected);
             CHECK(dfb::detail::findActivePixels(rgba, pixels) == expected);
         }
 }
