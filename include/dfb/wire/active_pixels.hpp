@@ -60,8 +60,9 @@ DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const floa
     std::uint64_t bits = 0;
     int i = 0;
     for (; i + 8 <= count; i += 8) {
-        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i), _MM_HINT_T0);
-        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i + 16), _MM_HINT_T0);
+        // As values that are read once: what the larger caches keep of the image stays.
+        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i), _MM_HINT_NTA);
+        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i + 16), _MM_HINT_NTA);
         __m256i isZero[4]; // of 2 pixels each
         for (int k = 0; k < 4; ++k) {
             const auto* from = reinterpret_cast<const __m256i*>(rgba + 4 * i + 8 * k);
