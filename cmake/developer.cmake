@@ -40,8 +40,10 @@ function(_dfb_reuse folder)
     if(target MATCHES "^dfb_precompiled" OR NOT libraries MATCHES "(^|;)dfb_(developer|catch)(;|$)")
       continue()
     elseif(options OR "OpenMP::OpenMP_CXX" IN_LIST libraries
-        OR NOT type MATCHES "^(EXECUTABLE|OBJECT_LIBRARY|STATIC_LIBRARY)$")
+        OR NOT type MATCHES "^(EXECUTABLE|OBJECT_LIBRARY)$")
       continue() # other flags
+    elseif(target MATCHES "^(test_(unit|fuzz_.*)|dfb_(check|compare|make|fuzz|render_stopped).*)$")
+      continue() # of dfb they include a few headers, if any
     elseif("dfb_catch" IN_LIST libraries OR "Catch2::Catch2" IN_LIST libraries)
       set(header dfb_precompiled_tests)
     else()
