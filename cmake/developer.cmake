@@ -39,11 +39,11 @@ function(_dfb_reuse folder)
     get_target_property(options ${target} COMPILE_OPTIONS)
     if(target MATCHES "^dfb_precompiled" OR NOT libraries MATCHES "(^|;)dfb_(developer|catch)(;|$)")
       continue()
-    elseif(options OR "OpenMP::OpenMP_CXX" IN_LIST libraries
-        OR NOT type MATCHES "^(EXECUTABLE|OBJECT_LIBRARY)$")
+    elseif(options OR "OpenMP::OpenMP_CXX" IN_LIST libraries OR type MATCHES "^(MODULE|SHARED)_LIBRARY$")
       continue() # other flags
-    elseif(target MATCHES "^(test_(unit|fuzz_.*)|dfb_(check|compare|make|fuzz|render_stopped).*)$")
-      continue() # of dfb they include a few headers, if any
+    elseif(type STREQUAL "STATIC_LIBRARY"
+        OR target MATCHES "^(test_(unit|fuzz_.*)|dfb_(check|compare|make|fuzz|render_stopped).*)$")
+      continue() # they include a few of dfb's headers: reading all takes longer
     elseif("dfb_catch" IN_LIST libraries OR "Catch2::Catch2" IN_LIST libraries)
       set(header dfb_precompiled_tests)
     else()

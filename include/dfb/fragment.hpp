@@ -181,11 +181,8 @@ public:
         if (row < pixels.valid.y0 || row >= pixels.valid.y1)
             return false;
         const detail::RowPlace first = pixels.at(pixels.valid.x0, row);
-        const auto width = static_cast<std::size_t>(pixels.valid.width());
-        const detail::RowPlace ahead = pixels.at(pixels.valid.x0, pixels.rowAhead(row));
-        detail::prefetch(ahead.color, 4 * width);
-        if (ahead.depth)
-            detail::prefetch(reinterpret_cast<const std::byte*>(ahead.depth), sizeof(float) * width);
+        const int width = pixels.valid.width();
+        pixels.at(pixels.valid.x0, detail::rowAhead(row, pixels.valid.y1, width)).prefetchAll(width, 4);
         result.valid = {static_cast<std::uint16_t>(pixels.valid.x0), static_cast<std::uint16_t>(width)};
         result.spans = &result.valid;
         result.spanCount = 1;

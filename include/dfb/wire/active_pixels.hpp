@@ -37,9 +37,14 @@ DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
     (void)from, (void)bytes;
 #endif
 }
-// How many rows of this width to load ahead: 4 KiB of colours were best where it was measured. A few lines at a time,
-// in between the work on a row that is here: a whole row at once takes up to a quarter longer.
-inline int rowsAhead(int width) { return width < 64 ? 1 : std::max(1, 256 / width); }
+// The row to load while row y is read, of rows before `yEnd`; the last ones load themselves. 4 KiB of colours ahead
+// were best where it was measured. Load it in pieces, between the work on row y: all at once takes up to a quarter
+// longer.
+inline int rowAhead(int y, int yEnd, int width)
+{
+    const int ahead = y + (width < 64 ? 1 : std::max(1, 256 / width));
+    return ahead < yEnd ? ahead : y;
+}
 
 // Of up to 64 pixels, bit by bit: those with a colour channel that is not 0.
 DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
@@ -60,7 +65,7 @@ DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const floa
     std::uint64_t bits = 0;
     int i = 0;
     for (; i + 8 <= count; i += 8) {
-        // As values that are read once: what the larger caches keep of the image stays.
+        // NTA: they are read soon, and then not again.
         _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i), _MM_HINT_NTA);
         _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i + 16), _MM_HINT_NTA);
         __m256i isZero[4]; // of 2 pixels each
@@ -182,6 +187,17 @@ inline bool hasNan(const float* depth, std::size_t count)
 struct RowPlace {
     const std::byte* color = nullptr;
     const float* depth = nullptr;
+
+    DFB_INLINE void prefetchDepth(int count) const
+    {
+        if (depth)
+            prefetch(reinterpret_cast<const std::byte*>(depth), sizeof(float) * static_cast<std::size_t>(count));
+    }
+    DFB_INLINE void prefetchAll(int count, std::ptrdiff_t colorBytes) const
+    {
+        prefetch(color, static_cast<std::size_t>(colorBytes * count));
+        prefetchDepth(count);
+    }
 };
 
 // Which pixels of a row are active.
@@ -190,17 +206,18 @@ struct Activity {
     bool hasBytes = false;
     float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
 
-    // Up to 64 pixels, bit by bit. Their depth may be null unless byDepth. Loads those at `ahead`, which the next call
-    // has or a later one. Counts NaNs that keep a pixel from being active.
+    std::ptrdiff_t colorBytes() const noexcept { return hasBytes ? 4 : 4 * sizeof(float); } // of a pixel
+
+    // Up to 64 pixels, bit by bit. Their depth may be null unless byDepth. Loads as many at `ahead` into the cache, for
+    // a later call. Counts NaNs that keep a pixel from being active.
     std::uint64_t bits(const RowPlace& pixels, const RowPlace& ahead, int count, std::uint64_t& nanDepths) const
     {
         const bool hasLimit = pixels.depth && depthLimit < std::numeric_limits<float>::infinity();
-        const auto size = static_cast<std::size_t>(count);
-        if (ahead.depth)
-            prefetch(reinterpret_cast<const std::byte*>(ahead.depth), sizeof(float) * size);
-        const DepthBits depths = byDepth || hasLimit ? depthBits(pixels.depth, count, depthLimit) : DepthBits();
         if (byDepth || hasBytes)
-            prefetch(ahead.color, (hasBytes ? 4 : 16) * size);
+            ahead.prefetchAll(count, colorBytes());
+        else
+            ahead.prefetchDepth(count); // activePixelBits() loads the colours
+        const DepthBits depths = byDepth || hasLimit ? depthBits(pixels.depth, count, depthLimit) : DepthBits();
         if (byDepth) {
             for (std::uint64_t nan = depths.nan; nan != 0; nan &= nan - 1)
                 ++nanDepths;
@@ -416,13 +433,7 @@ struct PixelsInPlace {
     RowPlace at(int x, int y) const noexcept
     {
         const std::ptrdiff_t pixel = y * stride + x;
-        return {color + (activity.hasBytes ? 4 : 16) * pixel, depth ? depth + pixel : nullptr};
-    }
-    // The row to load while row y is read; the last ones load themselves.
-    int rowAhead(int y) const noexcept
-    {
-        const int ahead = y + rowsAhead(valid.width());
-        return ahead < valid.y1 ? ahead : y;
+        return {color + activity.colorBytes() * pixel, depth ? depth + pixel : nullptr};
     }
 
     // Whether alpha is 1 in all pixels of a region of this size.
@@ -446,7 +457,7 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     if (y < valid.y0 || y >= valid.y1)
         return;
     const std::ptrdiff_t begin = y * stride;
-    const int ahead = rowAhead(y);
+    const int ahead = rowAhead(y, valid.y1, valid.width());
     const auto most = static_cast<std::size_t>(valid.width());
     row.color.resize(std::max(row.color.size(), 4 * most));
     row.depth.resize(std::max(row.depth.size(), depth ? most : 0));

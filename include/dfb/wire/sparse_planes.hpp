@@ -326,12 +326,12 @@ private:
         const Activity activity{byDepth, tile.hasBytes, tile.depthLimit};
         const Region valid = tile.valid;
         const int x0 = valid.x0 - tile.region.x0, width = planes.at[Color] ? valid.width() : 0;
-        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0, rows = rowsAhead(width);
+        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
         const auto at = [&](int x, int y) {
             return RowPlace{tile.colorAt(x, y), depths ? depths + y * tile.stride + x : nullptr};
         };
         for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const int ahead = y + rows < yEnd ? y + rows : y;
+            const int ahead = rowAhead(y, yEnd, width);
             findRow(
                 y, x0, x0 + width,
                 [&](int x, int count) { return activity.bits(at(x, y), at(x, ahead), count, nanDepths_); },

@@ -272,8 +272,8 @@ TEST_CASE("With checksums a changed byte is an error on every rank, and the next
             bool right = true;
             const std::string text = outcomeOf([&] {
                 Scene mine = s;
-                mine.timeout = std::chrono::milliseconds(
-                    20000); // a message that comes after its frame's end makes the next one fail
+                // Long: a message that comes after its frame's end makes the next one fail.
+                mine.timeout = std::chrono::milliseconds(20000);
                 right = goodFrame(fb, mine);
             });
             const bool same = sameEverywhere(text);
@@ -341,8 +341,7 @@ TEST_CASE("What is missing when the time is up is named on every rank, and the n
     dfb::DistributedFrameBuffer<Blend> fb(MPI_COMM_WORLD, configOf(s));
     const int last = fb.size() - 1;
     dfb::FrameConfig params;
-    // A rank that begins this much later than the others is still heard of before they give it up, after twice the
-    // time.
+    // A rank may begin so much later than the others: they give it up after twice the time.
     params.timeout = std::chrono::milliseconds(2000);
     for (const bool declared : {true, false}) {
         params.declared = declared;
