@@ -70,7 +70,11 @@ public:
         } else if (active_.size() == 1 && !wantsAux) {
             compositeSpans(row, active_.front());
         } else {
-            compositeRuns(row, wantsAux);
+            findEdges(width);
+            if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && areRunsShort())
+                compositeLayers(row);
+            else
+                compositeRuns(row, wantsAux);
         }
     }
 
@@ -124,6 +128,7 @@ public:
 private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
+    static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
@@ -174,9 +179,66 @@ private:
         clearGap(row, end, static_cast<int>(row.transmittance.size()));
     }
 
+    bool areRunsShort() const
+    {
+        return edges_[edgeCount_ - 1] - edges_.front() < shortRun * static_cast<int>(edgeCount_ - 1);
+    }
+
+    // Of fragments in order: one after the other, each under what is there. Begins as many runs as there are spans,
+    // where compositeRuns() begins one at each edge of any.
+    void compositeLayers(CompositeRow& row)
+    {
+        const int width = static_cast<int>(row.transmittance.size());
+        findRuns(width);
+        int end = 0;
+        for (const Run& run : runs_) {
+            clearGap(row, end, run.x);
+            row.clear(run.x, run.count);
+            end = run.x + run.count;
+        }
+        clearGap(row, end, width);
+        detail::BlendGroup group;
+        group.isFirst = false;
+        group.layers = 1;
+        group.minTransmittance = row.minTransmittance;
+        for (const FragmentRow& r : active_) {
+            Layer layer{r.color, r.depth, nullptr};
+            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+                group.colors[0] = layer.color;
+                detail::blendGroup(row.rgba.data() + 4 * span->x, row.transmittance.data() + span->x, span->count,
+                                   group);
+                if (row.wantsDepth && layer.depth)
+                    detail::takeNearest(row.depth.data() + span->x, span->count, layer.color, layer.depth);
+                layer = layer.from(span->count);
+            }
+        }
+    }
+
+    // The runs of pixels that any fragment covers, with the narrow gaps between them.
+    void findRuns(int width)
+    {
+        std::vector<std::uint64_t>& isCovered = marks_;
+        isCovered.assign(static_cast<std::size_t>(width / 64 + 1), 0);
+        for (const FragmentRow& r : active_)
+            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span)
+                for (int x = span->x, end = span->x + span->count; x < end;) {
+                    const int some = std::min(end - x, 64 - x % 64);
+                    isCovered[static_cast<std::size_t>(x / 64)] |= ~std::uint64_t{0} >> (64 - some) << x % 64;
+                    x += some;
+                }
+        for (std::size_t word = 0; word < isCovered.size(); ++word)
+            detail::forEachRun(isCovered[word], [&](int at, int count) {
+                const int x = static_cast<int>(64 * word) + at;
+                if (!runs_.empty() && x - (runs_.back().x + runs_.back().count) < narrowGap)
+                    runs_.back().count = x + count - runs_.back().x;
+                else
+                    runs_.push_back({x, count, nullptr});
+            });
+    }
+
+    // After findEdges().
     void compositeRuns(CompositeRow& row, bool wantsAux)
     {
-        findEdges(static_cast<int>(row.transmittance.size()));
         clearGap(row, 0, edges_.front());
         clearGap(row, edges_[edgeCount_ - 1], static_cast<int>(row.transmittance.size()));
         for (std::size_t e = 0; e + 1 < edgeCount_; ++e) {
@@ -223,11 +285,11 @@ private:
             runs_.push_back({x, count, nullptr});
     }
 
-    // The places where spans begin or end: between two neighbouring ones the set of layers is constant.
+    // Finds the places where spans begin or end: between two neighbouring ones the set of layers is constant.
     void findEdges(int width)
     {
-        isEdge_.assign(static_cast<std::size_t>(width / 64 + 1), 0);
-        const auto mark = [this](int x) { isEdge_[static_cast<std::size_t>(x / 64)] |= std::uint64_t{1} << x % 64; };
+        marks_.assign(static_cast<std::size_t>(width / 64 + 1), 0);
+        const auto mark = [this](int x) { marks_[static_cast<std::size_t>(x / 64)] |= std::uint64_t{1} << x % 64; };
         for (const FragmentRow& r : active_)
             for (int i = 0; i < r.spanCount; ++i) {
                 mark(r.spans[i].x);
@@ -235,8 +297,8 @@ private:
             }
         edges_.resize(std::max(edges_.size(), static_cast<std::size_t>(width + 1))); // filled below
         int* next = edges_.data();
-        for (std::size_t word = 0; word < isEdge_.size(); ++word)
-            for (std::uint64_t bits = isEdge_[word]; bits != 0; bits &= bits - 1)
+        for (std::size_t word = 0; word < marks_.size(); ++word)
+            for (std::uint64_t bits = marks_[word]; bits != 0; bits &= bits - 1)
                 *next++ = static_cast<int>(64 * word) + detail::zerosBelow(bits);
         edgeCount_ = static_cast<std::size_t>(next - edges_.data());
     }
@@ -256,7 +318,7 @@ private:
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
-    std::vector<std::uint64_t> isEdge_;    // bit by bit
+    std::vector<std::uint64_t> marks_;     // a bit for each pixel of a row
     std::vector<int> edges_;               // the first edgeCount_
     std::size_t edgeCount_ = 0;
     std::vector<Run> runs_;

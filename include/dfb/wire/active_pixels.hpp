@@ -26,13 +26,14 @@ struct Span {
 
 namespace detail {
 
-// Loads a piece of a row into the cache. No processor knows by itself where the next row begins. Inlined always, as GCC
-// leaves out calls of functions that do nothing else.
+// Loads a piece of a row into the second cache. No processor knows by itself where the next row begins. The first cache
+// is too small: rows of an image are often a multiple of 4 KiB apart, so those of several inputs take each other's
+// place. Inlined always, as GCC leaves out calls of functions that do nothing else.
 DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
 {
 #if defined(__GNUC__)
     for (std::size_t i = 0; i < bytes; i += 64)
-        __builtin_prefetch(from + i);
+        __builtin_prefetch(from + i, 0, 2);
 #else
     (void)from, (void)bytes;
 #endif
@@ -58,20 +59,57 @@ DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
     return bits;
 }
 
+// Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
+inline bool copyAndCheckColors(const float* rgba, int count, float* out)
+{
+    constexpr float most = std::numeric_limits<float>::max();
+    constexpr float low[4] = {-most, -most, -most, 0}, high[4] = {most, most, most, 1};
+    int bad[4] = {};
+    for (int i = 0; i < 4 * count; i += 4)
+        for (int c = 0; c < 4; ++c) {
+            const float value = rgba[i + c];
+            out[i + c] = value;
+            bad[c] |= static_cast<int>(!(value >= low[c])) | static_cast<int>(!(value <= high[c]));
+        }
+    return (bad[0] | bad[1] | bad[2] | bad[3]) == 0;
+}
+
 #if defined(DFB_HAS_AVX2_CLONES)
-DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahead, int count)
+// Looks at colours as copyAndCheckColors() does.
+struct Avx2ColorCheck {
+    __m256 areInside;
+
+    DFB_AVX2 DFB_INLINE void clear() { areInside = _mm256_castsi256_ps(_mm256_set1_epi32(-1)); }
+    DFB_AVX2 DFB_INLINE void add(__m256 two)
+    {
+        constexpr float most = std::numeric_limits<float>::max();
+        const __m256 low = _mm256_setr_ps(-most, -most, -most, 0, -most, -most, -most, 0);
+        const __m256 high = _mm256_setr_ps(most, most, most, 1, most, most, most, 1);
+        areInside = _mm256_and_ps(
+            areInside, _mm256_and_ps(_mm256_cmp_ps(two, low, _CMP_GE_OQ), _mm256_cmp_ps(two, high, _CMP_LE_OQ)));
+    }
+    DFB_AVX2 DFB_INLINE bool isGood() const { return _mm256_movemask_ps(areInside) == 255; }
+};
+
+// With Copies, also does what copyAndCheckColors() does; `isGood` becomes false where that would be.
+template <bool Copies>
+DFB_AVX2 std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
 {
     const __m256i zero = _mm256_setzero_si256(), allButSign = _mm256_set1_epi32(0x7fffffff);
+    Avx2ColorCheck check;
+    check.clear();
     std::uint64_t bits = 0;
     int i = 0;
     for (; i + 8 <= count; i += 8) {
-        // NTA: they are read soon, and then not again.
-        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i), _MM_HINT_NTA);
-        _mm_prefetch(reinterpret_cast<const char*>(ahead + 4 * i + 16), _MM_HINT_NTA);
+        prefetch(reinterpret_cast<const std::byte*>(ahead + 4 * i), 128);
         __m256i isZero[4]; // of 2 pixels each
         for (int k = 0; k < 4; ++k) {
-            const auto* from = reinterpret_cast<const __m256i*>(rgba + 4 * i + 8 * k);
-            isZero[k] = _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_loadu_si256(from), allButSign), zero);
+            const __m256 two = _mm256_loadu_ps(rgba + 4 * i + 8 * k);
+            if constexpr (Copies) {
+                _mm256_storeu_ps(out + 4 * i + 8 * k, two);
+                check.add(two);
+            }
+            isZero[k] = _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_castps_si256(two), allButSign), zero);
         }
         // A byte for each value, 4 for each pixel: of pixels 0 2 4 6 1 3 5 7.
         __m256i bytes =
@@ -80,7 +118,13 @@ DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const floa
         const int none = _mm256_movemask_ps(_mm256_castsi256_ps(_mm256_cmpeq_epi32(bytes, _mm256_set1_epi32(-1))));
         bits |= static_cast<std::uint64_t>(~none & 255) << i;
     }
-    return i < count ? bits | findActivePixels(rgba + 4 * i, count - i) << i : bits;
+    if (Copies && !check.isGood())
+        isGood = false;
+    if (i == count)
+        return bits;
+    if (Copies && !copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i))
+        isGood = false;
+    return bits | findActivePixels(rgba + 4 * i, count - i) << i;
 }
 #endif
 
@@ -88,11 +132,24 @@ DFB_AVX2 inline std::uint64_t findActivePixelsAvx2(const float* rgba, const floa
 inline std::uint64_t activePixelBits(const float* rgba, const float* ahead, int count)
 {
 #if defined(DFB_HAS_AVX2_CLONES)
+    bool isGood = true;
     if (cpuHasAvx2())
-        return findActivePixelsAvx2(rgba, ahead, count);
+        return findActivePixelsAvx2<false>(rgba, ahead, count, nullptr, isGood);
 #endif
     prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
     return findActivePixels(rgba, count);
+}
+
+// Does so and copies them all, in one pass. Sets `isGood` to false where copyAndCheckColors() would return it.
+inline std::uint64_t copyAndFindActivePixels(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
+{
+#if defined(DFB_HAS_AVX2_CLONES)
+    if (cpuHasAvx2())
+        return findActivePixelsAvx2<true>(rgba, ahead, count, out, isGood);
+#endif
+    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
+    isGood = copyAndCheckColors(rgba, count, out) && isGood;
+    return findActivePixels(out, count);
 }
 
 // Finds the active ones of pixels with 8 bits a channel.
@@ -207,6 +264,11 @@ struct Activity {
     float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
 
     std::ptrdiff_t colorBytes() const noexcept { return hasBytes ? 4 : 4 * sizeof(float); } // of a pixel
+    // Whether only float colours say it.
+    bool byColorAlone() const noexcept
+    {
+        return !byDepth && !hasBytes && depthLimit == std::numeric_limits<float>::infinity();
+    }
 
     // Up to 64 pixels, bit by bit. Their depth may be null unless byDepth. Loads as many at `ahead` into the cache, for
     // a later call. Counts NaNs that keep a pixel from being active.
@@ -229,37 +291,19 @@ struct Activity {
     }
 };
 
-// Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
-inline bool copyAndCheckColors(const float* rgba, int count, float* out)
-{
-    constexpr float most = std::numeric_limits<float>::max();
-    constexpr float low[4] = {-most, -most, -most, 0}, high[4] = {most, most, most, 1};
-    int bad[4] = {};
-    for (int i = 0; i < 4 * count; i += 4)
-        for (int c = 0; c < 4; ++c) {
-            const float value = rgba[i + c];
-            out[i + c] = value;
-            bad[c] |= static_cast<int>(!(value >= low[c])) | static_cast<int>(!(value <= high[c]));
-        }
-    return (bad[0] | bad[1] | bad[2] | bad[3]) == 0;
-}
-
 DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float* out)
 {
     int i = 0;
     bool areGood = true;
 #if defined(DFB_HAS_AVX2_CLONES)
-    constexpr float most = std::numeric_limits<float>::max();
-    const __m256 low = _mm256_setr_ps(-most, -most, -most, 0, -most, -most, -most, 0);
-    const __m256 high = _mm256_setr_ps(most, most, most, 1, most, most, most, 1);
-    __m256 areInside = _mm256_castsi256_ps(_mm256_set1_epi32(-1));
+    Avx2ColorCheck check;
+    check.clear();
     for (; i + 2 <= count; i += 2) {
         const __m256 two = _mm256_loadu_ps(rgba + 4 * i);
         _mm256_storeu_ps(out + 4 * i, two);
-        areInside = _mm256_and_ps(
-            areInside, _mm256_and_ps(_mm256_cmp_ps(two, low, _CMP_GE_OQ), _mm256_cmp_ps(two, high, _CMP_LE_OQ)));
+        check.add(two);
     }
-    areGood = _mm256_movemask_ps(areInside) == 255;
+    areGood = check.isGood();
 #endif
     const bool isRestGood = i == count || copyAndCheckColors(rgba + 4 * i, count - i, out + 4 * i);
     return isRestGood && areGood;
@@ -415,6 +459,7 @@ struct ActiveSpans {
 struct RowPixels {
     ActiveSpans active;
     std::vector<float> color, depth; // 4 and 1 a pixel
+    bool isFull = false;             // all that could be active are
 };
 
 // The pixels of an input that are read where they lie. Another process may write to them at any time: each value is
@@ -426,7 +471,7 @@ struct PixelsInPlace {
     Region valid{0, 0, 0, 0};         // counted from the region's first pixel
     Activity activity;
 
-    // Reads row y. Adds to `faults`.
+    // Reads row y; `row` may still be another one. Adds to `faults`.
     void readRow(int y, RowPixels& row, InputFaults& faults) const;
 
     // Of pixel x of row y.
@@ -464,17 +509,26 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     ConstPlanes planes;
     planes.at[Color] = color;
     planes.at[Depth] = reinterpret_cast<const std::byte*>(depth);
+    // A row below a full one is likely to be full: then its colours are copied as they are looked at.
+    const bool copiesAll = row.isFull && activity.byColorAlone();
+    bool areAllClean = true;
+    row.isFull = false;
     const auto bitsOf = [&](int x, int count) {
-        return activity.bits(at(x, y), at(x, ahead), count, faults.nonFinite);
+        if (!copiesAll)
+            return activity.bits(at(x, y), at(x, ahead), count, faults.nonFinite);
+        at(x, ahead).prefetchDepth(count);
+        return copyAndFindActivePixels(floatsOf(at(x, y).color), floatsOf(at(x, ahead).color), count,
+                                       row.color.data() + 4 * (x - valid.x0), areAllClean);
     };
     std::size_t done = 0;
     row.active.findRow(y, valid.x0, valid.x1, bitsOf, [&](Span span) {
         const std::ptrdiff_t first = begin + span.x;
         float *toColor = row.color.data() + 4 * done, *toDepth = depth ? row.depth.data() + done : nullptr;
-        bool isClean = true;
+        row.isFull = span.count == valid.width();
+        bool isClean = areAllClean;
         if (activity.hasBytes)
             bytesToFloats(color + 4 * first, span.count, toColor);
-        else
+        else if (!copiesAll || !row.isFull)
             isClean = copyAndCheck(planes, false, Color, first, span.count, reinterpret_cast<std::byte*>(toColor));
         if (depth)
             isClean &= copyAndCheck(planes, false, Depth, first, span.count, reinterpret_cast<std::byte*>(toDepth));

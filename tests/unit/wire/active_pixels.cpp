@@ -118,4 +118,75 @@ TEST_CASE("What is copied is checked, in each channel of each pixel", "[wire]")
     }
 }
 
+TEST_CASE("Pixels that are copied as they are looked at are those that are found, and checked alike", "[wire]")
+{
+    using namespace dfb::detail;
+    const float values[] = {0, 0, -0.0f, 0.5f, 1, denormal, -1, 2, infinity, notANumber};
+    std::mt19937 random(7);
+    for (int count = 1; count <= 64; ++count)
+        for (int round = 0; round < 30; ++round) {
+            const unsigned kinds = round % 3 == 0 ? 3 : round % 3 == 1 ? 6 : 10; // empty, without faults, all
+            std::vector<float> row(4 * static_cast<std::size_t>(count) + 1), out(row.size(), 7.0f), plain(out);
+            for (float& value : row)
+                value = values[random() % kinds];
+            const float* rgba = row.data() + random() % 2; // not aligned either
+            const bool wasGood = round % 4 != 0;
+            bool isGood = wasGood;
+            CHECK(copyAndFindActivePixels(rgba, rgba, count, out.data(), isGood) == findActivePixels(rgba, count));
+            CHECK(isGood == (copyAndCheckColors(rgba, count, plain.data()) && wasGood));
+            CHECK(std::memcmp(out.data(), plain.data(), sizeof(float) * out.size()) == 0); // and no more
+        }
+}
+
+TEST_CASE("A row in place is read alike, whatever the row above was", "[wire]")
+{
+    using namespace dfb::detail;
+    constexpr int width = 150, height = 60, stride = 160;
+    std::mt19937 random(9);
+    int full = 0;
+    for (int round = 0; round < 40; ++round) {
+        std::vector<float> colors(4 * stride * height), depths(stride * height);
+        std::uint32_t kind = 0;
+        for (std::size_t i = 0; i < depths.size(); ++i) {
+            if (i % stride == 0) // rows are full, or have gaps, or faults; often several alike
+                kind = random() % 3 == 0 ? random() % 4 : kind;
+            const bool isThere = kind == 0 || random() % (kind == 1 ? 40 : 3) != 0;
+            for (std::size_t c = 0; c < 4; ++c)
+                colors[4 * i + c] = isThere ? 0.25f * static_cast<float>(random() % 4 + 1) : 0.0f;
+            depths[i] = static_cast<float>(random() % 5);
+            if (kind == 3 && random() % 20 == 0)
+                colors[4 * i + random() % 4] = random() % 2 ? notANumber : 1.5f;
+            if (kind == 3 && random() % 20 == 0)
+                depths[i] = notANumber;
+        }
+        PixelsInPlace pixels;
+        pixels.color = reinterpret_cast<const std::byte*>(colors.data());
+        pixels.depth = round % 2 ? depths.data() : nullptr;
+        pixels.stride = stride;
+        pixels.valid = round % 4 < 2 ? dfb::Region{0, 0, width, height} : dfb::Region{3, 2, width - 1, height - 5};
+        pixels.activity.depthLimit = round % 8 == 7 ? 3.0f : infinity;
+        RowPixels kept;
+        InputFaults faults, expectedFaults;
+        for (int y = 0; y < height; ++y) {
+            RowPixels expected;
+            pixels.readRow(y, kept, faults);
+            pixels.readRow(y, expected, expectedFaults);
+            REQUIRE(kept.active.spans.size() == expected.active.spans.size());
+            for (std::size_t i = 0; i < kept.active.spans.size(); ++i) {
+                CHECK(kept.active.spans[i].x == expected.active.spans[i].x);
+                CHECK(kept.active.spans[i].count == expected.active.spans[i].count);
+            }
+            const std::size_t count = kept.active.pixels;
+            REQUIRE(count == expected.active.pixels);
+            CHECK((count == 0 || std::memcmp(kept.color.data(), expected.color.data(), 16 * count) == 0));
+            CHECK(
+                (!pixels.depth || count == 0 || std::memcmp(kept.depth.data(), expected.depth.data(), 4 * count) == 0));
+            full += kept.isFull;
+        }
+        CHECK(faults.nonFinite == expectedFaults.nonFinite);
+        CHECK(faults.alphaOutside == expectedFaults.alphaOutside);
+    }
+    CHECK(full > 100);
+}
+
 } // namespace active_pixels_cases
