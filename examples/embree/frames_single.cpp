@@ -1,25 +1,20 @@
-// dfb_render where every rank has the whole scene.
-#include "rank_run.hpp"
-#include "run.hpp"
+// Frames where every rank has the whole scene.
+#include "frames_by.hpp"
 
 namespace example {
 
-int runImageParallel(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& o, int threads)
+std::unique_ptr<RunFrames> makeSingleFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
+                                            const dfb::FrameBufferConfig& config,
+                                            dfb::testing::Verification& verification)
 {
-    const auto run = [&](auto tileOp, auto pixelOp) {
-        return runWith<decltype(tileOp), decltype(pixelOp)>(std::move(connection), transport, o, threads);
-    };
-    if (o.verify)
-        return run(VerifiedSingle(), dfb::NoPixelOp());
-    if (o.adaptive > 0)
-        return run(AdaptiveSingle(), dfb::NoPixelOp());
-    if (o.wallColumns > 0 && o.exposure > 0)
-        return run(Single(), ToneMapToWall());
-    if (o.wallColumns > 0)
-        return run(Single(), dfb::ToWall());
-    if (o.exposure > 0)
-        return run(Single(), dfb::ToneMap());
-    return run(Single(), dfb::NoPixelOp());
+    constexpr LoopOver tiles = LoopOver::Tiles;
+    const auto make = [&](auto function) { return function(std::move(connection), options, config, verification); };
+    switch (compositingOf(options)) {
+    case Compositing::SingleVerified: return make(framesBy<tiles, dfb::testing::Verified<Single>>);
+    case Compositing::SingleAdaptive: // samples are saved tile by tile: smaller tiles save more
+        return make(framesBy<tiles, dfb::Progressive<dfb::BasicImageParallel<16, tileChannels>>>);
+    default: return make(framesWithPixelOp<tiles, Single>);
+    }
 }
 
 } // namespace example

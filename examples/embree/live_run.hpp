@@ -1,19 +1,25 @@
 // LiveRun: renders what the viewers of a live view want to see, until they end the job.
 #pragma once
 
-#include "rank_run.hpp"
+#include "frames_by.hpp"
+#include "on_all_ranks.hpp"
+#include "run_config.hpp"
 
 #include <interrupt.hpp>
 #include <live_view.hpp>
 
+#include <algorithm>
+#include <array>
 #include <charconv>
 #include <chrono>
+#include <cstdint>
 #include <cstdio>
 #include <cstring>
 #include <memory>
 #include <optional>
 #include <stdexcept>
 #include <string>
+#include <type_traits>
 #include <utility>
 #include <vector>
 

@@ -14,9 +14,6 @@ int runInproc(const dfb::InprocCommunicator& communicator, const Options& option
 #if defined(DFB_HAS_MPI)
 int runMpi(MPI_Comm communicator, const Options& options, int threads);
 #endif
-// Of either; where every rank has the whole scene.
-int runImageParallel(std::shared_ptr<dfb::Connection> connection, const char* transport, const Options& options,
-                     int threads);
 // Of either; with --live.
 int runLive(std::shared_ptr<dfb::Connection> connection, const Options& options, int threads);
 

@@ -1,0 +1,31 @@
+// onAllRanks(): a step of all ranks, which they go on from together.
+#pragma once
+
+#include <dfb/frame.hpp>
+
+#include <cstdio>
+#include <exception>
+#include <string>
+
+namespace example {
+
+// Runs `step` on every rank. If it throws on any, the lowest of those says why, and all return false. `fb`: a
+// framebuffer, of which no frame is open.
+template <class FrameBuffer, class Step>
+bool onAllRanks(FrameBuffer& fb, const Step& step)
+{
+    std::string error;
+    bool failed = false;
+    try {
+        step();
+    } catch (const std::exception& e) {
+        error = e.what();
+        failed = true;
+    }
+    const auto lowest = fb.allReduce({failed ? fb.rank() : fb.size()}, dfb::Reduce::Min).front();
+    if (lowest == fb.rank())
+        std::fprintf(stderr, "dfb_render: %s\n", error.c_str());
+    return lowest == fb.size();
+}
+
+} // namespace example

@@ -1,0 +1,131 @@
+// RunConfig: what the options say, as the library wants it: the framebuffer's configuration, the world, the wall.
+#pragma once
+
+#include "options.hpp"
+#include "rank_scene.hpp"
+
+#include <dfb/dfb.hpp>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdint>
+#include <memory>
+#include <stdexcept>
+
+namespace example {
+
+// Which tile operation the options ask for.
+enum class Compositing {
+    Single,         // every rank has the whole scene, so a tile has one input
+    SingleVerified, // which checks itself
+    SingleAdaptive, // of which tiles have different numbers of samples
+    Sort,
+    SortVerified,
+    SortAdaptive,
+    Order,
+    Nearest,
+    Deep
+};
+
+inline Compositing compositingOf(const Options& o)
+{
+    if (o.deep > 0 || o.interleave > 1)
+        return Compositing::Deep;
+    if (o.mode == Mode::Image && (o.verify || o.blend == Blending::Sort))
+        return o.verify         ? Compositing::SingleVerified
+               : o.adaptive > 0 ? Compositing::SingleAdaptive
+                                : Compositing::Single;
+    if (o.verify)
+        return Compositing::SortVerified;
+    if (o.blend != Blending::Sort)
+        return o.blend == Blending::Order ? Compositing::Order : Compositing::Nearest;
+    return o.adaptive > 0 ? Compositing::SortAdaptive : Compositing::Sort;
+}
+
+inline bool isSingle(Compositing how)
+{
+    return how == Compositing::Single || how == Compositing::SingleVerified || how == Compositing::SingleAdaptive;
+}
+
+inline bool isAdaptive(Compositing how)
+{
+    return how == Compositing::SingleAdaptive || how == Compositing::SortAdaptive;
+}
+
+// Unless 8 bits per channel are all that is written. They lose too much to divide by alpha, as a PNG with alpha wants.
+inline bool wantsFloat(const Options& o)
+{
+    return !o.stats.empty() || !o.alpha.empty() || (!o.output.empty() && !o.background) || endingOf(o.output) == ".pfm"
+           || o.isExr() || o.pngBits == 16;
+}
+
+inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
+{
+    dfb::FrameBufferConfig config;
+    config.image.width = o.width;
+    config.image.height = o.height;
+    config.image.format = wantsFloat(o) ? dfb::OutputFormat::RGBA32F
+                          : !o.output.empty() || !o.depth.empty() || !o.aux.empty() || o.verify || o.live
+                              ? dfb::OutputFormat::SRGBA8
+                              : dfb::OutputFormat::None;
+    config.image.dither = o.dither;
+    const dfb::ChannelMask layers = o.isExr() ? o.layers : dfb::ChannelMask{0};
+    config.image.depth = !o.depth.empty() || (layers & dfb::depthChannel) != 0;
+    config.precision = o.errorBudget > 0 ? dfb::Precision(dfb::ErrorBudget{o.errorBudget}) : dfb::Precision(o.wire);
+    config.minTransmittance = o.minTransmittance;
+    config.framesInFlight = std::min(o.inFlight, o.frames);
+    config.image.aux =
+        o.aux.empty() ? static_cast<dfb::ChannelMask>(layers & dfb::imageAuxChannels) : dfb::imageAuxChannels;
+    config.image.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
+                            : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
+                                                           : dfb::latticeOwner;
+    if (o.compression == Compression::Auto)
+        config.messages.compression = dfb::CompressionMode::Auto;
+    if (o.compression != Compression::None) {
+#if defined(DFB_HAS_SNAPPY)
+        config.messages.codec = std::make_shared<dfb::SnappyCodec>();
+#else
+        throw std::runtime_error("this dfb_render was built without Snappy");
+#endif
+    }
+#if defined(DFB_HAS_TBB)
+    config.executor = std::make_shared<dfb::TbbExecutor>(threads);
+#else
+    config.executor = std::make_shared<dfb::ThreadExecutor>(threads);
+#endif
+    return config;
+}
+
+inline dfb::NetworkConfig networkOf(const Options& o)
+{
+    dfb::NetworkConfig options;
+    options.sharedMemory = o.sharedMemory;
+    options.peerTimeout = std::chrono::seconds(o.peerTimeout);
+    return options;
+}
+
+inline dfb::World worldOf(const RankScene& scene, const RenderSettings& settings)
+{
+    dfb::World world;
+    const float ghosts = ghostReach(scene.info, settings);
+    const auto box = [](const Box& b) { return dfb::Box3{b.lo, b.hi}; };
+    for (const std::uint32_t id : scene.brickIds)
+        world.add({id, box(scene.bounds[id]), box(scene.bounds[id].padded(ghosts))});
+    return world;
+}
+
+// Layout of the wall that the options ask for; the image size is that of all displays and what the bezels hide.
+inline dfb::WallLayout wallOf(const Options& o, int rankCount)
+{
+    dfb::WallLayout layout;
+    layout.columns = o.wallColumns;
+    layout.rows = o.wallRows;
+    layout.bezelX = layout.bezelY = o.bezel;
+    layout.displayWidth = (o.width - (o.wallColumns - 1) * o.bezel) / o.wallColumns;
+    layout.displayHeight = (o.height - (o.wallRows - 1) * o.bezel) / o.wallRows;
+    for (int d = 0; d < layout.displayCount(); ++d)
+        layout.ranks.push_back(d % rankCount);
+    return layout;
+}
+
+} // namespace example

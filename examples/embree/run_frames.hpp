@@ -1,0 +1,66 @@
+// RunFrames: the frames of a run: a framebuffer with whatever operations the options ask for, and the loop over it.
+// What a run does with its frames does not depend on the operations, and is compiled once.
+#pragma once
+
+#include "options.hpp"
+#include "rank_scene.hpp"
+
+#include <dfb/dfb.hpp>
+#include <dfb/testing/verified.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <vector>
+
+namespace example {
+
+// What a rank renders. It is loaded by way of the framebuffer, so that comes first.
+struct RankWork {
+    std::unique_ptr<RankScene> scene;
+    RenderSettings settings;
+    dfb::World world;
+    std::optional<dfb::SharedWorld> shared;          // where a rank must know of the bricks of others
+    std::function<void(std::int64_t work)> tileDone; // from any thread
+};
+
+class RunFrames {
+public:
+    virtual ~RunFrames() = default;
+
+    // As DistributedFrameBuffer has them.
+    virtual int rank() const = 0;
+    virtual int size() const = 0;
+    virtual const dfb::FrameBufferConfig& config() const = 0;
+    virtual const dfb::TileLayout& layout() const = 0;
+    virtual const dfb::Image& image() const = 0;
+    virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, dfb::Reduce how) = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes) = 0;
+    bool isDisplayRank() const { return rank() == config().image.displayRank; }
+
+    // Null: there is none.
+    virtual const dfb::DisplayWall* wall() const = 0;
+
+    // Begins frame number `frame` of the run, and renders what this rank has to.
+    virtual void start(int frame, const RankWork& work, const dfb::FrameConfig& params) = 0;
+    // How many frames have begun and not ended.
+    virtual int openCount() const = 0;
+    // Of the oldest of them; see Frame. What end() throws leaves it to leaveAll().
+    virtual void addFigure(std::uint64_t key, double value) = 0;
+    virtual dfb::FrameReport end() = 0;
+    // Leaves all of them without end().
+    virtual void leaveAll() = 0;
+};
+
+// Collective. `options` and `verification`, which a compositing that checks itself reports to, must outlive the frames.
+// Throws as the constructor of DistributedFrameBuffer does.
+std::unique_ptr<RunFrames> makeFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
+                                      const dfb::FrameBufferConfig& config, dfb::testing::Verification& verification);
+// For a compositing of single inputs.
+std::unique_ptr<RunFrames> makeSingleFrames(std::shared_ptr<dfb::Connection> connection, const Options& options,
+                                            const dfb::FrameBufferConfig& config,
+                                            dfb::testing::Verification& verification);
+
+} // namespace example
