@@ -27,7 +27,7 @@ struct BlendGroup {
 
     const float* colors[mostLayers]; // RGBA of the run's first pixel
     int layers = 0;
-    bool isFirst = true;         // the layers are in front of all others: the old pixels do not count
+    bool isFirst = true;         // the layers, one at least, are in front of all others: the old pixels do not count
     double minTransmittance = 0; // a pixel that lets less through counts as opaque
 };
 
@@ -204,10 +204,13 @@ template <bool HasLeast>
 struct Avx2Pixel {
     __m256d sum, through;
 
-    DFB_AVX2 DFB_INLINE void clear()
+    // The first layer, added to 0; -0 becomes 0.
+    DFB_AVX2 DFB_INLINE void take(const float* color, double minTransmittance)
     {
-        sum = _mm256_setzero_pd();
-        through = _mm256_set1_pd(1.0);
+        const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
+        sum = _mm256_add_pd(_mm256_setzero_pd(), v);
+        through = _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff));
+        close(minTransmittance);
     }
     DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* transmittance)
     {
@@ -224,6 +227,10 @@ struct Avx2Pixel {
         const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
         sum = _mm256_add_pd(sum, _mm256_mul_pd(through, v));
         through = _mm256_mul_pd(through, _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff)));
+        close(minTransmittance);
+    }
+    DFB_AVX2 DFB_INLINE void close(double minTransmittance)
+    {
         if constexpr (HasLeast) // values below it become 0, a NaN stays
             through = _mm256_and_pd(through, _mm256_cmp_pd(through, _mm256_set1_pd(minTransmittance), _CMP_NLT_UQ));
     }
@@ -234,7 +241,19 @@ template <bool HasLeast>
 struct Avx2Block {
     Avx2Pixel<HasLeast> a, b, c, d;
 
-    DFB_AVX2 DFB_INLINE void clear() { a.clear(), b.clear(), c.clear(), d.clear(); }
+    // Of pixels that lie side by side.
+    DFB_AVX2 DFB_INLINE void take(const float* color, double minTransmittance)
+    {
+        prefetch(color);
+        a.take(color, minTransmittance), b.take(color + 4, minTransmittance);
+        c.take(color + 8, minTransmittance), d.take(color + 12, minTransmittance);
+    }
+    DFB_AVX2 DFB_INLINE void add(const float* color, double minTransmittance)
+    {
+        prefetch(color);
+        a.add(color, minTransmittance), b.add(color + 4, minTransmittance);
+        c.add(color + 8, minTransmittance), d.add(color + 12, minTransmittance);
+    }
     DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* t)
     {
         a.load(rgba, t), b.load(rgba + 4, t + 1), c.load(rgba + 8, t + 2), d.load(rgba + 12, t + 3);
@@ -249,6 +268,13 @@ struct Avx2Block {
         const __m256i withoutSign = _mm256_set1_epi64x(0x7fffffffffffffff);
         return _mm256_testz_si256(_mm256_castpd_si256(any), withoutSign) != 0;
     }
+
+private:
+    // The next row of a tile that is full: streams that jump from layer to layer are not foreseen.
+    DFB_AVX2 DFB_INLINE static void prefetch(const float* color)
+    {
+        _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
+    }
 };
 
 template <bool HasLeast>
@@ -258,20 +284,14 @@ DFB_AVX2 bool blendGroupAvx2(double* rgba, double* transmittance, int count, con
     const std::ptrdiff_t inBlocks = count - count % 4;
     for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
         Avx2Block<HasLeast> block;
+        int k = 0;
         if (group.isFirst)
-            block.clear();
+            block.take(group.colors[k++] + 4 * i, group.minTransmittance);
         else
             block.load(rgba + 4 * i, transmittance + i);
-        for (int k = 0; k < group.layers && !block.isOpaque();)
-            for (const int end = nextLook(k, group.layers); k < end; ++k) {
-                const float* color = group.colors[k] + 4 * i;
-                // The next row of a tile that is full: streams that jump from layer to layer are not foreseen.
-                _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
-                block.a.add(color, group.minTransmittance);
-                block.b.add(color + 4, group.minTransmittance);
-                block.c.add(color + 8, group.minTransmittance);
-                block.d.add(color + 12, group.minTransmittance);
-            }
+        while (k < group.layers && !block.isOpaque())
+            for (const int end = nextLook(k, group.layers); k < end; ++k)
+                block.add(group.colors[k] + 4 * i, group.minTransmittance);
         block.store(rgba + 4 * i, transmittance + i);
         isSeen |= !block.isOpaque();
     }
@@ -285,8 +305,11 @@ DFB_AVX2 void blendFourAvx2(double* rgba, double* transmittance, const float* co
                             const std::uint32_t (*orders)[4], int layers, double minTransmittance)
 {
     Avx2Block<HasLeast> block;
-    block.clear();
-    for (int k = 0; k < layers && !block.isOpaque();)
+    block.a.take(colors[orders[0][0]], minTransmittance);
+    block.b.take(colors[orders[0][1]] + 4, minTransmittance);
+    block.c.take(colors[orders[0][2]] + 8, minTransmittance);
+    block.d.take(colors[orders[0][3]] + 12, minTransmittance);
+    for (int k = 1; k < layers && !block.isOpaque();)
         for (const int end = nextLook(k, layers); k < end; ++k) {
             block.a.add(colors[orders[k][0]], minTransmittance);
             block.b.add(colors[orders[k][1]] + 4, minTransmittance);
