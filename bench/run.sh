@@ -2,7 +2,7 @@
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
 # benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results, one table to
-# docs/performance.md. Half an hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
+# docs/performance.md. An hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
 # of a program, is to start it there, 4 ranks at best, one on each.
 # The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
 set -eu
@@ -12,7 +12,7 @@ cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
 launcher=
 # Each kind of system in its fastest ways
-main_rows="limit|defaults|in order, float32, tiles of 128, to|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
+main_rows="limit|defaults|in order, float32, tiles of 128, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
 while [ $# -gt 0 ]; do
     case $1 in
     --quick)
@@ -52,7 +52,9 @@ for ranks in 4 8; do
     mpiexec -n "$ranks" "$bench"/bench_error_time --frames "$frames" --commit "$commit" \
         --json "$results/error_time.json" --table "$results/error_time.$ranks.md"
 done
-/usr/bin/env python3 bench/compositing/plot_error_time.py "$results/error_time.json" "$results" ||
+python=python3
+"$python" -c 'import matplotlib' 2>/dev/null || python=/usr/bin/python3 # the one that Debian's packages are for
+"$python" bench/compositing/plot_error_time.py "$results/error_time.json" "$results" ||
     echo "run.sh: no pictures of error against time: they need python3 with matplotlib"
 
 # What has been measured at one size tells most; the others show whether it holds.

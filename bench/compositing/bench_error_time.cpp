@@ -54,6 +54,14 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, float32, tiles of 128", {});
     addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, unorm16, tiles of 128",
                                         {WireFormat::Unorm16});
+    DfbSettings inPlace;
+    inPlace.memory = bench::InputMemory::Shared;
+    addDfb<dfb::BasicAlphaBlend<64>>(systems, connection, inputs, "float32, all in place, tiles of 64", inPlace);
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, float32, all in place, tiles of 128",
+                                        inPlace);
+    inPlace.hasBytes = true;
+    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, bytes, all in place, tiles of 128",
+                                        inPlace);
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
     for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})
