@@ -336,12 +336,21 @@ private:
             addToTable(best, {first.scene, size, std::to_string(size_), output});
     }
 
-    // With a head, if the file is new.
+    bool hasTable() const
+    {
+        std::ifstream file(o_.table);
+        for (std::string line; std::getline(file, line);)
+            if (line.rfind("| ", 0) == 0)
+                return true;
+        return false;
+    }
+
+    // With a head, if the file has no table yet.
     void addToTable(const Best& best, const std::array<std::string, 4>& what) const
     {
-        const bool isNew = std::ifstream(o_.table).peek() == std::ifstream::traits_type::eof();
+        const bool isFirst = !hasTable();
         std::ofstream file(o_.table, std::ios::app);
-        if (isNew)
+        if (isFirst)
             file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb defaults [ms] | dfb "
                     "within a level [ms] | "
                     "IceT float [ms] "
