@@ -227,13 +227,8 @@ private:
                     x += some;
                 }
         for (std::size_t word = 0; word < isCovered.size(); ++word)
-            detail::forEachRun(isCovered[word], [&](int at, int count) {
-                const int x = static_cast<int>(64 * word) + at;
-                if (!runs_.empty() && x - (runs_.back().x + runs_.back().count) < narrowGap)
-                    runs_.back().count = x + count - runs_.back().x;
-                else
-                    runs_.push_back({x, count, nullptr});
-            });
+            detail::forEachRun(isCovered[word],
+                               [&](int at, int count) { joinRun(static_cast<int>(64 * word) + at, count); });
     }
 
     // After findEdges().
@@ -279,6 +274,12 @@ private:
             return;
         }
         composite(row, x, count);
+        joinRun(x, count);
+    }
+
+    // Adds pixels of the row to runs(): to the last run, if the gap is narrow.
+    void joinRun(int x, int count)
+    {
         if (!runs_.empty() && !runs_.back().color && x - (runs_.back().x + runs_.back().count) < narrowGap)
             runs_.back().count = x + count - runs_.back().x;
         else
