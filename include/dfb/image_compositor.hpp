@@ -161,7 +161,7 @@ public:
     void resize(int width, int height);
 
 private:
-    std::unique_ptr<detail::Operations> makeOperations() const;
+    std::unique_ptr<detail::Operations> makeOperations(const ImageConfig& image) const;
     void makeEngine(const FrameBufferConfig& config);
     void begin(const FrameConfig& frame);
     void send(const InputImage& image, int place, bool usesDepth);
@@ -189,11 +189,19 @@ public:
     static constexpr ChannelMask neededChannels = colorChannel;
 };
 
+// The tiles are strips, as wide as the picture: then what is read and written of an image is one piece of memory.
+// Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times as long. 8
+// strips a rank share the work well enough; a strip of under 4096 pixels costs more to send than to blend.
 template <class TileOp>
-std::unique_ptr<Operations> plainOperations()
+std::unique_ptr<Operations> stripOperations(const ImageConfig& image, int ranks)
 {
+    auto traits = OperationTraits::of<TileOp, NoPixelOp>();
+    traits.tileWidth = std::clamp(image.width, 1, 4096);
+    const std::int64_t share = std::int64_t{image.width} * image.height / (8 * ranks);
+    const std::int64_t rows = std::clamp<std::int64_t>(share, 4096, 32768) / traits.tileWidth;
+    traits.tileHeight = static_cast<int>(std::clamp<std::int64_t>(rows, 1, 256));
     static const NoFrameData none;
-    auto operations = std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp());
+    auto operations = std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
     operations->offer(none, none);
     return operations;
 }
@@ -202,6 +210,10 @@ std::unique_ptr<Operations> plainOperations()
 class InputTile {
 public:
     using View = TileView<colorChannel | depthChannel, 64>;
+    struct Converted {
+        std::vector<float> color, depth;
+        std::vector<std::uint8_t> color8;
+    };
 
     // `isFlipped`: the image's first row is the last of the picture. `usesDepth`: whether depths are sent.
     InputTile(const InputImage& image, const Region& region, const TileLayout& layout, bool isFlipped, bool usesDepth)
@@ -216,9 +228,9 @@ public:
 
     const Region& valid() const noexcept { return valid_; } // in the picture
 
-    // Returns where the pixels of a tile are; `view` is used for them. Pixels that have to be converted are in memory
-    // of this thread until its next call.
-    InputPixels find(View& view) const
+    // Returns where the pixels of a tile are; `view` is used for them. Pixels that have to be converted are in
+    // `converted`.
+    InputPixels find(View& view, Converted& converted) const
     {
         const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();
         const int row = (isFlipped_ ? height_ - 1 - view.region.y0 : view.region.y0) - held_.y0;
@@ -229,10 +241,7 @@ public:
         view.color = image_.rgba32f ? image_.rgba32f + 4 * first : nullptr;
         view.depth = image_.depth ? image_.depth + first : nullptr;
         if (isConverted_) {
-            static thread_local std::unique_ptr<Converted> converted;
-            if (!converted)
-                converted.reset(new Converted);
-            convert(view, *converted);
+            convert(view, converted);
             return InputPixels(view);
         }
         view.staysUntilEnd = image_.staysUntilEnd;
@@ -242,26 +251,26 @@ public:
     }
 
 private:
-    struct Converted {
-        float color[4 * 64 * 64], depth[64 * 64];
-        std::uint8_t color8[4 * 64 * 64];
-    };
-
-    // Copies the valid pixels to memory with rows of 64 pixels, as a framebuffer wants them.
+    // Copies the valid pixels, as a framebuffer wants them.
     void convert(View& view, Converted& to) const
     {
         const Region some = intersection(view.region, valid_);
         const bool staysBytes = view.color8 && !image_.hasStraightAlpha;
+        const int width = view.region.width();
+        const auto pixels = static_cast<std::size_t>(width) * static_cast<std::size_t>(view.region.height());
+        to.color.resize(staysBytes ? 0 : 4 * pixels);
+        to.color8.resize(staysBytes ? 4 * pixels : 0);
+        to.depth.resize(view.depth ? pixels : 0);
         const int red = image_.isBgra ? 2 : 0, blue = 2 - red;
         for (int y = some.y0 - view.region.y0; y < some.y1 - view.region.y0; ++y)
             for (int x = some.x0 - view.region.x0; x < some.x1 - view.region.x0; ++x) {
-                const std::ptrdiff_t from = y * view.stride + x, at = y * 64 + x;
+                const std::ptrdiff_t from = y * view.stride + x, at = y * width + x;
                 const bool isEmpty = view.depth && view.depth[from] >= image_.farDepth;
                 if (view.depth)
-                    to.depth[at] = isEmpty ? std::numeric_limits<float>::infinity() : view.depth[from];
+                    to.depth.data()[at] = isEmpty ? std::numeric_limits<float>::infinity() : view.depth[from];
                 if (staysBytes) {
                     const std::uint8_t* in = view.color8 + 4 * from;
-                    std::uint8_t* out = to.color8 + 4 * at;
+                    std::uint8_t* out = to.color8.data() + 4 * at;
                     out[0] = in[red], out[1] = in[1], out[2] = in[blue], out[3] = in[3];
                     std::fill_n(out, isEmpty ? 4 : 0, std::uint8_t{0});
                 } else {
@@ -270,16 +279,16 @@ private:
                                            : view.color[4 * from + c];
                     };
                     const float alpha = value(3), factor = image_.hasStraightAlpha ? alpha : 1.0f;
-                    float* out = to.color + 4 * at;
+                    float* out = to.color.data() + 4 * at;
                     out[0] = value(red) * factor, out[1] = value(1) * factor, out[2] = value(blue) * factor;
                     out[3] = alpha;
                     std::fill_n(out, isEmpty ? 4 : 0, 0.0f);
                 }
             }
-        view.stride = 64;
-        view.color8 = staysBytes ? to.color8 : nullptr;
-        view.color = staysBytes ? nullptr : to.color;
-        view.depth = view.depth ? to.depth : nullptr;
+        view.stride = width;
+        view.color8 = staysBytes ? to.color8.data() : nullptr;
+        view.color = staysBytes ? nullptr : to.color.data();
+        view.depth = view.depth ? to.depth.data() : nullptr;
     }
 
     const InputImage& image_;
@@ -300,19 +309,20 @@ DFB_COMPILED_ONCE ImageCompositor::ImageCompositor(std::shared_ptr<Connection> c
     makeEngine(config);
 }
 
-DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOperations() const
+DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOperations(const ImageConfig& image) const
 {
+    const int ranks = connection_->size();
     switch (blend_) {
-    case ImageBlend::ByDepth: return detail::plainOperations<AlphaBlend>();
-    case ImageBlend::InOrder: return detail::plainOperations<detail::BlendBySource>();
+    case ImageBlend::ByDepth: return detail::stripOperations<AlphaBlend>(image, ranks);
+    case ImageBlend::InOrder: return detail::stripOperations<detail::BlendBySource>(image, ranks);
     case ImageBlend::Nearest: break;
     }
-    return detail::plainOperations<DepthComposite>();
+    return detail::stripOperations<DepthComposite>(image, ranks);
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
 {
-    auto operations = makeOperations();
+    auto operations = makeOperations(config.image);
     try {
         engine_ = detail::makeEngine(connection_, config, *operations, 0);
     } catch (const InvalidArgument&) {
@@ -406,7 +416,8 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         static_cast<TileHeader&>(view) = engine_->headerOf(inputs_[i].tile, 0);
         view.generation = 1;
         view.source = source;
-        engine_->setTile(part.find(view));
+        static thread_local detail::InputTile::Converted converted; // with its memory, from tile to tile
+        engine_->setTile(part.find(view, converted));
     });
 }
 

@@ -17,24 +17,28 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Tiles are numbered row by row from the top left. All members are pure and may be called from any thread.
+// Tiles are numbered row by row from the top left. All have one size, cut at the image's border. All members are pure
+// and may be called from any thread.
 class TileLayout {
 public:
     static constexpr int maxImageSize = 1 << 16; // pixels a side
 
     TileLayout() = default;
     // Throws InvalidArgument for a size outside [1, 65536].
-    TileLayout(int width, int height, int tileSize) : width_(width), height_(height), tileSize_(tileSize)
+    TileLayout(int width, int height, int tileSize) : TileLayout(width, height, tileSize, tileSize) {}
+    TileLayout(int width, int height, int tileWidth, int tileHeight)
+        : width_(width), height_(height), tileWidth_(tileWidth), tileHeight_(tileHeight)
     {
         if (width < 1 || height < 1 || width > maxImageSize || height > maxImageSize)
             detail::failArgument("the image size is %dx%d, it must be 1 to 65536 pixels a side", width, height);
-        tilesX_ = (width + tileSize - 1) / tileSize;
-        tilesY_ = (height + tileSize - 1) / tileSize;
+        tilesX_ = (width + tileWidth - 1) / tileWidth;
+        tilesY_ = (height + tileHeight - 1) / tileHeight;
     }
 
     int width() const noexcept { return width_; }
     int height() const noexcept { return height_; }
-    int tileSize() const noexcept { return tileSize_; }
+    int tileWidth() const noexcept { return tileWidth_; }
+    int tileHeight() const noexcept { return tileHeight_; }
     int tilesX() const noexcept { return tilesX_; }
     int tilesY() const noexcept { return tilesY_; }
     int tileCount() const noexcept { return tilesX_ * tilesY_; }
@@ -46,8 +50,8 @@ public:
     // The pixels of a tile, cut at the image's border.
     Region region(int tile) const noexcept
     {
-        const int x0 = column(tile) * tileSize_, y0 = row(tile) * tileSize_;
-        return {x0, y0, std::min(x0 + tileSize_, width_), std::min(y0 + tileSize_, height_)};
+        const int x0 = column(tile) * tileWidth_, y0 = row(tile) * tileHeight_;
+        return {x0, y0, std::min(x0 + tileWidth_, width_), std::min(y0 + tileHeight_, height_)};
     }
 
     // The columns and rows of tiles that meet a region of pixels, half-open; empty if they miss the image.
@@ -56,11 +60,11 @@ public:
         const Region r = intersection(pixels, {0, 0, width_, height_});
         if (r.empty())
             return {};
-        return {r.x0 / tileSize_, r.y0 / tileSize_, (r.x1 - 1) / tileSize_ + 1, (r.y1 - 1) / tileSize_ + 1};
+        return {r.x0 / tileWidth_, r.y0 / tileHeight_, (r.x1 - 1) / tileWidth_ + 1, (r.y1 - 1) / tileHeight_ + 1};
     }
 
 private:
-    int width_ = 0, height_ = 0, tileSize_ = 1;
+    int width_ = 0, height_ = 0, tileWidth_ = 1, tileHeight_ = 1;
     int tilesX_ = 0, tilesY_ = 0;
 };
 

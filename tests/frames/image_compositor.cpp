@@ -299,7 +299,10 @@ struct Failures {
         dfb::FrameBufferConfig config(imageWidth, imageHeight);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::Nearest, config);
-        const std::vector<std::uint8_t> pixels(4 * 300 * 200, 255);
+        std::vector<std::uint8_t> pixels(4 * 300 * 200, 255);
+        for (std::uint32_t i = 0; i < pixels.size(); ++i)
+            if (i % 4 < 3)
+                pixels[i] = static_cast<std::uint8_t>(mixed(i, 0, 0) & 255);
         const std::vector<float> depths(300 * 200, 0.5f);
         const dfb::InputImage good(pixels.data(), depths.data());
         const auto expectGood = [&](int width, int height, const std::string& when) {
@@ -309,7 +312,7 @@ struct Failures {
                 return;
             int wrong = image.width() != width || image.height() != height;
             for (std::size_t i = 0; i < 4 * image.pixelCount(); ++i)
-                wrong += image.rgba8()[i] != 255;
+                wrong += image.rgba8()[i] != pixels[i];
             result.expect(wrong == 0, "a wrong picture after " + when);
         };
         const auto expectError = [&](const dfb::InputImage& image, const char* what, const std::string& part) {
@@ -339,7 +342,9 @@ struct Failures {
                       "startFailed(): " + failed);
         expectGood(imageWidth, imageHeight, "startFailed()");
 
-        for (const auto& [width, height] : {std::make_pair(64, 31), std::make_pair(300, 200)}) {
+        // The second and the third are wider and higher than a strip may be.
+        for (const auto& [width, height] :
+             {std::make_pair(64, 31), std::make_pair(5000, 12), std::make_pair(6, 10000), std::make_pair(300, 200)}) {
             compositor.resize(width, height);
             result.expect(compositor.image().empty(), "an image after resize()");
             expectGood(width, height, "resize()");

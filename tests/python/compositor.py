@@ -35,7 +35,7 @@ def composite(images, depths, places=None, blend="nearest", **options):
         with dfb.ImageCompositor(comm, WIDTH, HEIGHT, blend, **settings) as compositor:
             report = compositor.composite(images[comm.rank], None if depths is None else depths[comm.rank],
                                           None if places is None else places[comm.rank], **options)
-            assert report.frame == 1 and report.tiles_total == 6, report
+            assert report.frame == 1 and report.tiles_total == 4, report  # strips of 27 rows
             return compositor.image, compositor.depth
 
     results = dfb.run_ranks(len(images), rank)

@@ -15,19 +15,20 @@ TEST_CASE("The tiles of a layout cover each pixel once", "[layout]")
 {
     for (const auto& [width, height] : std::vector<std::pair<int, int>>{
              {1, 1}, {1, 37}, {37, 1}, {64, 64}, {65, 63}, {97, 61}, {509, 251}, {8, 8}, {256, 1}, {257, 255}})
-        for (const int size : {8, 16, 64, 256}) {
-            const dfb::TileLayout layout(width, height, size);
+        for (const auto& [tileWidth, tileHeight] :
+             std::vector<std::pair<int, int>>{{8, 8}, {16, 16}, {64, 64}, {256, 256}, {97, 3}, {1, 40}}) {
+            const dfb::TileLayout layout(width, height, tileWidth, tileHeight);
             std::vector<int> covered(static_cast<std::size_t>(width * height));
             bool sane = layout.tileCount() == layout.tilesX() * layout.tilesY();
             for (int tile = 0; tile < layout.tileCount(); ++tile) {
                 const dfb::Region r = layout.region(tile);
-                sane = sane && !r.empty() && r.width() <= size && r.height() <= size && r.x0 % size == 0
-                       && r.y0 % size == 0 && layout.tileAt(layout.column(tile), layout.row(tile)) == tile;
+                sane = sane && !r.empty() && r.width() <= tileWidth && r.height() <= tileHeight && r.x0 % tileWidth == 0
+                       && r.y0 % tileHeight == 0 && layout.tileAt(layout.column(tile), layout.row(tile)) == tile;
                 for (int y = r.y0; y < r.y1; ++y)
                     for (int x = r.x0; x < r.x1; ++x)
                         ++covered.at(static_cast<std::size_t>(y * width + x));
             }
-            INFO(width << "x" << height << " in tiles of " << size);
+            INFO(width << "x" << height << " in tiles of " << tileWidth << "x" << tileHeight);
             CHECK(sane);
             CHECK(std::all_of(covered.begin(), covered.end(), [](int count) { return count == 1; }));
         }
@@ -48,7 +49,7 @@ TEST_CASE("The largest images", "[layout]")
 
 TEST_CASE("tilesIn names exactly the tiles that meet a region", "[layout]")
 {
-    const dfb::TileLayout layout(45, 29, 8);
+    const dfb::TileLayout layout(45, 29, 8, 5);
     std::size_t wrong = 0;
     for (int x0 = -9; x0 < 50; x0 += 4)
         for (int y0 = -9; y0 < 36; y0 += 3)

@@ -16,7 +16,7 @@ namespace detail {
 
 // The traits of a tile operation and a pixel operation; see tile_op.hpp and pixel_op.hpp.
 struct OperationTraits {
-    int tileSize = 64;
+    int tileWidth = 64, tileHeight = 64;
     ChannelMask channels = 0, neededChannels = 0;
     bool activeByDepth = false, emptyIsBackground = false, keepsState = false, endsEarly = false;
     bool opaqueHides = false, reports = false, readsInPlace = false;
@@ -27,7 +27,7 @@ struct OperationTraits {
     static OperationTraits of()
     {
         OperationTraits t;
-        t.tileSize = TileSizeOf<TileOp>::value;
+        t.tileWidth = t.tileHeight = TileSizeOf<TileOp>::value;
         t.channels = TileOp::channels;
         t.neededChannels = NeededChannelsOf<TileOp>::value;
         t.activeByDepth = ActiveByDepth<TileOp>::value;
@@ -86,8 +86,8 @@ public:
     using TileFrameData = typename FrameDataOf<TileOp>::type;
     using PixelFrameData = typename FrameDataOf<PixelOp>::type;
 
-    explicit OperationsOf(PixelOp pixelOp)
-        : Operations(OperationTraits::of<TileOp, PixelOp>()), pixelOp_(std::move(pixelOp))
+    explicit OperationsOf(PixelOp pixelOp, OperationTraits traits = OperationTraits::of<TileOp, PixelOp>())
+        : Operations(std::move(traits)), pixelOp_(std::move(pixelOp))
     {
     }
 

@@ -36,7 +36,7 @@ public:
                  int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
           budget_(budgetOf(config, hasFarRanks)),
-          table_(TileLayout(config.image.width, config.image.height, traits().tileSize),
+          table_(TileLayout(config.image.width, config.image.height, traits().tileWidth, traits().tileHeight),
                  config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
               pool_, table_.layout(),
@@ -67,9 +67,10 @@ public:
     // The most that one message with pixels can have.
     static std::size_t largestMessage(const OperationTraits& traits, const FrameBufferConfig& config)
     {
-        const int size = traits.tileSize;
-        return std::max(largestFragment(size, size, travelling(traits, config)),
-                        FinalGather::largestMessage(size, config.image.format, imageChannels(config)));
+        const int width = traits.tileWidth, height = traits.tileHeight;
+        return std::max(largestFragment(width, height, travelling(traits, config)),
+                        FinalGather::largestMessage(static_cast<std::size_t>(width) * static_cast<std::size_t>(height),
+                                                    config.image.format, imageChannels(config)));
     }
 
     TileTable& table() noexcept { return table_; }
@@ -107,7 +108,7 @@ public:
         const ConstPlanes& planes = tile.planes();
         if (!planes.at[Color])
             return;
-        if (std::abs(tile.stride) < tile.region.width())
+        if (std::abs(tile.stride) < tile.valid.width())
             failArgument("a view of tile %d with rows of %lld pixels", tile.tile, static_cast<long long>(tile.stride));
         for (std::size_t c = 0; c < channelCount; ++c)
             if (!planes.at[c] && hasChannel(sent_, c))

@@ -320,7 +320,7 @@ struct Agreement {
         s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
         s.add(tileOperation, operations.tileOp);
         s.add(pixelOperation, operations.pixelOp);
-        s.add("the size of tiles", operations.tileSize);
+        s.add("the size of tiles", printed("%dx%d", operations.tileWidth, operations.tileHeight));
         s.add("the mask of channels", operations.channels);
         s.add("the mask of channels that travel", sent);
         s.add("width", c.image.width);

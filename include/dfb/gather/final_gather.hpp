@@ -190,10 +190,9 @@ public:
     }
 
     // The most that a message to the display rank can have.
-    static std::size_t largestMessage(int tileSize, OutputFormat format, ChannelMask channels)
+    static std::size_t largestMessage(std::size_t tilePixels, OutputFormat format, ChannelMask channels)
     {
-        const auto pixels = static_cast<std::size_t>(tileSize) * static_cast<std::size_t>(tileSize);
-        return std::max(batchBytes, prefix + FinishedRecord(format, channels).mostBytes(pixels));
+        return std::max(batchBytes, prefix + FinishedRecord(format, channels).mostBytes(tilePixels));
     }
 
     // Room for a finished tile. Write it, then commit().
@@ -551,7 +550,7 @@ private:
     }
     std::size_t maxBatchBytes() const
     {
-        return std::max(batchBytes, record_.mostBytes(pixelsIn({0, 0, layout_.tileSize(), layout_.tileSize()})));
+        return std::max(batchBytes, record_.mostBytes(pixelsIn({0, 0, layout_.tileWidth(), layout_.tileHeight()})));
     }
 
     // `planes`: of the whole image.

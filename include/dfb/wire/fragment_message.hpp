@@ -370,8 +370,8 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
         || p.valid.y1 > region.height())
         failMalformed("valid pixels outside the tile", region.width(), p.valid.x1);
     if (!isSmall(place.stride) || !isSmall(place.color) || !isSmall(place.depth)
-        || std::abs(place.stride) < region.width() || place.color % 4 != 0)
-        failMalformed("rows that cannot be", region.width(), place.stride);
+        || std::abs(place.stride) < p.valid.width() || place.color % 4 != 0)
+        failMalformed("rows that cannot be", p.valid.width(), place.stride);
     // The address of the region's first pixel, which need not lie in the memory itself.
     const auto planeAt = [&](std::int64_t first, std::int64_t pixelBytes) {
         const ByteRange bytes = bytesOfPlane(first, place.stride, p.valid, pixelBytes);

@@ -209,7 +209,7 @@ inline SparseShape shapeOf(const ActiveSpans& active, const Region& region)
         shape.encoding = FragmentEncoding::Dense;
     } else if (active.pixels > 0) {
         shape.encoding = FragmentEncoding::Sparse;
-        shape.spans = static_cast<std::uint16_t>(active.spans.size()); // at most 128 a row, 256 rows
+        shape.spans = static_cast<std::uint16_t>(active.spans.size()); // at most 2^15: a tile has at most 2^16 pixels
         shape.rowBegin = static_cast<std::uint16_t>(active.rowBegin);
         shape.rowEnd = static_cast<std::uint16_t>(active.rowEnd);
     }

@@ -84,7 +84,7 @@ TEST_CASE("Ranks that were built differently learn what differs, and which ranks
     const dfb::ChannelMask more = dfb::colorChannel | dfb::depthChannel | dfb::albedoChannel;
     const dfb::ChannelMask deep = dfb::colorChannel | dfb::depthChannel | dfb::farChannel;
     const std::vector<Case> cases{
-        {"tile size", madeWith<dfb::BasicAlphaBlend<8>>(), {"the size of tiles is 16 on rank 2 and 8 on rank 3"}},
+        {"tile size", madeWith<dfb::BasicAlphaBlend<8>>(), {"the size of tiles is 16x16 on rank 2 and 8x8 on rank 3"}},
         {"channels",
          madeWith<dfb::BasicAlphaBlend<16, more>>(),
          {"the mask of channels is 3 on rank 2 and 11 on rank 3"}},
