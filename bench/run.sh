@@ -12,7 +12,7 @@ cd "$root"
 frames=41 compositing_frames=11 views=12 skip_size=4096x4096 paper_views=8 paper_sizes=256x256,512x512 quick=
 launcher=
 # Each kind of system in its fastest ways
-main_rows="limit|defaults|in order, float32, tiles of 128, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
+main_rows="limit|defaults|in order, float32, to|in order, float32, all in place|in order, bytes, all in place|in order, unorm8|direct|sequential, radix-k,|sequential, tree"
 while [ $# -gt 0 ]; do
     case $1 in
     --quick)
@@ -97,7 +97,7 @@ status=0
 
 if [ -n "$launcher" ]; then
     $launcher "$bench"/bench_compositing --scene bricks --size 1024x1024 --frames "$frames" --commit "$commit" \
-        --only "in order, float32, tiles of 128|in order, float32, snappy|icet: float, direct|icet: float, sequential" \
+        --only "in order, float32, to|in order, float32, snappy|icet: float, direct|icet: float, sequential" \
         --json "$results/network.json" --table "$results/network.md"
 else
     echo "run.sh: no --launcher: nothing was measured over a network"

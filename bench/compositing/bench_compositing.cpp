@@ -44,34 +44,29 @@ struct Options {
 
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
-    const auto connection = bench::makeConnection(inputs.comm, false);
-    using bench::addDfb, dfb::WireFormat, dfb::BasicOrderedBlend, dfb::BasicAlphaBlend;
-    const auto addOrdered = [&](const std::string& wire, const bench::DfbSettings& settings) {
-        addDfb<BasicOrderedBlend<128>>(systems, connection, inputs, "in order, " + wire + ", tiles of 128", settings);
+    using dfb::ImageBlend, dfb::WireFormat;
+    const auto own = bench::makeConnection(inputs.comm, false);
+    const auto add = [&](const std::string& config, ImageBlend blend, const bench::DfbSettings& settings) {
+        bench::addImages(systems, own, inputs, config, blend, settings);
     };
-    addDfb<BasicOrderedBlend<64>>(systems, connection, inputs, "in order, float32, tiles of 64", {});
-    addOrdered("float32", {});
-    bench::DfbSettings inPlace;
-    inPlace.memory = bench::InputMemory::Own;
-    addOrdered("float32, own in place", inPlace);
-    inPlace.memory = bench::InputMemory::Shared;
-    addOrdered("float32, all in place", inPlace);
-    addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, all in place, tiles of 64", inPlace);
-    inPlace.hasBytes = true;
-    addOrdered("bytes, all in place", inPlace);
-    bench::DfbSettings bytes;
-    bytes.hasBytes = true;
-    addOrdered("bytes", bytes);
-    bench::DfbSettings threads;
+    const auto addOrdered = [&](const std::string& config, const bench::DfbSettings& settings) {
+        add("in order, " + config, ImageBlend::InOrder, settings);
+    };
+    bench::DfbSettings shared, bytes, sharedBytes, threads, defaults;
+    shared.isShared = sharedBytes.isShared = true;
+    bytes.hasBytes = sharedBytes.hasBytes = true;
     threads.hasThreads = true;
-    addDfb<BasicOrderedBlend<128>>(systems, bench::makeConnection(inputs.comm, true), inputs,
-                                   "in order, float32, tiles of 128, threads of its own", threads);
-    bench::DfbSettings defaults;
     defaults.hasDefaultThreads = true;
-    addDfb<dfb::AlphaBlend>(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, "float32, defaults",
-                            defaults);
-    addDfb<BasicAlphaBlend<64>>(systems, connection, inputs, "float32, tiles of 64", {});
-    addDfb<BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
+    addOrdered("float32", {});
+    addOrdered("float32, all in place", shared);
+    addOrdered("bytes", bytes);
+    addOrdered("bytes, all in place", sharedBytes);
+    add("float32", ImageBlend::ByDepth, {});
+    add("float32, all in place", ImageBlend::ByDepth, shared);
+    const auto withDefaults = dfb::connect<dfb::MpiTransport>(inputs.comm);
+    bench::addImages(systems, withDefaults, inputs, bench::defaultConfig, ImageBlend::ByDepth, defaults);
+    bench::addImages(systems, bench::makeConnection(inputs.comm, true), inputs, "in order, float32, threads of its own",
+                     ImageBlend::InOrder, threads);
     addOrdered("within half a level", {dfb::HalfLevel{}});
     addOrdered("unorm16", {WireFormat::Unorm16});
     addOrdered("unorm8", {WireFormat::Unorm8});
@@ -80,6 +75,9 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     addOrdered("float32, snappy", {WireFormat::Float32, snappy});
     addOrdered("float32, snappy if faster", {WireFormat::Float32, snappy, 0, false, dfb::CompressionMode::Auto});
 #endif
+    bench::addDfb<dfb::OrderedBlend>(systems, own, inputs, "tiles of 64, in order, float32", {});
+    bench::addDfb<dfb::AlphaBlend>(systems, own, inputs, "tiles of 64, float32", {});
+    bench::addDfb<dfb::AlphaBlend>(systems, withDefaults, inputs, "tiles of 64, float32, default threads", defaults);
 }
 
 void addAllPlain(std::vector<System>& systems, const Inputs& inputs)
@@ -166,7 +164,8 @@ struct Best {
     explicit Best(const std::vector<Result>& results)
         : exact(
             fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, nameOf(dfb::WireFormat::Float32)); })),
-          defaults(fastestOf(results, [](const Result& r) { return isDfb(r) && has(r, "defaults"); })),
+          defaults(fastestOf(results,
+                             [](const Result& r) { return isDfb(r) && r.config.rfind(bench::defaultConfig, 0) == 0; })),
           oneLevel(fastestOf(results, [](const Result& r) { return isDfb(r) && r.levels <= 1; })),
           limit(fastestOf(results, [](const Result& r) { return r.system == "limit"; })),
           icetFloat(fastestOf(results, [](const Result& r) { return r.system == "icet" && has(r, "float, "); })),

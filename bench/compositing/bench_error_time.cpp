@@ -25,48 +25,45 @@ struct Options {
 void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 {
     const auto connection = bench::makeConnection(inputs.comm, false);
-    using bench::addDfb, bench::DfbSettings, dfb::WireFormat;
+    using bench::DfbSettings, dfb::ImageBlend, dfb::WireFormat;
     const auto add = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::AlphaBlend>(systems, connection, inputs, config, settings);
+        bench::addImages(systems, connection, inputs, config, ImageBlend::ByDepth, settings);
     };
     const auto addOrdered = [&](const std::string& config, const DfbSettings& settings) {
-        addDfb<dfb::OrderedBlend>(systems, connection, inputs, config, settings);
+        bench::addImages(systems, connection, inputs, "in order, " + config, ImageBlend::InOrder, settings);
     };
     DfbSettings defaults;
     defaults.isDefault = defaults.hasDefaultThreads = true;
-    addDfb<dfb::AlphaBlend>(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, "float32, defaults",
-                            defaults);
+    bench::addImages(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, bench::defaultConfig,
+                     ImageBlend::ByDepth, defaults);
     add("float32", {});
-    addOrdered("in order, float32", {WireFormat::Float32, {}, 0, true});
+    addOrdered("float32", {WireFormat::Float32, {}, 0, true});
     for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8}) {
         add(nameOf(format), {format});
-        addOrdered(std::string("in order, ") + nameOf(format), {format});
+        addOrdered(nameOf(format), {format});
     }
     for (const double budget : {1e-2, 2e-3, 5e-4, 1e-5}) {
         std::ostringstream name;
         name << "budget " << budget;
         add(name.str(), {dfb::ErrorBudget{budget}});
     }
-    addOrdered("in order, within half a level", {dfb::HalfLevel{}});
+    addOrdered("within half a level", {dfb::HalfLevel{}});
     add("float32, transmittance 1e-3", {WireFormat::Float32, {}, 1e-3f});
-    addDfb<dfb::BasicAlphaBlend<32>>(systems, connection, inputs, "float32, tiles of 32", {});
-    addDfb<dfb::BasicAlphaBlend<128>>(systems, connection, inputs, "float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, float32, tiles of 128", {});
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, unorm16, tiles of 128",
-                                        {WireFormat::Unorm16});
     DfbSettings inPlace;
-    inPlace.memory = bench::InputMemory::Shared;
-    addDfb<dfb::BasicAlphaBlend<64>>(systems, connection, inputs, "float32, all in place, tiles of 64", inPlace);
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, float32, all in place, tiles of 128",
-                                        inPlace);
+    inPlace.isShared = true;
+    add("float32, all in place", inPlace);
+    addOrdered("float32, all in place", inPlace);
     inPlace.hasBytes = true;
-    addDfb<dfb::BasicOrderedBlend<128>>(systems, connection, inputs, "in order, bytes, all in place, tiles of 128",
-                                        inPlace);
+    addOrdered("bytes, all in place", inPlace);
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
     for (const WireFormat format : {WireFormat::Float32, WireFormat::Float16, WireFormat::Unorm8})
         add(std::string(nameOf(format)) + ", snappy", {format, snappy});
 #endif
+    for (const auto& [side, addTiles] : {std::make_pair("32", &bench::addDfb<dfb::BasicAlphaBlend<32>>),
+                                         std::make_pair("64", &bench::addDfb<dfb::BasicAlphaBlend<64>>),
+                                         std::make_pair("128", &bench::addDfb<dfb::BasicAlphaBlend<128>>)})
+        addTiles(systems, connection, inputs, std::string("tiles of ") + side + ", float32", {});
 }
 
 class Bench {

@@ -107,7 +107,7 @@ inline void keepWanted(std::vector<System>& systems, const std::string& only)
     systems.erase(std::remove_if(systems.begin(), systems.end(), isUnwanted), systems.end());
 }
 
-// ---- dfb: inputs that are ready are read where they are
+// ---- dfb: an ImageCompositor, or a framebuffer whose renderer shows it images that are ready, tile by tile
 
 // Each rank has one brick, whose box says no more than which rank that is.
 inline dfb::World worldOf(int rank)
@@ -132,9 +132,8 @@ struct ViewportCamera {
 template <class TileOp>
 inline constexpr bool isOrdered = TileOp::rule == dfb::BlendRule::InOrder;
 
-// Where dfb finds the images: it copies them, or reads them where they lie (TileView::staysUntilEnd), a rank those in
-// its own memory or all ranks those in memory that the node shares.
-enum class InputMemory { Copied, Own, Shared };
+// The row of what a program gets that sets nothing.
+inline const char* const defaultConfig = "float32, defaults";
 
 struct DfbSettings {
     dfb::Precision wire{};
@@ -144,22 +143,23 @@ struct DfbSettings {
     dfb::CompressionMode compression = dfb::CompressionMode::Always;
     bool hasThreads = false;        // a worker; else the executor has none
     bool hasDefaultThreads = false; // those that a framebuffer makes by itself
-    InputMemory memory = InputMemory::Copied;
-    bool hasBytes = false; // images of 8 bits a channel, which are ready
+    bool isShared = false;          // the images lie in memory that the node shares, and are read there
+    bool hasBytes = false;          // images of 8 bits a channel, which are ready
 };
 
 // The pixels of one view as a framebuffer gets them.
 struct DfbImage {
-    template <class FrameBuffer>
-    DfbImage(const FrameBuffer& fb, const PartialImage& image, const DfbSettings& settings)
-        : color(image.rgba.data()), depth(image.depth.data()), staysUntilEnd(settings.memory != InputMemory::Copied)
+    // `dfb`: a framebuffer or an ImageCompositor.
+    template <class Dfb>
+    DfbImage(const Dfb& dfb, const PartialImage& image, const DfbSettings& settings)
+        : color(image.rgba.data()), depth(image.depth.data()), staysUntilEnd(settings.isShared)
     {
         const std::size_t pixels = image.depth.size(), colorBytes = (settings.hasBytes ? 4 : 16) * pixels;
-        if (settings.memory != InputMemory::Shared && !settings.hasBytes)
+        if (!settings.isShared && !settings.hasBytes)
             return;
         std::byte* at = nullptr;
-        if (settings.memory == InputMemory::Shared) {
-            shared = fb.sharedMemory(colorBytes + 4 * pixels);
+        if (settings.isShared) {
+            shared = dfb.sharedMemory(colorBytes + 4 * pixels);
             at = shared.data();
         } else {
             own.resize(colorBytes + 4 * pixels);
@@ -192,7 +192,97 @@ inline std::shared_ptr<Connection> makeConnection(MPI_Comm comm, bool hasThreads
     return dfb::connect<dfb::MpiTransport>(comm, options);
 }
 
-// `inputs` must outlive the systems, here and below.
+inline dfb::FrameBufferConfig configOf(const Inputs& inputs, const DfbSettings& settings, bool toBytes)
+{
+    dfb::FrameBufferConfig c(inputs.image().width, inputs.image().height,
+                             toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F);
+    c.precision = settings.wire;
+    c.messages.codec = settings.codec;
+    c.messages.compression = settings.compression;
+    c.minTransmittance = settings.minTransmittance;
+    if (settings.hasThreads)
+        c.executor = std::make_shared<dfb::ThreadExecutor>(1);
+    else if (!settings.hasDefaultThreads)
+        c.executor = std::make_shared<dfb::CallerExecutor>();
+    return c;
+}
+
+// Adds a system to floats and one to bytes. `start(toBytes)` makes its Compositor.
+template <class Start>
+void addToBoth(std::vector<System>& systems, const std::string& config, const DfbSettings& settings, const Start& start)
+{
+    for (const bool toBytes : {false, true}) {
+        if (settings.hasBytes && !toBytes)
+            continue;
+        System s;
+        s.name = "dfb";
+        s.config = config;
+        s.output = toBytes ? "8 bit" : "float";
+        s.isDefault = settings.isDefault;
+        s.start = [start, toBytes] { return start(toBytes); };
+        systems.push_back(std::move(s));
+    }
+}
+
+// Returns what does `render(renderer)` for each frame, with an object that has `dfb`, a framebuffer or an
+// ImageCompositor, and `report`, that of the last frame.
+template <class Renderer, class Render>
+Compositor compositorOf(const std::shared_ptr<Renderer>& r, bool toBytes, const Trace& trace, const Render& render)
+{
+    Compositor compositor;
+    compositor.frame = [r, render] { r->report = render(*r); };
+    if (toBytes)
+        compositor.bytes = [r] { return r->dfb.image().rgba8(); };
+    else
+        compositor.floats = [r] { return r->dfb.image().rgba32f(); };
+    compositor.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
+    compositor.trafficIsOfAll = true;
+    compositor.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
+    if (trace.sink)
+        compositor.writeTrace = [r, trace] { trace.write(r->dfb); };
+    return compositor;
+}
+
+// Adds an ImageCompositor, which is told no more than IceT is. `inputs` must outlive the systems, here and below.
+inline void addImages(std::vector<System>& systems, const std::shared_ptr<Connection>& connection, const Inputs& inputs,
+                      const std::string& config, dfb::ImageBlend blend, const DfbSettings& settings)
+{
+    struct Renderer {
+        Renderer(const std::shared_ptr<Connection>& sharedConnection, dfb::ImageBlend b,
+                 const dfb::FrameBufferConfig& c)
+            : dfb(sharedConnection, b, c)
+        {
+        }
+        dfb::ImageCompositor dfb;
+        std::vector<DfbImage> images; // by view
+        dfb::FrameReport report;
+    };
+    addToBoth(systems, config, settings, [connection, blend, settings, &inputs](bool toBytes) {
+        dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
+        const Trace trace(inputs.trace);
+        c.trace = trace.sink;
+        const auto r = std::make_shared<Renderer>(connection, blend, c);
+        for (const View& view : inputs.views)
+            r->images.emplace_back(r->dfb, view.image, settings);
+        return compositorOf(r, toBytes, trace, [blend, &inputs](Renderer& by) {
+            const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
+            dfb::InputImage image;
+            image.rgba32f = pixels.color;
+            image.rgba8 = pixels.color8;
+            const auto [left, top, columns, rows] = inputs.image().viewport;
+            image.valid = {left, top, left + columns, top + rows};
+            if (blend == dfb::ImageBlend::InOrder) {
+                const std::vector<int>& order = inputs.order();
+                const auto at = std::find(order.begin(), order.end(), by.dfb.rank());
+                return by.dfb.composite(image, static_cast<int>(at - order.begin()));
+            }
+            image.depth = pixels.depth;
+            return by.dfb.composite(image);
+        });
+    });
+}
+
+// Adds a framebuffer, with a renderer of bricks that shows its tiles.
 template <class TileOp>
 void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& connection, const Inputs& inputs,
             const std::string& config, const DfbSettings& settings)
@@ -200,11 +290,11 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
     using FrameBuffer = dfb::DistributedFrameBuffer<TileOp>;
     struct Renderer {
         Renderer(const std::shared_ptr<Connection>& sharedConnection, const dfb::FrameBufferConfig& c)
-            : fb(sharedConnection, c), world(worldOf(fb.rank())), shared(fb, world), loop(fb, world),
-              orderedLoop(fb, shared, owner)
+            : dfb(sharedConnection, c), world(worldOf(dfb.rank())), shared(dfb, world), loop(dfb, world),
+              orderedLoop(dfb, shared, owner)
         {
         }
-        FrameBuffer fb;
+        FrameBuffer dfb;
         dfb::World world;
         dfb::SharedWorld shared;
         dfb::RoundRobinBricks owner;
@@ -213,70 +303,37 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         std::vector<DfbImage> images; // by view
         dfb::FrameReport report;
     };
-    for (const bool toBytes : {false, true}) {
-        if (settings.hasBytes && !toBytes)
-            continue;
-        dfb::FrameBufferConfig c;
-        c.image.width = inputs.image().width;
-        c.image.height = inputs.image().height;
-        c.image.format = toBytes ? dfb::OutputFormat::RGBA8 : dfb::OutputFormat::RGBA32F;
-        c.precision = settings.wire;
-        c.messages.codec = settings.codec;
-        c.messages.compression = settings.compression;
-        c.minTransmittance = settings.minTransmittance;
-        System s;
-        s.name = "dfb";
-        s.config = config;
-        s.output = toBytes ? "8 bit" : "float";
-        s.isDefault = settings.isDefault;
-        s.start = [c, connection, toBytes, settings, &inputs] {
-            dfb::FrameBufferConfig ownConfig = c;
-            if (settings.hasThreads)
-                ownConfig.executor = std::make_shared<dfb::ThreadExecutor>(1);
-            else if (!settings.hasDefaultThreads)
-                ownConfig.executor = std::make_shared<dfb::CallerExecutor>();
-            const Trace trace(inputs.trace);
-            ownConfig.trace = trace.sink;
-            const auto r = std::make_shared<Renderer>(connection, ownConfig);
-            for (const View& view : inputs.views)
-                r->images.emplace_back(r->fb, view.image, settings);
-            Compositor compositor;
-            compositor.frame = [r, &inputs] {
-                const PartialImage& image = inputs.image();
-                const DfbImage& pixels = r->images[inputs.frame % r->images.size()];
-                const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
-                    view.stride = static_cast<std::size_t>(image.width);
-                    const std::size_t first = static_cast<std::size_t>(view.region.y0) * view.stride
-                                              + static_cast<std::size_t>(view.region.x0);
-                    view.color = pixels.color ? pixels.color + 4 * first : nullptr;
-                    view.color8 = pixels.color8 ? pixels.color8 + 4 * first : nullptr;
-                    view.depth = pixels.depth + first;
-                    view.staysUntilEnd = pixels.staysUntilEnd;
-                    const auto [left, top, columns, rows] = image.viewport; // as IceT has it
-                    view.valid = {left, top, left + columns, top + rows};
-                });
-                const ViewportCamera camera{inputs.viewports()};
-                if constexpr (isOrdered<TileOp>) {
-                    r->report = r->orderedLoop.render(camera, inputs.order(), renderBrick); // bricks are by rank
-                } else {
-                    dfb::FrameConfig params;
-                    params.maxLayers = r->fb.size();
-                    r->report = r->loop.render(camera, renderBrick, params);
-                }
-            };
-            if (toBytes)
-                compositor.bytes = [r] { return r->fb.image().rgba8(); };
-            else
-                compositor.floats = [r] { return r->fb.image().rgba32f(); };
-            compositor.traffic = [r] { return std::make_pair(r->report.bytesSent, r->report.messagesSent); };
-            compositor.trafficIsOfAll = true;
-            compositor.peakMemory = [r] { return static_cast<double>(r->report.peakMemoryBytes); };
-            if (trace.sink)
-                compositor.writeTrace = [r, trace] { trace.write(r->fb); };
-            return compositor;
-        };
-        systems.push_back(std::move(s));
-    }
+    addToBoth(systems, config, settings, [connection, settings, &inputs](bool toBytes) {
+        dfb::FrameBufferConfig c = configOf(inputs, settings, toBytes);
+        const Trace trace(inputs.trace);
+        c.trace = trace.sink;
+        const auto r = std::make_shared<Renderer>(connection, c);
+        for (const View& view : inputs.views)
+            r->images.emplace_back(r->dfb, view.image, settings);
+        return compositorOf(r, toBytes, trace, [&inputs](Renderer& by) {
+            const PartialImage& image = inputs.image();
+            const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
+            const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
+                view.stride = static_cast<std::size_t>(image.width);
+                const std::size_t first =
+                    static_cast<std::size_t>(view.region.y0) * view.stride + static_cast<std::size_t>(view.region.x0);
+                view.color = pixels.color ? pixels.color + 4 * first : nullptr;
+                view.color8 = pixels.color8 ? pixels.color8 + 4 * first : nullptr;
+                view.depth = pixels.depth + first;
+                view.staysUntilEnd = pixels.staysUntilEnd;
+                const auto [left, top, columns, rows] = image.viewport; // as IceT has it
+                view.valid = {left, top, left + columns, top + rows};
+            });
+            const ViewportCamera camera{inputs.viewports()};
+            if constexpr (isOrdered<TileOp>) {
+                return by.orderedLoop.render(camera, inputs.order(), renderBrick); // bricks are by rank
+            } else {
+                dfb::FrameConfig params;
+                params.maxLayers = by.dfb.size();
+                return by.loop.render(camera, renderBrick, params);
+            }
+        });
+    });
 }
 
 // ---- the peers
