@@ -144,6 +144,21 @@ public:
     }
 
     int concurrency() const noexcept override { return static_cast<int>(threads_.size()); }
+    bool hasWorkers() const noexcept override { return resting_ == 0; }
+
+    // The workers rest from now on, or no more; as often false as true. Meanwhile loops and tasks run on threads that
+    // call, as with a CallerExecutor. Any thread.
+    void rest(bool more)
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            resting_ += more ? 1 : -1;
+            if (resting_ > 0 || !hasTasks()) // a task that comes later will find them awake
+                return;
+            signals_ += threads_.size();
+        }
+        wakeUp_.notify_all();
+    }
 
 private:
     struct Loop {
@@ -157,6 +172,8 @@ private:
     {
         {
             std::lock_guard<std::mutex> lock(mutex_);
+            if (resting_ > 0)
+                return;
             ++signals_;
         }
         wakeUp_.notify_one();
@@ -164,7 +181,7 @@ private:
 
     void run(std::size_t count, const std::function<void(std::size_t)>& body) override
     {
-        if (current() == this) {
+        if (current() == this || resting_ > 0) {
             for (std::size_t i = 0; i < count; ++i)
                 body(i);
             return;
@@ -185,7 +202,8 @@ private:
             if (signals_ > 0) {
                 --signals_;
                 lock.unlock();
-                runOne();
+                while (runOne()) {
+                }
                 lock.lock();
             } else if (!loops_.empty()) {
                 Loop* loop = loops_.front();
@@ -214,6 +232,7 @@ private:
     std::condition_variable wakeUp_, loopDone_;
     detail::Fifo<Loop*> loops_;
     std::size_t signals_ = 0;
+    std::atomic<int> resting_{0}; // changes under mutex_
     bool stop_ = false;
     std::vector<std::thread> threads_;
 };

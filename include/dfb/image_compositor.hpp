@@ -24,6 +24,7 @@
 #include <exception>
 #include <limits>
 #include <memory>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -98,14 +99,9 @@ public:
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
     // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
-    // rank's place in the order, 0 in front, a different one on each rank. Collective. Waits and throws as end().
-    FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {})
-    {
-        InputImage staying = image;
-        staying.staysUntilEnd = true;
-        start(staying, place, frame);
-        return end();
-    }
+    // rank's place in the order, 0 in front, a different one on each rank. Without config.executor, on a rank with one
+    // processor, the calling thread does all the work. Collective. Waits and throws as end().
+    FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
     // Does so for the other ways to blend, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
     {
@@ -167,6 +163,7 @@ private:
     void send(const InputImage& image, int place, bool usesDepth);
 
     std::shared_ptr<Connection> connection_;
+    std::shared_ptr<ThreadExecutor> oneThread_; // made here, for a rank with one processor
     ImageBlend blend_;
     bool bottomUp_ = false, isOpen_ = false;
     std::unique_ptr<detail::Operations> operations_;
@@ -205,6 +202,29 @@ std::unique_ptr<Operations> stripOperations(const ImageConfig& image, int ranks)
     operations->offer(none, none);
     return operations;
 }
+
+// Lets the calling thread do the work of `threads` and of the connection's progress thread. Nothing without `threads`.
+class OneThread {
+public:
+    OneThread(ThreadExecutor* threads, Connection& connection) : threads_(threads)
+    {
+        if (!threads)
+            return;
+        threads->rest(true);
+        standIn_.emplace(connection);
+    }
+    OneThread(const OneThread&) = delete;
+    OneThread& operator=(const OneThread&) = delete;
+    ~OneThread()
+    {
+        if (threads_)
+            threads_->rest(false);
+    }
+
+private:
+    ThreadExecutor* threads_;
+    std::optional<Connection::StandIn> standIn_;
+};
 
 // The part of an input image that is in one tile, as a view of pixels that a framebuffer takes.
 class InputTile {
@@ -304,8 +324,12 @@ DFB_COMPILED_ONCE ImageCompositor::ImageCompositor(std::shared_ptr<Connection> c
     : connection_(std::move(connection)), blend_(blend)
 {
     config.framesInFlight = 1;
-    if (!config.executor)
-        config.executor = detail::makeThreads(*connection_);
+    if (!config.executor) {
+        const auto threads = detail::makeThreads(*connection_);
+        config.executor = threads;
+        if (threads->concurrency() == 1)
+            oneThread_ = threads;
+    }
     makeEngine(config);
 }
 
@@ -372,6 +396,16 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
     } catch (...) {
         engine_->abort(std::current_exception(), -1);
     }
+}
+
+DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image, int place, const FrameConfig& frame)
+{
+    // On one processor the thread that waits here anyway does it all.
+    const detail::OneThread alone(oneThread_.get(), *connection_);
+    InputImage staying = image;
+    staying.staysUntilEnd = true;
+    start(staying, place, frame);
+    return end();
 }
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::end()

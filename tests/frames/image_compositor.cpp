@@ -296,8 +296,7 @@ struct Failures {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        dfb::FrameBufferConfig config(imageWidth, imageHeight);
-        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        const dfb::FrameBufferConfig config(imageWidth, imageHeight); // with the threads that it makes itself
         dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::Nearest, config);
         std::vector<std::uint8_t> pixels(4 * 300 * 200, 255);
         for (std::uint32_t i = 0; i < pixels.size(); ++i)

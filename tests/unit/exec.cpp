@@ -184,6 +184,35 @@ TEST_CASE("ThreadExecutor has the workers it says, and they work at once", "[exe
     CHECK(arrived == 3);
 }
 
+TEST_CASE("While the workers of a ThreadExecutor rest, the threads that call do their work", "[executor]")
+{
+    dfb::ThreadExecutor executor(1);
+    executor.rest(true);
+    executor.rest(true);
+    CHECK(!executor.hasWorkers());
+    std::mutex mutex;
+    std::condition_variable changed;
+    std::vector<std::thread::id> threads;
+    const auto note = [&] {
+        const std::lock_guard<std::mutex> lock(mutex);
+        threads.push_back(std::this_thread::get_id());
+        changed.notify_all();
+    };
+    executor.submit(note);
+    executor.parallelFor(2, [&](std::size_t) { note(); });
+    CHECK(threads == std::vector<std::thread::id>(3, std::this_thread::get_id()));
+
+    executor.submit(note);
+    executor.submit(note);
+    executor.rest(false);
+    CHECK(!executor.hasWorkers()); // one is left that wants them to rest
+    executor.rest(false);
+    CHECK(executor.hasWorkers());
+    std::unique_lock<std::mutex> lock(mutex);
+    CHECK(changed.wait_for(lock, std::chrono::seconds(10), [&] { return threads.size() == 5; }));
+    CHECK((threads[3] != std::this_thread::get_id() && threads[4] != std::this_thread::get_id()));
+}
+
 TEST_CASE("Waiting tasks run between the iterations of a loop", "[executor]")
 {
     const auto check = [](dfb::Executor& executor) {

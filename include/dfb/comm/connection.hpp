@@ -146,7 +146,7 @@ public:
 
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
     // may not call MPI. Never blocks.
-    bool poll() { return !progress_.running() && link_->mayPoll() && progress_.tryPoll(); }
+    bool poll() { return (!progress_.running() || progress_.hasStandIn()) && link_->mayPoll() && progress_.tryPoll(); }
 
     // ---- for the objects that it serves
 
@@ -265,13 +265,29 @@ public:
         ProgressThread& progress_;
     };
 
+    // While an object of this type exists, its thread moves messages in place of the progress thread: it stays in calls
+    // that do so. Two threads on one processor would take turns for each message.
+    class StandIn {
+    public:
+        explicit StandIn(Connection& connection) : progress_(connection.progress_) { progress_.standIn(true); }
+        StandIn(const StandIn&) = delete;
+        StandIn& operator=(const StandIn&) = delete;
+        ~StandIn() { progress_.standIn(false); }
+
+    private:
+        ProgressThread& progress_;
+    };
+
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
     // moved.
     bool helpProgress() { return progress_.tryPoll(); }
     bool hasProgressThread() const noexcept { return progress_.running(); }
 
     // Whether a thread that waits must call poll() itself; and whether a progress thread does.
-    bool needsCaller() const noexcept { return link_->needsPolling() && !progress_.running(); }
+    bool needsCaller() const noexcept
+    {
+        return link_->needsPolling() && (!progress_.running() || progress_.hasStandIn());
+    }
     bool mayPoll() const noexcept { return link_->mayPoll(); }
     bool quiet() const { return link_->quiet(); }
     void nap(std::chrono::nanoseconds limit) { link_->nap(limit); }

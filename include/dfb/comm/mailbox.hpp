@@ -488,7 +488,7 @@ private:
     // for a core.
     void waitAwake(FunctionRef<bool()> over)
     {
-        if (!connection_->hasProgressThread())
+        if (!connection_->hasProgressThread() || connection_->needsCaller())
             return;
         for (Alertness alertness(std::chrono::microseconds(200)); !over();) {
             if (executor_->help() || connection_->helpProgress())

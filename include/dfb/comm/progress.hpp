@@ -8,6 +8,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <condition_variable>
 #include <cstdint>
 #include <functional>
 #include <mutex>
@@ -70,6 +71,23 @@ public:
     }
     bool expectsMessages() const noexcept { return expecting_; }
 
+    // A thread that calls tryPoll() all the time stands in for this one from now on, or no more; as often false as
+    // true. Meanwhile this one polls every 2 ms. From any thread.
+    void standIn(bool more)
+    {
+        if (more) {
+            ++standIns_;
+            return;
+        }
+        {
+            const std::lock_guard<std::mutex> lock(standInMutex_);
+            --standIns_;
+        }
+        if (expecting_)
+            standInLeft_.notify_one();
+    }
+    bool hasStandIn() const noexcept { return standIns_ > 0; }
+
     // Somebody waits for messages from now on, or no more; as often false as true. From any thread.
     void hurry(bool more)
     {
@@ -106,6 +124,10 @@ private:
         auto last = Clock::now();
         std::uint64_t polls = 0;
         while (!stop_) {
+            if (hasStandIn()) {
+                std::unique_lock<std::mutex> lock(standInMutex_);
+                standInLeft_.wait_for(lock, std::chrono::milliseconds(2), [this] { return !hasStandIn(); });
+            }
             const bool moved = tryPoll();
             const auto now = Clock::now();
             if (polls_ != polls) {
@@ -129,7 +151,9 @@ private:
     std::mutex pollMutex_;
     std::atomic<std::uint64_t> polls_{0};
     std::atomic<bool> stop_{false}, expecting_{false};
-    std::atomic<int> waiting_{0};
+    std::atomic<int> waiting_{0}, standIns_{0};
+    std::mutex standInMutex_;
+    std::condition_variable standInLeft_;
     std::thread thread_;
 };
 

@@ -72,7 +72,7 @@ DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection>
                                                      Operations& operations, int slot);
 
 // Threads for those processors that this rank of the connection has for itself.
-DFB_COMPILED_ONCE std::shared_ptr<Executor> makeThreads(const Connection& connection);
+DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(const Connection& connection);
 
 } // namespace detail
 DFB_NAMESPACE_END

@@ -351,7 +351,9 @@ public:
         report.wireColor = pipeline_->wireColor();
         report.compressed = compressed;
         report.threads = mailbox_->executor().concurrency();
-        report.progress = mailbox_->connection().needsCaller() ? Progress::Caller : Progress::Thread;
+        const Connection& connection = mailbox_->connection();
+        report.progress =
+            connection.needsCaller() && !connection.hasProgressThread() ? Progress::Caller : Progress::Thread;
         verdict.addTo(report);
         return report;
     }
@@ -855,7 +857,7 @@ private:
 };
 
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE std::shared_ptr<Executor> makeThreads(const Connection& connection)
+DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(const Connection& connection)
 {
     return std::make_shared<ThreadExecutor>(connection.threadShare());
 }
