@@ -187,14 +187,14 @@ public:
 };
 
 // The tiles are strips, as wide as the picture: then what is read and written of an image is one piece of memory.
-// Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times as long. 8
+// Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times as long. 4
 // strips a rank share the work well enough; a strip of under 4096 pixels costs more to send than to blend.
 template <class TileOp>
 std::unique_ptr<Operations> stripOperations(const ImageConfig& image, int ranks)
 {
     auto traits = OperationTraits::of<TileOp, NoPixelOp>();
     traits.tileWidth = std::clamp(image.width, 1, 4096);
-    const std::int64_t share = std::int64_t{image.width} * image.height / (8 * ranks);
+    const std::int64_t share = std::int64_t{image.width} * image.height / (4 * ranks);
     const std::int64_t rows = std::clamp<std::int64_t>(share, 4096, 32768) / traits.tileWidth;
     traits.tileHeight = static_cast<int>(std::clamp<std::int64_t>(rows, 1, 256));
     static const NoFrameData none;
