@@ -107,7 +107,7 @@ private:
 template <class FrameBuffer>
 void tellTiles(const FrameBuffer& fb, LivePicture& picture)
 {
-    picture.tileSize = fb.layout().tileWidth(); // they are square
+    picture.tileSize = fb.layout().tileSize();
     for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
         picture.owners.push_back(fb.tileOwner(tile));
 }

@@ -37,6 +37,7 @@ public:
 
     int width() const noexcept { return width_; }
     int height() const noexcept { return height_; }
+    int tileSize() const noexcept { return tileWidth_; } // of square tiles, as a tile operation has them
     int tileWidth() const noexcept { return tileWidth_; }
     int tileHeight() const noexcept { return tileHeight_; }
     int tilesX() const noexcept { return tilesX_; }
