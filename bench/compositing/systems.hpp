@@ -152,7 +152,7 @@ struct DfbImage {
     // `dfb`: a framebuffer or an ImageCompositor.
     template <class Dfb>
     DfbImage(const Dfb& dfb, const PartialImage& image, const DfbSettings& settings)
-        : color(image.rgba.data()), depth(image.depth.data()), staysUntilEnd(settings.isShared)
+        : color(image.rgba.data()), depth(image.depth.data())
     {
         const std::size_t pixels = image.depth.size(), colorBytes = (settings.hasBytes ? 4 : 16) * pixels;
         if (!settings.isShared && !settings.hasBytes)
@@ -181,7 +181,6 @@ struct DfbImage {
     std::vector<std::byte> own;
     const float *color, *depth;
     const std::uint8_t* color8 = nullptr;
-    bool staysUntilEnd;
 };
 
 // Without `hasThreads` what each rank does is done by one thread, as with the other systems.
@@ -320,7 +319,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
                 view.color = pixels.color ? pixels.color + 4 * first : nullptr;
                 view.color8 = pixels.color8 ? pixels.color8 + 4 * first : nullptr;
                 view.depth = pixels.depth + first;
-                view.staysUntilEnd = pixels.staysUntilEnd;
+                view.staysUntilEnd = pixels.shared.size() > 0;
                 const auto [left, top, columns, rows] = image.viewport; // as IceT has it
                 view.valid = {left, top, left + columns, top + rows};
             });

@@ -146,7 +146,7 @@ public:
 
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
     // may not call MPI. Never blocks.
-    bool poll() { return (!progress_.running() || progress_.hasStandIn()) && link_->mayPoll() && progress_.tryPoll(); }
+    bool poll() { return progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll(); }
 
     // ---- for the objects that it serves
 
@@ -253,30 +253,23 @@ public:
         progress_.expectMessages(expecting_ > 0);
     }
 
-    // While an object of this type exists, the connection looks for messages often.
-    class Hurry {
+    // Tells the progress thread something for as long as an object of this type exists.
+    template <void (ProgressThread::*Tell)(bool)>
+    class Telling {
     public:
-        explicit Hurry(Connection& connection) : progress_(connection.progress_) { progress_.hurry(true); }
-        Hurry(const Hurry&) = delete;
-        Hurry& operator=(const Hurry&) = delete;
-        ~Hurry() { progress_.hurry(false); }
+        explicit Telling(Connection& connection) : progress_(connection.progress_) { (progress_.*Tell)(true); }
+        Telling(const Telling&) = delete;
+        Telling& operator=(const Telling&) = delete;
+        ~Telling() { (progress_.*Tell)(false); }
 
     private:
         ProgressThread& progress_;
     };
-
-    // While an object of this type exists, its thread moves messages in place of the progress thread: it stays in calls
-    // that do so. Two threads on one processor would take turns for each message.
-    class StandIn {
-    public:
-        explicit StandIn(Connection& connection) : progress_(connection.progress_) { progress_.standIn(true); }
-        StandIn(const StandIn&) = delete;
-        StandIn& operator=(const StandIn&) = delete;
-        ~StandIn() { progress_.standIn(false); }
-
-    private:
-        ProgressThread& progress_;
-    };
+    // The connection looks for messages often.
+    using Hurry = Telling<&ProgressThread::hurry>;
+    // The calling thread moves messages in place of the progress thread: it stays in calls that do so. Two threads on
+    // one processor would take turns for each message.
+    using StandIn = Telling<&ProgressThread::standIn>;
 
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
     // moved.
@@ -284,10 +277,7 @@ public:
     bool hasProgressThread() const noexcept { return progress_.running(); }
 
     // Whether a thread that waits must call poll() itself; and whether a progress thread does.
-    bool needsCaller() const noexcept
-    {
-        return link_->needsPolling() && (!progress_.running() || progress_.hasStandIn());
-    }
+    bool needsCaller() const noexcept { return link_->needsPolling() && progress_.needsCaller(); }
     bool mayPoll() const noexcept { return link_->mayPoll(); }
     bool quiet() const { return link_->quiet(); }
     void nap(std::chrono::nanoseconds limit) { link_->nap(limit); }

@@ -87,6 +87,8 @@ public:
             standInLeft_.notify_one();
     }
     bool hasStandIn() const noexcept { return standIns_ > 0; }
+    // Whether messages are moved by threads that call.
+    bool needsCaller() const noexcept { return !running() || hasStandIn(); }
 
     // Somebody waits for messages from now on, or no more; as often false as true. From any thread.
     void hurry(bool more)
