@@ -71,7 +71,7 @@ public:
 
 private:
     mutable std::mutex mutex_;
-    std::array<MessageCount, static_cast<std::size_t>(Kind::Hidden) + 1> counts_{};
+    std::array<MessageCount, static_cast<std::size_t>(Kind::Leaving) + 1> counts_{};
 };
 
 // What ranks share that are counted: their traffic, and a place to meet without messages.

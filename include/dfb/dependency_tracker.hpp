@@ -86,7 +86,9 @@ public:
         ++g.arrived;
         g.children += children;
         if (generationIndex < current_ || (generationIndex == current_ && g.arrived > g.expected))
-            fail(ErrorKind::TooManyInputs, generationIndex, source, rank, g.expected, g.arrived, "");
+            fail(ErrorKind::TooManyInputs, generationIndex, source, rank, g.expected, g.arrived,
+                 generationIndex == 0 ? "a pass of a tile has one input of generation 0: is `generation` set?"
+                                      : "inputs of the generation before have announced fewer children");
         advance();
     }
 
@@ -104,15 +106,18 @@ public:
         info.source = source;
         info.expected = 1;
         info.got = 2;
-        info.message = detail::printed("source %u (in the library's loops: the id of a brick)", source);
+        info.message = detail::printed(
+            "source %u (in the library's loops the id of a brick; in an ImageCompositor the place of an image)",
+            source);
         if (part > 0)
             info.message += detail::printed(" part %d", part);
         if (std::min(rank, otherRank) < 0 || rank == otherRank)
             info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
         else
-            info.message += detail::printed(" comes from rank %d and from rank %d: a brick may be in the World of one "
-                                            "rank only. If several hold it, use SharedWorld and MixedParallelLoop",
-                                            std::min(rank, otherRank), std::max(rank, otherRank));
+            info.message +=
+                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only. For "
+                                "bricks that several ranks hold there are SharedWorld and MixedParallelLoop",
+                                std::min(rank, otherRank), std::max(rank, otherRank));
         throw Error(std::move(info));
     }
 

@@ -9,6 +9,7 @@
 #include <cstdarg>
 #include <cstdint>
 #include <cstdio>
+#include <memory>
 #include <stdexcept>
 #include <string>
 #include <utility>
@@ -44,7 +45,7 @@ DFB_NAMESPACE_END
 DFB_NAMESPACE_BEGIN
 
 enum class ErrorKind : std::uint32_t {
-    InvalidArgument,  // a call with arguments that can never be right
+    InvalidArgument,  // a call with a wrong argument; in a FrameError one between begin() and end()
     TooManyInputs,    // a generation has received more tiles than were announced for it
     DuplicateInput,   // the same (pass, generation, source, part) came twice for one tile
     UnannouncedInput, // an input of a generation or source that nobody announced
@@ -80,8 +81,8 @@ inline const char* toString(ErrorKind kind)
 // An error and its place. A negative number means "does not apply".
 struct ErrorInfo {
     ErrorKind kind = ErrorKind::InvalidArgument;
-    // Where it went wrong: the rank whose code threw, that cancelled or left, passed the wrong argument, or is lost. Of
-    // inputs and messages that are wrong or do not come: the rank that noticed, which need not be to blame.
+    // The rank where it went wrong: its code threw, it cancelled or left the frame, it passed a wrong argument, or it
+    // is lost. For wrong or missing inputs and messages: the rank that noticed, which need not be the one to blame.
     int rank = -1;
     // The rank that the input or message came from. If something did not come (TimedOut, MissingInput, Transport): the
     // rank that is waited for; of an input of a tile, the one that announced it.
@@ -157,7 +158,14 @@ private:
 // A frame failed. Every rank throws the same one out of Frame::end(); the framebuffer can begin a new frame.
 class FrameError : public Error {
 public:
-    using Error::Error;
+    // `whileThrown` lives as long as the exception does.
+    explicit FrameError(ErrorInfo info, std::shared_ptr<const void> whileThrown = {})
+        : Error(std::move(info)), whileThrown_(std::move(whileThrown))
+    {
+    }
+
+private:
+    std::shared_ptr<const void> whileThrown_;
 };
 
 // The transport cannot work or has failed; the framebuffer is of no further use.

@@ -201,11 +201,11 @@ private:
 
     static const char* messageOf(const TraceEvent& e)
     {
-        static constexpr std::array<const char*, 17> names{
+        static constexpr std::array<const char*, 18> names{
             "reduction up", "reduction down", "input",         "manifest", "manifest taken", "finished tiles",
             "tiles done",   "abort",          "ask",           "credit",   "ask for jobs",   "jobs",
-            "image place",  "failure",        "are you there", "present",  "hidden"};
-        static_assert(static_cast<std::size_t>(MessageKind::Hidden) + 1 == names.size());
+            "image place",  "failure",        "are you there", "present",  "hidden",         "leaving"};
+        static_assert(static_cast<std::size_t>(MessageKind::Leaving) + 1 == names.size());
         return names[std::min<std::size_t>(e.message, names.size() - 1)];
     }
     static std::string nameOf(const TraceEvent& e)

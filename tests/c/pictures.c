@@ -433,7 +433,7 @@ static void check_lost(void)
     const double start = MPI_Wtime();
     const int status = dfb_render(fb, bricks, 2, scene_view, scene_projection, draw_and_stop, &is_to_stop);
     const double ms = 1e3 * (MPI_Wtime() - start);
-    expect_error(status, DFB_TRANSPORT_FAILED, "no verdict after 2000 ms", "", "dfb_render");
+    expect_error(status, DFB_TRANSPORT_FAILED, "not all ranks have ended this frame after 2000 ms", "", "dfb_render");
     expect(rank == lost || ms <= 2 * limit_ms + margin_ms, "told in time");
     expect(!dfb_image_rgba8(fb), "no picture");
     expect(dfb_render(fb, bricks, 2, scene_view, scene_projection, draw, NULL) == DFB_TRANSPORT_FAILED, "no other one");

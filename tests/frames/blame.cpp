@@ -123,7 +123,8 @@ struct BlamedConfig {
             {"depth", [](Config& c) { c.image.depth = false; }, "true", "false"},
             {"dither", [](Config& c) { c.image.dither = true; }, "false", "true"},
             {"framesInFlight", [](Config& c) { c.framesInFlight = 2; }, "1", "2"},
-            {"messages.compression", [](Config& c) { c.messages.compression = dfb::CompressionMode::Auto; }, "Always", "Auto"},
+            {"messages.compression", [](Config& c) { c.messages.compression = dfb::CompressionMode::Auto; }, "Always",
+             "Auto"},
             {"messages.poolBytes", [](Config& c) { c.messages.poolBytes = 1 << 28; }, "67108864", "268435456"},
             {"minTransmittance", [](Config& c) { c.minTransmittance = 0.5f; }, "0", "0.5"},
             {"precision.color", [](Config& c) { c.precision = dfb::WireFormat::Float16; }, "float32", "float16"}};
@@ -140,7 +141,9 @@ struct BlamedConfig {
             {[](Config& c) { c.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 99; }; },
              "the owner map gives tile 0 to rank 99 of "},
             {[](Config& c) {
-                 c.image.ownerMap = [](int, const dfb::TileLayout&, int) -> int { throw std::runtime_error("no such map"); };
+                 c.image.ownerMap = [](int, const dfb::TileLayout&, int) -> int {
+                     throw std::runtime_error("no such map");
+                 };
              },
              "no such map"}};
         const scene::Scene s = scene::makeScene(3);
@@ -277,8 +280,9 @@ struct BlamedTree {
             }
             expectText(result, "a brick of two ranks", text,
                        {"dfb: duplicate input: noticed by rank ", "generation 1, source 7",
-                        "source 7 (in the library's loops: the id of a brick) comes from " + rankText(first)
-                            + " and from " + rankText(second),
+                        "source 7 (in the library's loops the id of a brick; in an ImageCompositor the place of an "
+                        "image) comes from "
+                            + rankText(first) + " and from " + rankText(second),
                         "SharedWorld"});
             result.expect(error.source == 7 && error.from == second
                               && error.rank == fb.tileOwner(static_cast<int>(error.tile)),
@@ -298,7 +302,9 @@ struct BlamedTree {
         });
         expectText(result, "an input that comes twice", text,
                    {"dfb: duplicate input: noticed by " + rankText(owner) + ", from " + rankText(size - 1), "tile 5",
-                    "source 50 (in the library's loops: the id of a brick) comes twice from " + rankText(size - 1)});
+                    "source 50 (in the library's loops the id of a brick; in an ImageCompositor the place of an image) "
+                    "comes twice from "
+                        + rankText(size - 1)});
         result.expect(!scene::has(text, "SharedWorld"), text);
         expectGoodFrame(result, fb, s, "an input that comes twice");
         return result;
@@ -366,6 +372,65 @@ struct BlamedLoop {
     }
 };
 
+// A frame's error that ends the framebuffer, too: one rank has it first, and its leaving must not hide it from others.
+struct BlamedOutside {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        dfb::FrameBufferConfig config(64, 48);
+        config.quiet = std::chrono::milliseconds(1);
+        for (int round = 0; round < 10; ++round) {
+            const std::string text = scene::outcomeOf([&] {
+                BlameFrameBuffer<Transport> fb(communicator, config);
+                auto frame = fb.begin();
+                frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
+                    tile.children = 1; // which nobody sends
+                    frame.setTile(tile);
+                });
+                frame.end();
+            });
+            expectText(result, "an error that leaves the framebuffer's scope", text,
+                       {"FrameError: dfb: missing input"});
+        }
+        return result;
+    }
+};
+
+// A rank that destroys its framebuffer while the others go on.
+struct BlamedLeaving {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Fb = BlameFrameBuffer<Transport>;
+        Result result;
+        const scene::Scene s = scene::makeScene(3);
+        const int size = Fb(communicator, configOf(s)).size();
+        const std::vector<std::pair<std::string, std::function<void(Fb&)>>> calls{
+            {"frame 2", [&](Fb& fb) { scene::renderLoop(fb, s, scene::Loop::Declared); }},
+            {"collective call", [](Fb& fb) { fb.imageOnAllRanks(); }}};
+        for (const int leaver : oddRanks(size))
+            for (const auto& [name, call] : calls) {
+                int rank = -1;
+                const std::string text = scene::outcomeOf([&, &call = call] {
+                    Fb fb(communicator, configOf(s));
+                    rank = fb.rank();
+                    scene::renderLoop(fb, s, scene::Loop::Declared);
+                    if (rank != leaver)
+                        call(fb);
+                });
+                if (rank == leaver)
+                    result.expect(text == "fine", "a rank that leaves in order: " + text);
+                else
+                    expectText(
+                        result, "a rank that leaves", text,
+                        {"TransportError: ", rankText(leaver) + ": it has destroyed its framebuffer after frame 1",
+                         "is in " + name});
+            }
+        return result;
+    }
+};
+
 } // namespace frame_cases
 
 TEST_CASE("Parameters of frames that differ are named, with ranks and values", "[blame]")
@@ -383,4 +448,12 @@ TEST_CASE("Inputs that are missing or come twice are named, with their ranks", "
 TEST_CASE("An exception between begin() and end() is told to all ranks", "[blame]")
 {
     everywhere<frame_cases::BlamedLoop>();
+}
+TEST_CASE("A frame's error is the same on all ranks when it ends their framebuffers", "[blame]")
+{
+    everywhere<frame_cases::BlamedOutside>();
+}
+TEST_CASE("A rank that destroys its framebuffer is named on ranks that go on", "[blame]")
+{
+    everywhere<frame_cases::BlamedLeaving>();
 }

@@ -602,13 +602,14 @@ private:
         case Cancel:
         case Leave: kinds = {ErrorKind::Cancelled}; break;
         case OtherBackground: kinds = {ErrorKind::Disagreement}; break;
+        case NoDeclaration: kinds = {ErrorKind::InvalidArgument}; break;
         case Duplicate: kinds = {ErrorKind::DuplicateInput}; break;
         case WrongGeneration: kinds = {ErrorKind::UnannouncedInput}; break;
         case OneTooMany: kinds = {ErrorKind::TooManyInputs, ErrorKind::UnannouncedInput}; break;
         default: break;
         }
         if (isExtraInput(fault.kind) && isImageParallel(loop_))
-            kinds.insert(ErrorKind::UserCode); // the operation itself refuses it
+            kinds.insert(ErrorKind::InvalidArgument); // the operation itself refuses it
         expect(kinds.count(error.kind) > 0, ending.text);
         const bool mine = fault.culprit == fb_.rank();
         if (isExtraInput(fault.kind)) {

@@ -59,7 +59,7 @@ struct Way {
 // else to be done, such as an answer.
 enum How : std::uint8_t { NextFrame = 1, LastFrame = 2, OtherHeader = 3, numbered = 3, ToAnother = 4, Awaited = 8 };
 constexpr std::uint8_t kinds = 31, endOfFrame = 31; // in place of a kind
-static_assert(static_cast<int>(MessageKind::Hidden) < endOfFrame);
+static_assert(static_cast<int>(MessageKind::Leaving) < endOfFrame);
 
 // Tasks run where they are submitted, but never within the delivery of a message, which holds locks.
 class TaskList final : public dfb::Executor {

@@ -492,13 +492,18 @@ TEST_CASE("An input that comes twice: from which ranks, and what to do about a b
         }
         return std::string("nothing");
     };
-    const std::string two = "source 7 (in the library's loops: the id of a brick) part 2 comes from rank 1 and from "
-                            "rank 4: a brick may be in the "
-                            "World of one rank only. If several hold it, use SharedWorld and MixedParallelLoop";
+    const std::string two = "source 7 (in the library's loops the id of a brick; in an ImageCompositor the place of an "
+                            "image) part 2 comes from rank 1 and from "
+                            "rank 4: it may be that of one rank only. For bricks that several ranks hold there are "
+                            "SharedWorld and MixedParallelLoop";
     CHECK(textOf(1, 4) == two);
     CHECK(textOf(4, 1) == two); // whichever came first
-    CHECK(textOf(4, 4) == "source 7 (in the library's loops: the id of a brick) part 2 comes twice from rank 4");
-    CHECK(textOf(-1, -1) == "source 7 (in the library's loops: the id of a brick) part 2 comes twice");
+    CHECK(textOf(4, 4)
+          == "source 7 (in the library's loops the id of a brick; in an ImageCompositor the place of an image) part 2 "
+             "comes twice from rank 4");
+    CHECK(textOf(-1, -1)
+          == "source 7 (in the library's loops the id of a brick; in an ImageCompositor the place of an image) part 2 "
+             "comes twice");
 }
 
 } // namespace dependency_tracker_cases

@@ -35,7 +35,7 @@ public:
 
 // When messages are compressed, if there is a codec.
 enum class CompressionMode : std::uint8_t {
-    Always,
+    Always, // every message with pixels for another rank, also within a node
     // Between nodes, in frames where compressing has turned out to be faster. All ranks try a few frames with it and a
     // few without, take the better, and try the other again now and then. Each rank leaves out the ranks for which its
     // messages do not become smaller.

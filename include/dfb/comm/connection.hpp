@@ -121,11 +121,11 @@ public:
         }
     }
 
-    // Waits for the other ranks, unless an exception is passing: they may never come here then, so it tells them and
-    // leaves.
+    // Waits for the other ranks, unless an exception is passing that they do not get: they may never come here then, so
+    // it tells them and leaves.
     ~Connection()
     {
-        if (std::uncaught_exceptions() > exceptions_)
+        if (std::uncaught_exceptions() > exceptions_ && thrownByAll_.expired())
             leave("an exception has ended its connection");
         end();
     }
@@ -251,6 +251,15 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         expecting_ += expect ? 1 : -1;
         progress_.expectMessages(expecting_ > 0);
+    }
+
+    // Returns what the exception that all ranks throw now must keep: while it does, the connection ends in order.
+    std::shared_ptr<const void> throwByAll()
+    {
+        auto whileThrown = std::make_shared<char>();
+        const std::lock_guard<std::mutex> lock(failureMutex_);
+        thrownByAll_ = whileThrown;
+        return whileThrown;
     }
 
     // Tells the progress thread something for as long as an object of this type exists.
@@ -558,6 +567,7 @@ private:
 
     mutable std::mutex failureMutex_;
     std::optional<ErrorInfo> failure_;
+    std::weak_ptr<const void> thrownByAll_; // under failureMutex_
     std::atomic<bool> failed_{false};
 
     ProgressThread progress_{*link_, longestNap(),

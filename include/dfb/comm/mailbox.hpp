@@ -18,6 +18,7 @@
 #include <condition_variable>
 #include <cstdint>
 #include <cstring>
+#include <exception>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -78,9 +79,13 @@ public:
 
     ~Mailbox() { stop(); }
 
-    // Ends the calls of the handler, and waits for those under way.
+    // Ends the calls of the handler, and waits for those under way. Tells the others, for one that still waits for this
+    // rank.
     void stop()
     {
+        if (!isEnding_ && !failed())
+            for (const int neighbour : reductions_.neighbours())
+                sendBody(neighbour, MessageKind::Leaving, epoch_, Leaving{reductionCount_, std::uncaught_exceptions()});
         connection_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);
         isEnding_ = true;
@@ -107,6 +112,7 @@ public:
         epoch_ = number;
         sentOn_ = takenOn_ = 0;
         flow_.newEpoch();
+        checkLeft();
     }
     FlowControl& flow() noexcept { return flow_; }
 
@@ -361,6 +367,7 @@ public:
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         const std::int64_t number = reductionCount_++;
         auto damage = takeDamage(); // now: the others go on when they have this rank's part
+        checkLeft();
         connection_->expectMessages(true);
         try {
             try {
@@ -533,7 +540,8 @@ private:
         switch (kind) {
         case MessageKind::Credit:
         case MessageKind::CreditRequest:
-        case MessageKind::ImagePlace: return false;
+        case MessageKind::ImagePlace:
+        case MessageKind::Leaving: return false;
         default: return !isOwnReduction(kind, message) && !(isReduction(kind) && scopeOf(message) == quietScope);
         }
     }
@@ -572,6 +580,43 @@ private:
         event->byteCount = static_cast<std::int64_t>(message.size());
         event->peer = peer;
         event->sequence = header.sequence;
+    }
+
+    // The body of the message: how many calls of reduce() the rank has begun, and how many exceptions are passing
+    // there.
+    struct Leaving {
+        std::int64_t reductions, exceptions;
+    };
+
+    // A neighbour in the tree of reductions that has destroyed its object, and the last epoch that it has begun.
+    struct Left {
+        int rank;
+        std::int64_t epoch;
+        Leaving how;
+    };
+
+    // What this rank has begun after such a rank has left would never end.
+    void checkLeft()
+    {
+        std::vector<Left> all;
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            all = left_;
+        }
+        for (const Left& left : all) {
+            if (epoch_ <= left.epoch && reductionCount_ <= left.how.reductions)
+                continue;
+            ErrorInfo error;
+            error.kind = ErrorKind::Transport;
+            error.rank = left.rank;
+            const bool isInFrame = epoch_ > left.epoch, isThrown = left.how.exceptions > 0;
+            error.message = printed("%s its framebuffer after frame %lld, and rank %d is in %s %lld%s",
+                                    isThrown ? "an exception has ended" : "it has destroyed",
+                                    static_cast<long long>(left.epoch), rank(), isInFrame ? "frame" : "collective call",
+                                    static_cast<long long>(isInFrame ? epoch_ : reductionCount_),
+                                    isThrown ? "" : ": all ranks must make the same calls");
+            connection_->giveUp(error);
+        }
     }
 
     struct Arrival {
@@ -617,6 +662,15 @@ private:
         TraceSpan span(trace_, TraceEvent::Kind::Receive, epoch_);
         trace(span, a.source, a.header, a.message);
         try {
+            if (a.header.kind == MessageKind::Leaving) {
+                const Left left{a.source, a.header.number, bodyOf<Leaving>(a.message)};
+                {
+                    const std::lock_guard<std::mutex> lock(mutex_);
+                    left_.push_back(left);
+                }
+                checkLeft();
+                return;
+            }
             if (isReduction(a.header.kind)) {
                 if (a.message.size() < sizeof a.header + sizeof(std::uint32_t))
                     failMalformed("a reduction without a scope");
@@ -627,7 +681,7 @@ private:
                 }
             }
         } catch (const Error& e) {
-            giveUp(a.source, e.info()); // a rank waits for this reduction in any case
+            giveUp(a.source, e.info()); // a rank waits for this in any case
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
@@ -669,6 +723,7 @@ private:
     std::mutex mutex_;
     std::condition_variable changed_;
     Fifo<Arrival> inbox_;
+    std::vector<Left> left_;
     int tasks_ = 0; // submitted and not yet done
     bool isEnding_ = false;
 };

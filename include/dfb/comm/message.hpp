@@ -123,12 +123,13 @@ enum class MessageKind : std::uint8_t {
     Failure,       // the sender's connection cannot go on, nor can ranks that wait for it
     AreYouThere,   // to be answered at once with the next
     Present,       // the sender is there, and answers whenever it is asked
-    Hidden         // from which generation on inputs of a tile cannot be seen
+    Hidden,        // from which generation on inputs of a tile cannot be seen
+    Leaving        // the sender destroys its object, and takes part in nothing that begins from now on
 };
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 9;
+    static constexpr std::uint8_t formatVersion = 10;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;
@@ -183,7 +184,7 @@ inline MessageHeader readMessageHeader(const Buffer& message)
     if (header.version != MessageHeader::formatVersion)
         failMalformed("the sender was built with another version of dfb, or of its wire format",
                       MessageHeader::formatVersion, header.version);
-    if (header.kind > MessageKind::Hidden)
+    if (header.kind > MessageKind::Leaving)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;
 }

@@ -95,15 +95,17 @@ public:
     static constexpr int postedPackets = 8;                         // receives; their memory is said above
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
-    // Collective over `communicator`. Throws TransportError if MPI is not initialised, is finalised, or was initialised
-    // below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all ranks if they were built with different packet
-    // formats, or if one of them cannot make its transport, with its rank and the reason. The others cannot be told,
-    // and wait, only if a collective of MPI fails on one rank, or finds no memory there for its result. Below
-    // MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
+    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL. Throws TransportError if MPI is not
+    // initialised, is finalised, or was initialised below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all
+    // ranks if they were built with different packet formats, or if one of them cannot make its transport, with its
+    // rank and the reason. The others cannot be told, and wait, only if a collective of MPI fails on one rank, or finds
+    // no memory there for its result. Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(std::move(pool)), packet_(pool_)
     {
         checkLevel(progress);
+        if (communicator == MPI_COMM_NULL)
+            detail::failArgument("the communicator is MPI_COMM_NULL: only ranks that have one can take part");
         duplicate(communicator);
         Reason wrong{};
         attempt(wrong, [this] { prepare(); });
@@ -223,7 +225,12 @@ public:
     // come; MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
-        if (orderly && !failed_) {
+        int finalized = 0;
+        MPI_Finalized(&finalized);
+        if (finalized) {
+            std::fputs("dfb: MPI_Finalize() was called before the last framebuffer, compositor or wall was destroyed\n",
+                       stderr);
+        } else if (orderly && !failed_) {
             if (guarded([this] { return finish(); }))
                 return;
             flush();

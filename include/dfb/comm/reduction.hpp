@@ -47,6 +47,15 @@ public:
         }
     }
 
+    // The ranks that this one exchanges parts and results with.
+    std::vector<int> neighbours() const
+    {
+        std::vector<int> all = children_;
+        if (rank_ != 0)
+            all.push_back(parent());
+        return all;
+    }
+
     // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1: a
     // text follows, on arrays that are not equally long. Throws Error (MalformedMessage).
     template <class Operation>

@@ -332,7 +332,7 @@ public:
         EndOfFrame ending{*this};
         const Verdict verdict = outcome_->conclude();
         if (verdict.error && !outcome_->isPartial(verdict))
-            throw FrameError(*verdict.error);
+            throw FrameError(*verdict.error, mailbox_->connection().throwByAll());
         const bool compressed = compression_->isOn();
         pipeline_->fillBackground();
         if (!verdict.error) {

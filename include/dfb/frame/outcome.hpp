@@ -430,7 +430,7 @@ private:
         if (!frame_.areTilesKnown()) {
             info.message = "not all ranks have declared their inputs";
             info.expected = mailbox_.size();
-            addWaitedFor(info, "no word from", {AllDeclared, frame_.number()});
+            addWaitedFor(info, {AllDeclared, frame_.number()});
         } else if (!frame_.areTilesFinished()) {
             if (const auto tile = tiles_.table().missing(terms_.declared))
                 info = *tile;
@@ -442,7 +442,8 @@ private:
             info.expected = tiles_.gather().senderCount();
             info.got = tiles_.gather().ranksComplete();
         } else {
-            addWaitedFor(info, "no verdict from", verdictKey());
+            info.message = "not all ranks have ended this frame";
+            addWaitedFor(info, verdictKey());
         }
         info.kind = kind;
         if (const std::string lost = mailbox_.connection().lost(); kind == ErrorKind::TimedOut && !lost.empty())
@@ -451,12 +452,12 @@ private:
     }
 
     // Says whose part of a reduction this rank waits for, and in `from`, if there is only one that it can be.
-    void addWaitedFor(ErrorInfo& info, const char* what, const ReductionKey& key)
+    void addWaitedFor(ErrorInfo& info, const ReductionKey& key)
     {
         const auto missing = mailbox_.reductions().missing(key);
         std::string text;
         for (const auto& part : missing) {
-            text += printed("%s rank %d", text.empty() ? what : ",", part.rank);
+            text += printed("%s rank %d", text.empty() ? "waiting for" : ",", part.rank);
             if (part.rank < mailbox_.rank())
                 text += ", through which the result comes";
             else if (part.last > part.rank)
@@ -473,8 +474,9 @@ private:
     {
         ErrorInfo info = placed({});
         info.kind = ErrorKind::Transport;
-        info.message = printed("no verdict after %lld ms", static_cast<long long>(after.count()));
-        addWaitedFor(info, "no verdict from", verdictKey());
+        info.message =
+            printed("not all ranks have ended this frame after %lld ms", static_cast<long long>(after.count()));
+        addWaitedFor(info, verdictKey());
         if (const std::string lost = mailbox_.connection().lost(); !lost.empty())
             info.message += "; " + lost;
         mailbox_.connection().giveUp(info);

@@ -46,8 +46,6 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
         info.kind = ErrorKind::UserCode;
         info.message = "an exception that is not a std::exception";
     }
-    if (info.kind == ErrorKind::InvalidArgument)
-        info.kind = ErrorKind::UserCode; // of a call within a renderer or an op
     const auto fill = [](std::int64_t& to, std::int64_t from) { to = to < 0 ? from : to; };
     if (info.from < 0)
         info.from = where.from;
@@ -318,13 +316,13 @@ struct Agreement {
             owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
         Settings s;
         s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
+        s.add("width", c.image.width);
+        s.add("height", c.image.height);
         s.add(tileOperation, operations.tileOp);
         s.add(pixelOperation, operations.pixelOp);
         s.add("the size of tiles", printed("%dx%d", operations.tileWidth, operations.tileHeight));
         s.add("the mask of channels", operations.channels);
         s.add("the mask of channels that travel", sent);
-        s.add("width", c.image.width);
-        s.add("height", c.image.height);
         s.add("format", nameOf(c.image.format));
         s.add("depth", c.image.depth);
         s.add("aux", c.image.aux);

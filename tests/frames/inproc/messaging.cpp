@@ -523,8 +523,9 @@ TEST_CASE("A damaged vote or verdict does not hang a frame that has no time-out"
             CHECK(d.wrong == 0);
             // Who has the verdict has a frame that ended well; it learns of the end of the others in the next one.
             CHECK(has(d.texts[1], "TransportError"));
-            CHECK((kind == MessageKind::ReduceDown || has(d.texts[0], "no verdict after 300 ms")
-                   || has(d.texts[1], "no verdict after 300 ms")));
+            CHECK((kind == MessageKind::ReduceDown
+                   || has(d.texts[0], "not all ranks have ended this frame after 300 ms")
+                   || has(d.texts[1], "not all ranks have ended this frame after 300 ms")));
             CHECK((d.texts[0] == "fine" ? has(d.after[0], "TransportError") : has(d.texts[0], "TransportError")));
         });
 }

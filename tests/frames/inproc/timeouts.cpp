@@ -441,7 +441,7 @@ TEST_CASE("A rank that does not call end(): the others get their error while it 
             CHECK(e.error->kind == dfb::ErrorKind::TimedOut);
             CHECK(e.ms < 2 * limitMs + marginMs);
         }
-        CHECK(has(o.endings[0].text, "no verdict from rank"));
+        CHECK(has(o.endings[0].text, "waiting for rank"));
         CHECK(o.sawFailure);
         CHECK(o.wrong == 0);
     });
@@ -504,10 +504,10 @@ TEST_CASE("One lost message of each kind: an error in time, on every rank", "[ti
         {"answer to a manifest", MessageKind::ManifestAck, 0, "declared", true},
         {"finished tiles", MessageKind::FinishedTiles, 0, "finished tiles have not come from rank", true},
         {"count of finished tiles", MessageKind::TilesDone, 0, "finished tiles have not come from rank", true},
-        {"all have declared, up", MessageKind::ReduceUp, AllDeclared, "from rank", true},
-        {"all have declared, down", MessageKind::ReduceDown, AllDeclared, "from rank", true},
-        {"vote", MessageKind::ReduceUp, FrameVerdict, "no verdict", false},
-        {"verdict", MessageKind::ReduceDown, FrameVerdict, "no verdict", false}};
+        {"all have declared, up", MessageKind::ReduceUp, AllDeclared, "waiting for rank", true},
+        {"all have declared, down", MessageKind::ReduceDown, AllDeclared, "waiting for rank", true},
+        {"vote", MessageKind::ReduceUp, FrameVerdict, "not all ranks have ended", false},
+        {"verdict", MessageKind::ReduceDown, FrameVerdict, "not all ranks have ended", false}};
     struct Case {
         Loss loss;
         int ranks, nth; // not always the first of its kind
