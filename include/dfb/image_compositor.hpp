@@ -45,8 +45,9 @@ struct InputImage {
     explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
     explicit InputImage(const float* floats, const float* depths = nullptr) : rgba32f(floats), depth(depths) {}
 
-    // One of these; 8-bit colours are sent as 8 bits and blended exactly. Level k counts as k / 255: images that are
-    // encoded for a display are blended as they are, so ask for OutputFormat::RGBA8.
+    // Set one of the two. 8-bit colours are sent as bytes; level k means the float next to k / 255. Images that are
+    // encoded for a display (sRGB) are blended without decoding: ask for OutputFormat::RGBA8, which does not encode
+    // them a second time.
     const std::uint8_t* rgba8 = nullptr;
     const float* rgba32f = nullptr;
     const float* depth = nullptr;  // grows away from the camera
@@ -55,7 +56,8 @@ struct InputImage {
     bool isBgra = false;           // bytes are blue, green, red, alpha
     bool hasStraightAlpha = false; // colours are not multiplied by alpha yet; 8-bit ones then travel as floats
     float farDepth = std::numeric_limits<float>::infinity(); // a pixel at this depth or beyond is empty; 1 in OpenGL
-    // The part of the picture that the memory holds; empty: all of it. x counts from the left, y from the first row.
+    // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
+    // left, y from the first row in memory. {0, 0, 0, 0}: all of it. Another one without pixels: nothing to show.
     Region region{0, 0, 0, 0};
     // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
@@ -82,7 +84,7 @@ public:
 
     ImageCompositor(const ImageCompositor&) = delete;
     ImageCompositor& operator=(const ImageCompositor&) = delete;
-    // An open picture fails on all ranks.
+    // Collective. Waits for all ranks. Must come before MPI_Finalize(). An open picture fails on all ranks.
     ~ImageCompositor()
     {
         if (isOpen_)
@@ -94,8 +96,8 @@ public:
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
     const FrameBufferConfig& config() const noexcept { return engine_->config(); }
 
-    // Sets whether image() has its lowest row first, as OpenGL takes it. The default is its top row. All ranks must
-    // give the same, while no picture is open.
+    // True: row 0 of image() is the lowest row, as OpenGL takes it. False, the default: the top row. Call it with the
+    // same value on all ranks while no picture is open; nobody checks that. Waits for nothing.
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
     // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
@@ -108,10 +110,11 @@ public:
         return composite(image, -1, frame);
     }
 
-    // Reads this rank's image and sends it. Its memory may be used again when this returns, unless you have promised
-    // InputImage::staysUntilEnd. Waits for another rank only
-    // if this one has too much under way (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open. If
-    // the image is wrong, end() throws on all ranks.
+    // Begins a picture: reads this rank's image and sends it. Every rank must call start() or startFailed() once for
+    // each picture, then end(). The image's memory may be used again when this returns, unless you have promised
+    // InputImage::staysUntilEnd. Waits for another rank only if this one has too much under way
+    // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, and TransportError. If the image is
+    // wrong, end() throws on all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
     // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
@@ -127,8 +130,9 @@ public:
         return isOpen_ && engine_->isDone();
     }
 
-    // Ends the picture. Collective. Waits until it is complete on the display rank. Throws what Frame::end() throws: a
-    // FrameError, the same on all ranks, after which the next picture can be made; or TransportError.
+    // Ends the picture. Collective. Waits until it is complete on the display rank, or has failed. Throws FrameError,
+    // the same on all ranks, after which the next picture can be made; TransportError; and InvalidArgument without
+    // start() or on a thread that may not call MPI.
     FrameReport end();
 
     // The last picture, on the display rank, until the next start(). Empty on other ranks, before the first picture,
@@ -186,9 +190,9 @@ public:
     static constexpr ChannelMask neededChannels = colorChannel;
 };
 
-// The tiles are strips, as wide as the picture: then what is read and written of an image is one piece of memory.
+// The tiles are strips, as wide as the picture (at most 4096 pixels). A strip is one piece of memory in each image.
 // Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times as long. 4
-// strips a rank share the work well enough; a strip of under 4096 pixels costs more to send than to blend.
+// strips a rank share the work well enough. A strip of under 4096 pixels costs more to send than to blend.
 template <class TileOp>
 std::unique_ptr<Operations> stripOperations(const ImageConfig& image, int ranks)
 {
@@ -372,9 +376,9 @@ DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
 {
     if (isOpen_)
         detail::failArgument("start() while a picture is open: end() it first");
-    if (frame.passes != 1 || frame.samples)
-        detail::failArgument("a picture of images has one sample a pixel");
     FrameConfig declared = frame;
+    declared.passes = 1;
+    declared.samples = nullptr;
     declared.declared = true;
     if (declared.maxLayers == 0)
         declared.maxLayers = size();
@@ -392,6 +396,8 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
 {
     begin(frame);
     try {
+        if (frame.passes != 1 || frame.samples)
+            detail::failArgument("a picture of images has one sample a pixel");
         send(image, place, blend_ != ImageBlend::InOrder || config().image.depth);
     } catch (...) {
         engine_->abort(std::current_exception(), -1);
@@ -421,10 +427,15 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
 DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place, bool usesDepth)
 {
     const TileLayout& layout = engine_->layout();
-    const bool isThere = image.rgba8 || image.rgba32f;
-    Region region = image.region;
-    if (region.empty())
-        region = {0, 0, layout.width(), layout.height()};
+    const Region& given = image.region;
+    const bool isWhole = given.x0 == 0 && given.y0 == 0 && given.x1 == 0 && given.y1 == 0;
+    const Region region = isWhole ? Region{0, 0, layout.width(), layout.height()} : given;
+    if (region.x1 < region.x0 || region.y1 < region.y0)
+        detail::failArgument("an image of columns %d to %d and rows %d to %d", region.x0, region.x1, region.y0,
+                             region.y1);
+    if (image.depth && !image.rgba8 && !image.rgba32f && !region.empty())
+        detail::failArgument("an image with depth and without colour");
+    const bool isThere = (image.rgba8 || image.rgba32f) && !region.empty();
     if (isThere && usesDepth && !image.depth)
         detail::failArgument("an image without depth, which %s needs",
                              blend_ == ImageBlend::InOrder ? "the depth of the picture" : "this way to blend");
@@ -434,7 +445,9 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     if (image.rgba8 && image.rgba32f)
         detail::failArgument("an image of 8 bits and of floats");
     if (blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
-        detail::failArgument("place %d in an order of %d ranks", place, size());
+        detail::failArgument(
+            "ImageBlend::InOrder needs the place of this rank's image, from 0, in front, to %d; it is %d", size() - 1,
+            place);
     const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);
     const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
     inputs_.clear();

@@ -329,6 +329,30 @@ struct Failures {
         dfb::InputImage both = good;
         both.rgba32f = depths.data();
         expectError(both, "two images", "of 8 bits and of floats");
+        dfb::InputImage inverted = good;
+        inverted.region = {10, 10, 5, 20};
+        expectError(inverted, "an inverted region", "invalid argument: rank");
+        dfb::InputImage depthAlone;
+        depthAlone.depth = depths.data();
+        expectError(depthAlone, "depth alone", "with depth and without colour");
+
+        // Data that project to nothing: memory without a pixel, which nobody may read.
+        dfb::InputImage nothing = good;
+        nothing.rgba8 = reinterpret_cast<const std::uint8_t*>(16);
+        nothing.depth = reinterpret_cast<const float*>(16);
+        nothing.region = {10, 10, 10, 10};
+        const auto report = compositor.composite(nothing);
+        result.expect(report.tilesTouched == 0, "an image without pixels touches tiles");
+        expectGood(imageWidth, imageHeight, "images without pixels");
+
+        const std::string passes = scene::outcomeOf([&] {
+            dfb::FrameConfig frame;
+            frame.passes = compositor.rank() == 0 ? 2 : 1;
+            compositor.composite(good, frame);
+        });
+        result.expect(passes.find("FrameError") != std::string::npos && passes.find("one sample") != std::string::npos,
+                      "two passes on a rank: " + passes);
+        expectGood(imageWidth, imageHeight, "two passes on a rank");
 
         const std::string failed = scene::outcomeOf([&] {
             if (compositor.rank() < compositor.size() - 1)

@@ -115,7 +115,7 @@ typedef struct dfb_input {
     int has_straight_alpha; // 1: colours are not multiplied by alpha yet
     float far_depth;        // a pixel at this depth or beyond is empty; +infinity, in OpenGL 1
     // x0, y0, x1, y1: the part of the picture that the memory holds, [x0, x1) x [y0, y1). x counts from the left, y
-    // from the first row. Zeros: all of it.
+    // from the first row. Zeros: all of it. Another one without pixels: nothing to show.
     int region[4];
     // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
     int valid[4];

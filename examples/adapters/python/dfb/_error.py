@@ -7,7 +7,7 @@ class Error(RuntimeError):
     A frame that fails raises it on all ranks, with the same text. Attributes that do not apply are None:
 
     kind        the error's name in docs/errors.md, such as "UserCode" (an exception in a function of yours), "Transport"
-                (the object is of no further use: leave it) or "InvalidArgument" (nothing was sent)
+                (the object is of no further use: leave it) or "InvalidArgument" (a wrong argument)
     message     the detail in words; of an exception in a function of yours its type and text
     rank        where it went wrong, or who noticed
     tile, frame
