@@ -2,7 +2,6 @@
 // meshes have it. Patches lie on any rank. A patch announces how many finer ones refine it, wherever those are: level l
 // is generation l of the tile's tree. The operation keeps the finest value of each pixel and drops the rest.
 //   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -113,7 +112,7 @@ int main(int argc, char** argv)
     if (!fb.isDisplayRank())
         return 0;
 
-    example::writePpm("custom_tile_op.ppm", fb.image());
+    dfb::writePpm("custom_tile_op.ppm", fb.image());
     constexpr int finest = patchSize[levels - 1];
     std::vector<int> shown; // the level that each patch of the finest size shows
     for (int j = 0; j < height / finest; ++j)

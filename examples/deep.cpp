@@ -3,7 +3,6 @@
 // one within the other, as if one rank had rendered all.
 //   mpirun -n 4 deep    writes deep.ppm
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -67,7 +66,7 @@ try {
             }
     });
     if (fb.isDisplayRank())
-        example::writePpm("deep.ppm", fb.image());
+        dfb::writePpm("deep.ppm", fb.image());
 } catch (const std::exception& e) {
     std::fprintf(stderr, "deep: %s\n", e.what());
     return 1;

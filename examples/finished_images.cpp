@@ -3,8 +3,6 @@
 // nothing. In the picture the balls stick in each other: every pixel shows the nearest one.
 //
 //   mpirun -n 4 finished_images [picture.ppm]
-#include "write_image.hpp"
-
 #include <dfb/dfb.hpp>
 
 #include <cmath>
@@ -63,7 +61,7 @@ try {
     frame.background = {0.1f, 0.1f, 0.12f, 1};
     compositor.composite(mine, frame);
     if (compositor.isDisplayRank())
-        example::writePpm(argc > 1 ? argv[1] : "finished_images.ppm", compositor.image());
+        dfb::writePpm(argc > 1 ? argv[1] : "finished_images.ppm", compositor.image());
 } catch (const std::exception& e) {
     std::fprintf(stderr, "finished_images: %s\n", e.what());
     return 1;

@@ -2,7 +2,6 @@
 // glass balls that turn around the middle.
 //   mpirun -n 4 frames_in_flight    writes turn_00.ppm to turn_07.ppm
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -38,7 +37,7 @@ try {
         const dfb::FrameReport report = open.front().end();
         open.pop_front();
         if (fb.isDisplayRank()) // the image is there until its memory is needed again
-            example::writePpm("turn_0" + std::to_string(report.frame - 1) + ".ppm", fb.image());
+            dfb::writePpm("turn_0" + std::to_string(report.frame - 1) + ".ppm", fb.image());
     };
     for (int number = 0; number < frames; ++number) {
         if (open.size() == 2)

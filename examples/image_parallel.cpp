@@ -2,7 +2,6 @@
 // operation of one's own darkens the corners of the finished tiles on their owners. The picture shows the Mandelbrot
 // set.
 //   mpirun -n 4 image_parallel    writes image_parallel.ppm
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -56,7 +55,7 @@ try {
     loop.render(
         [](auto& tile) { tile.forEachPixel([](int x, int y, float* rgba, float&) { renderPixel(x, y, rgba); }); });
     if (fb.isDisplayRank())
-        example::writePpm("image_parallel.ppm", fb.image());
+        dfb::writePpm("image_parallel.ppm", fb.image());
 } catch (const std::exception& e) {
     std::fprintf(stderr, "image_parallel: %s\n", e.what());
     return 1;

@@ -5,7 +5,6 @@
 //   mpirun -n 4 in_situ --live        shows them in a browser, where they can be turned and the simulation be stopped
 #include "live/interrupt.hpp"
 #include "live/live_view.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -516,7 +515,7 @@ std::string run(MPI_Comm comm, const Options& options)
             name = options.out + number;
             try {
                 if (fb.isDisplayRank())
-                    example::writePpm(name, fb.image());
+                    dfb::writePpm(name, fb.image());
             } catch (const std::runtime_error&) {
                 isWritten = false;
             }

@@ -2,7 +2,6 @@
 // frame the loop knows what each ball costs in each tile, and shares the work. The picture shows eight glass balls.
 //   mpirun -n 4 mixed_parallel    writes mixed_parallel.ppm
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -39,7 +38,7 @@ try {
             });
         }));
     if (fb.isDisplayRank())
-        example::writePpm("mixed_parallel.ppm", fb.image());
+        dfb::writePpm("mixed_parallel.ppm", fb.image());
 } catch (const std::exception& e) {
     std::fprintf(stderr, "mixed_parallel: %s\n", e.what());
     return 1;

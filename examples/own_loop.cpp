@@ -3,7 +3,6 @@
 //   mpirun -n 4 own_loop          writes own_loop.ppm
 //   mpirun -n 4 own_loop fail     the last rank's renderer throws; each rank says so
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -63,7 +62,7 @@ try {
         return 1;
     }
     if (fb.isDisplayRank())
-        example::writePpm("own_loop.ppm", fb.image());
+        dfb::writePpm("own_loop.ppm", fb.image());
 } catch (const std::exception& e) {
     std::fprintf(stderr, "own_loop: %s\n", e.what());
     return 1;

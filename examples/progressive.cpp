@@ -3,7 +3,6 @@
 // done at once. The picture shows a soft shadow.
 //   mpirun -n 4 progressive    writes progressive.ppm and says how many samples were taken
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -63,7 +62,7 @@ try {
             sampler.next()));
     if (fb.isDisplayRank()) {
         std::printf("%d frames\n", frames);
-        example::writePpm("progressive.ppm", fb.image());
+        dfb::writePpm("progressive.ppm", fb.image());
     }
 } catch (const std::exception& e) {
     std::fprintf(stderr, "progressive: %s\n", e.what());

@@ -4,8 +4,6 @@
 // VOLUME is a file such as head_256x256x128_uint8.raw: sizes and type of the voxels (uint8, uint16 or float32) are in
 // its name, x is fastest. Without one a knot is rendered. BRICKS (8) does not depend on the number of ranks. Equal
 // bricks make an equal picture, bit for bit, however many ranks there are.
-#include "write_image.hpp"
-
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
@@ -255,7 +253,7 @@ try {
     };
     const dfb::FrameReport report = loop.render(camera, render, frame);
     if (fb.isDisplayRank()) {
-        example::writePpm("raycast.ppm", fb.image());
+        dfb::writePpm("raycast.ppm", fb.image());
         std::printf("wrote raycast.ppm: %d bricks on %d ranks, %.0f ms\n", count, fb.size(), report.totalMs);
     }
 } catch (const std::exception& e) {

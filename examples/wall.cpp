@@ -2,7 +2,6 @@
 // owners straight to the displays. Each display writes what it shows; a ball that crosses a bezel goes on straight.
 //   mpirun -n 4 wall    writes wall_0.ppm to wall_3.ppm
 #include "ball.hpp"
-#include "write_image.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -45,7 +44,7 @@ try {
 
     for (int display = 0; display < layout.displayCount(); ++display)
         if (layout.ranks[static_cast<std::size_t>(display)] == fb.rank())
-            example::writePpm("wall_" + std::to_string(display) + ".ppm", wall.image(display));
+            dfb::writePpm("wall_" + std::to_string(display) + ".ppm", wall.image(display));
 } catch (const std::exception& e) {
     std::fprintf(stderr, "wall: %s\n", e.what());
     return 1;

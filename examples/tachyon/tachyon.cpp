@@ -4,8 +4,6 @@
 // samples.
 //   mpirun -n 4 tachyon            writes tachyon.ppm
 //   mpirun -n 4 tachyon --check    also compares a frame with the whole image as Tachyon alone renders it: all bits
-#include "../write_image.hpp"
-
 #include <dfb/dfb.hpp>
 
 #include <tachyon.h>
@@ -145,7 +143,7 @@ try {
     if (fb.isDisplayRank()) {
         std::printf("%lld samples, %lld fewer than if all tiles had as many as the one that has most\n",
                     static_cast<long long>(sampler.samplesTaken()), static_cast<long long>(sampler.samplesSaved()));
-        example::writePpm("tachyon.ppm", fb.image());
+        dfb::writePpm("tachyon.ppm", fb.image());
     }
 } catch (const std::exception& e) {
     std::fprintf(stderr, "tachyon: %s\n", e.what());

@@ -4,7 +4,6 @@
 //   mpirun -n 4 vtk_parts [--volume] [--check] [--output picture.ppm] [file.vti]
 //
 // --check: rank 0 also renders all slabs, one by one, and the whole data set, and compares.
-#include "../write_image.hpp"
 #include "check.hpp"
 #include "slab_renderer.hpp"
 
@@ -67,7 +66,7 @@ try {
     compositor.composite(image, isVolume ? static_cast<int>(place) : -1);
     if (!compositor.isDisplayRank())
         return 0;
-    example::writePpm(output, compositor.image());
+    dfb::writePpm(output, compositor.image());
     return isChecked && !example::isRight(compositor.image(), data, renderer, order, isVolume) ? 1 : 0;
 } catch (const std::exception& e) {
     std::fprintf(stderr, "vtk_parts: %s\n", e.what());

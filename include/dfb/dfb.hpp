@@ -1,5 +1,5 @@
-// All of dfb. MPI, oneTBB and Snappy come in where the targets dfb::mpi, dfb::tbb and dfb::snappy are linked, which
-// define DFB_HAS_MPI, DFB_HAS_TBB and DFB_HAS_SNAPPY.
+// All of dfb, except dfb/trace_file.hpp. MPI, oneTBB and Snappy are included if DFB_HAS_MPI, DFB_HAS_TBB and
+// DFB_HAS_SNAPPY are defined. The CMake targets dfb::mpi, dfb::tbb and dfb::snappy define them; see also version.hpp.
 #pragma once
 
 #include <dfb/comm/inproc_transport.hpp>

@@ -16,6 +16,7 @@
 #include <new>
 #include <numeric>
 #include <string>
+#include <vector>
 
 #if defined(__SSE2__)
 #include <immintrin.h>
@@ -131,10 +132,10 @@ inline void storesAreDone() noexcept
 
 } // namespace detail
 
-// Converts `count` linear premultiplied RGBA pixels of type double or float into `out`, bytesPerPixel(format) each,
-// rounded to nearest. Returns how far the farthest value was from an 8-bit level, up to 1/2, which is a tie between
-// two; an sRGB colour next to where another level begins counts as one. A value that is no tie may count as up to 2^-15
-// farther.
+// Converts `count` linear premultiplied RGBA pixels, double or float, to `format`, and writes bytesPerPixel(format)
+// bytes each to `out`, rounded to nearest. Returns the largest rounding distance in 8-bit levels, 0 to 1/2; 1/2 is a
+// tie. It may be up to 2^-15 too large. An sRGB colour next to a level's boundary counts as a tie; other sRGB colours
+// do not count. 0 for RGBA32F and None.
 template <class Real>
 double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte* out)
 {
@@ -155,8 +156,8 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
     return 0;
 }
 
-// A whole image, row-major, row 0 on top, no padding. Empty on ranks other than the display rank and with
-// OutputFormat::None.
+// A whole image, row-major, without padding. Row 0 is the top row, or the lowest one after
+// ImageCompositor::setBottomUp(true). Empty on ranks other than the display rank and with OutputFormat::None.
 class Image {
 public:
     Image() = default;
@@ -274,6 +275,33 @@ private:
     OutputFormat format_ = OutputFormat::None;
     std::array<Buffer, detail::channelCount> planes_;
 };
+
+// Writes the colours of an image to a file that any image viewer opens: a PPM file, 8 bits a channel, without alpha.
+// RGBA32F becomes sRGB; 8-bit images are written as they are. Throws InvalidArgument if the image is empty or the file
+// cannot be written.
+inline void writePpm(const std::string& path, const Image& image)
+{
+    if (image.empty())
+        detail::failArgument("no image to write to %s: only the display rank has one", path.c_str());
+    const auto width = static_cast<std::size_t>(image.width()), height = static_cast<std::size_t>(image.height());
+    const bool isFloat = image.format() == OutputFormat::RGBA32F;
+    std::vector<std::uint8_t> converted(isFloat ? 4 * width : 0), row(3 * width);
+    std::FILE* file = std::fopen(path.c_str(), "wb");
+    bool good = file && std::fprintf(file, "P6 %zu %zu 255\n", width, height) > 0;
+    for (std::size_t y = 0; good && y < height; ++y) {
+        if (isFloat)
+            convertPixels(image.rgba32f() + 4 * width * y, image.width(), OutputFormat::SRGBA8,
+                          reinterpret_cast<std::byte*>(converted.data()));
+        const std::uint8_t* rgba = isFloat ? converted.data() : image.rgba8() + 4 * width * y;
+        for (std::size_t x = 0; x < width; ++x)
+            std::copy_n(rgba + 4 * x, 3, row.data() + 3 * x);
+        good = std::fwrite(row.data(), 1, row.size(), file) == row.size();
+    }
+    if (file && std::fclose(file) != 0)
+        good = false;
+    if (!good)
+        detail::failArgument("cannot write %s", path.c_str());
+}
 
 // Dither: conversion to 8 bit that leaves no bands in gradients. Each pixel's place in the image says from which part
 // of the way between two levels on it takes the upper one, so that the mean over neighbours lies between the levels,

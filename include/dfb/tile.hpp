@@ -184,9 +184,9 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
         (void)depthValue;
     }
 
-    // Calls f(x, y, rgba, depth), or f(x, y, rgba) without a depth channel, for each pixel of the region, row by row:
-    // x and y are its place in the image, `rgba` points to its 4 floats, `depth` is a reference to its depth. For other
-    // channels f may take the pixel's number i as its last argument, as in tile.normal + 3 * i.
+    // Calls f(x, y, rgba, depth), or f(x, y, rgba), for each pixel of the region, row by row: x and y are its place in
+    // the image, `rgba` points to its 4 floats, `depth` is a reference to its depth, if there is a depth channel. For
+    // other channels f may take the pixel's number i as its last argument, as in tile.normal + 3 * i.
     template <class PixelFunction>
     void forEachPixel(const PixelFunction& f)
     {
@@ -195,7 +195,7 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
                 const int i = y * Size + x;
                 if constexpr (hasDepth && std::is_invocable_v<const PixelFunction&, int, int, float*, float&, int>)
                     f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[i], i);
-                else if constexpr (hasDepth)
+                else if constexpr (hasDepth && !std::is_invocable_v<const PixelFunction&, int, int, float*>)
                     f(region.x0 + x, region.y0 + y, pixel(x, y), this->depth[i]);
                 else if constexpr (std::is_invocable_v<const PixelFunction&, int, int, float*, int>)
                     f(region.x0 + x, region.y0 + y, pixel(x, y), i);
@@ -234,10 +234,12 @@ struct TileView : TileHeader {
     Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
                  std::numeric_limits<int>::max()};
     Region validRegion() const noexcept { return intersection(region, valid); }
-    // A promise: the pixels stay as they are until the frame's end() has returned. Then they need not be copied: where
-    // the tile belongs to this rank they are read where they lie, and where it belongs to another rank of the node, if
-    // they lie in memory of sharedMemory(). After a TransportError such memory must not be written to until the
-    // framebuffer is gone. NetworkConfig::checksums finds promises that are not kept.
+    // A promise: the pixels do not change until the frame's end() has returned. Then they need not be copied. They are
+    // read in place if this rank owns the tile, or if the owner is on the same node and they are in memory of
+    // sharedMemory(). They are copied all the same if the operation has no readsInPlace or keeps state, if a channel
+    // beside colour and depth is sent, with a WireFormat that rounds, an ErrorBudget, or minTransmittance above 0.
+    // After a TransportError do not write to such memory until the framebuffer is gone. NetworkConfig::checksums finds
+    // promises that are not kept.
     bool staysUntilEnd = false;
 
     detail::ConstPlanes planes() const noexcept

@@ -20,24 +20,27 @@
 //                                                default: all of `channels`. Depth travels as well where positions
 //                                                or ids of several passes are compared, see channels.hpp
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
-//   static constexpr bool activeByDepth = true;  a pixel of an input is there if it has a depth below +infinity,
-//                                                whatever its colour; depth must be among neededChannels. Else it is
-//                                                there if one of its four colour channels is not 0, whatever its
-//                                                depth. Only what is there travels and comes to add()
-//   bool isComplete() const;                     true: finish now, whatever is still announced; later inputs are
-//                                                then expected and counted
+//   static constexpr bool activeByDepth = true;  a pixel of an input is active if its depth is below +infinity,
+//                                                whatever its colour; depth must be among neededChannels. Otherwise it
+//                                                is active if one of its four colour channels is not 0, whatever its
+//                                                depth. Only active pixels are sent and reach add()
+//   bool isComplete() const;                     asked after each add(). True: the tile is finished at once, without
+//                                                the inputs still announced. When these come, they are checked and
+//                                                counted, but not given to add()
 //   static constexpr bool readsInPlace = true;   inputs may come as views of a renderer's memory
 //                                                (FragmentEncoding::InPlace) or as bytes: they are read with
 //                                                forEachPixel() or a FragmentCursor, in finish(), and not through
 //                                                Fragment::color()
-//   static bool opaqueHides(const TileInfo&);    inputs of a higher generation than an opaque one do not count, and
-//                                                isComplete() does not wait for them: nobody need render them
-//   static constexpr bool keepsState = true;     what it has of a tile outlives the frame: then a tile may have no pass
-//                                                in a frame, and the image keeps its pixels. TileInfo says which
-//                                                samples come; those of a tile without inputs before, in frames that
-//                                                it was not asked in, are TileInfo::emptySamples
-//   static constexpr bool emptyIsBackground = true;   out of inputs without any pixel it makes the background: then it
-//                                                need not be asked, and nothing travels
+//   static bool opaqueHides(const TileInfo&);    whether in this frame an opaque input hides all inputs of a higher
+//                                                generation: nobody need render them, and isComplete() does not wait
+//                                                for them
+//   static constexpr bool keepsState = true;     the object keeps values of its tile from frame to frame. A tile may
+//                                                then have no pass in a frame: the image keeps its pixels. TileInfo
+//                                                tells which samples come now. If all samples before were empty,
+//                                                the object was not called for them: TileInfo::emptySamples is
+//                                                their number
+//   static constexpr bool emptyIsBackground = true;   inputs without any pixel give the background: finish() is then
+//                                                not called and nothing is sent, if the pixel operation is pointwise
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
@@ -449,6 +452,8 @@ constexpr bool checkTileOp()
     static_assert(HasNewFrame<T>::value || HasNewFrameWithData<T>::value,
                   "dfb: TileOp must provide void newFrame(const TileInfo&) "
                   "or void newFrame(const TileInfo&, const FrameData&)");
+    static_assert(TileSizeOf<T>::value >= 8 && TileSizeOf<T>::value <= 256,
+                  "dfb: the tile size of a TileOp must be 8 to 256 pixels");
     static_assert(HasAdd<T>::value, "dfb: TileOp must provide void add(Fragment&&)");
     static_assert(HasFinish<T>::value, "dfb: TileOp must provide void finish(FinishedTile&)");
     if constexpr (ActiveByDepth<T>::value)

@@ -5,7 +5,7 @@
 #define DFB_VERSION_MINOR 2
 #define DFB_VERSION_PATCH 0
 
-// Everything stands in an inline namespace named after the version, such as dfb::v1_0. A program writes dfb::Image. If
+// Everything stands in an inline namespace named after the version, such as dfb::v0_2. A program writes dfb::Image. If
 // a process has two versions, as with two plugins, neither takes the functions of the other.
 #define DFB_NAMESPACE_OF_(major, minor) v##major##_##minor
 #define DFB_NAMESPACE_OF(major, minor) DFB_NAMESPACE_OF_(major, minor)
@@ -13,6 +13,17 @@
 #define DFB_NAMESPACE_BEGIN namespace dfb { inline namespace DFB_NAMESPACE_OF(DFB_VERSION_MAJOR, DFB_VERSION_MINOR) {
 #define DFB_NAMESPACE_END } }
 // clang-format on
+
+// MPI is used where the CMake target dfb::mpi is linked, and where the compiler finds mpi.h by itself, as mpicxx does.
+#if !defined(DFB_HAS_MPI) && !defined(DFB_COMPILED) && defined(__has_include)
+#if __has_include(<mpi.h>)
+#define DFB_HAS_MPI 1
+#endif
+#endif
+
+#if (defined(_MSVC_LANG) ? _MSVC_LANG : __cplusplus) < 201703L
+#error "dfb needs C++17: compile with -std=c++17"
+#endif
 
 #if defined(__FAST_MATH__) || defined(__ASSOCIATIVE_MATH__) || (defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__)
 #error \

@@ -2,7 +2,6 @@
 //   mpirun -n 3 test_c_twin pictures FILE                as `test_c_pictures write FILE`
 //   mpirun -n 3 test_c_twin minimal FILE                 as minimal_c
 //   mpirun -n 3 test_c_twin heat FILES STEPS EVERY       as `heat STEPS EVERY`; FILES0000.ppm and so on
-#include "../../examples/write_image.hpp"
 #include "scene.h"
 
 #include <dfb/dfb.hpp>
@@ -142,7 +141,7 @@ void drawMinimal(MPI_Comm communicator, const std::string& path)
 {
     dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(communicator, {640, 320, OutputFormat::SRGBA8});
     const auto rank = static_cast<float>(fb.rank());
-    const dfb::Vec3 center{rank - 1.5f, 0.3f * rank - 0.6f, -rank}, half{1, 1, 1};
+    const dfb::Vec3 center{rank - 1.5f, 0.3f * rank - 0.6f, -2 * rank}, half{1, 1, 1};
     const dfb::World world({{static_cast<std::uint32_t>(fb.rank()), {center - half, center + half}}});
     const float view[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, -8, 1};
     const float projection[16] = {0.25f, 0, 0, 0, 0, 0.5f, 0, 0, 0, 0, -0.1f, 0, 0, 0, -1, 1};
@@ -161,7 +160,7 @@ void drawMinimal(MPI_Comm communicator, const std::string& path)
         });
     });
     if (fb.isDisplayRank())
-        example::writePpm(path, fb.image());
+        dfb::writePpm(path, fb.image());
 }
 
 // ---- heat.f90
@@ -272,7 +271,7 @@ void drawHeat(MPI_Comm communicator, const std::string& files, int steps, int ev
         char name[20];
         std::snprintf(name, sizeof name, "%04d.ppm", step / every - 1);
         if (fb.isDisplayRank())
-            example::writePpm(files + name, fb.image());
+            dfb::writePpm(files + name, fb.image());
     }
 }
 

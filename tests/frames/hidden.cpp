@@ -56,7 +56,7 @@ struct Hidden {
         std::uint64_t hashes[2] = {};
         const auto render = [&](const dfb::Brick& b, auto& tile) {
             ++rendered;
-            tile.forEachPixel([&](int x, int y, float* rgba, float&) {
+            tile.forEachPixel([&](int x, int y, float* rgba) {
                 const auto c = colorOf(b.id, x, y, isOpaque);
                 std::copy(c.begin(), c.end(), rgba);
             });

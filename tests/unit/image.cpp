@@ -9,9 +9,14 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
 #include <cstring>
+#include <fstream>
+#include <iterator>
 #include <limits>
+#include <random>
 #include <set>
+#include <string>
 #include <vector>
 
 namespace image_cases {
@@ -113,6 +118,34 @@ TEST_CASE("8-bit levels come back, ends clamp, NaN is 0", "[image]")
         last = level;
     }
     CHECK(rising);
+}
+
+TEST_CASE("writePpm writes what a viewer shows, and says what it cannot write", "[image]")
+{
+    const std::string path = "image_test_" + std::to_string(std::random_device()()) + ".ppm";
+    const auto pool = dfb::MemoryPool::create();
+    const auto written = [&](dfb::OutputFormat format, const auto& fill) {
+        dfb::Image image(*pool, 2, 2, format, 0);
+        fill(image.bytes());
+        dfb::writePpm(path, image);
+        std::ifstream file(path, std::ios::binary);
+        const std::string text{std::istreambuf_iterator<char>(file), {}};
+        return text;
+    };
+    const std::string bytes = written(dfb::OutputFormat::RGBA8, [](std::byte* out) {
+        for (int i = 0; i < 16; ++i)
+            out[i] = static_cast<std::byte>(i);
+    });
+    CHECK(bytes == std::string("P6 2 2 255\n") + std::string("\0\1\2\4\5\6\10\11\12\14\15\16", 12));
+    const std::string floats = written(dfb::OutputFormat::RGBA32F, [](std::byte* out) {
+        const std::vector<float> values{0, 1, 0.5f, 1, 0.25f, 0, 2, 0, 1, 1, 1, 1, 0, 0, 0, 0};
+        std::memcpy(out, values.data(), 16 * sizeof(float));
+    });
+    CHECK(floats == std::string("P6 2 2 255\n") + std::string("\0\377\274\211\0\377\377\377\377\0\0\0", 12));
+    CHECK_THROWS_AS(dfb::writePpm(path, dfb::Image()), dfb::InvalidArgument);
+    dfb::Image image(*pool, 1, 1, dfb::OutputFormat::RGBA8, 0);
+    CHECK_THROWS_AS(dfb::writePpm("no_such_folder/" + path, image), dfb::InvalidArgument);
+    std::remove(path.c_str());
 }
 
 TEST_CASE("convertPixels writes each format", "[image]")

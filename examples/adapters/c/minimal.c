@@ -57,7 +57,7 @@ int main(int argc, char** argv)
     require(dfb_create(MPI_COMM_WORLD, &config, &fb));
 
     const float rank = (float)dfb_rank(fb);
-    float center[3] = {rank - 1.5f, 0.3f * rank - 0.6f, -rank};
+    float center[3] = {rank - 1.5f, 0.3f * rank - 0.6f, -2 * rank};
     dfb_brick brick = {(uint32_t)dfb_rank(fb), {0, 0, 0}, {0, 0, 0}};
     for (int i = 0; i < 3; ++i) {
         brick.lower[i] = center[i] - 1;

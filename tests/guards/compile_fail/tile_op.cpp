@@ -11,6 +11,10 @@ struct Op {
     static constexpr dfb::ChannelMask channels = dfb::colorChannel;
 #endif
 
+#if defined(CASE_LARGE_TILES) // expect: dfb: the tile size of a TileOp must be 8 to 256 pixels
+    static constexpr int tileSize = 512;
+#endif
+
 #if defined(CASE_BY_DEPTH_WITHOUT_DEPTH) // expect: dfb: a TileOp with activeByDepth must have depthChannel
     static constexpr bool activeByDepth = true;
 #endif
