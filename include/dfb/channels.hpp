@@ -10,12 +10,13 @@
 DFB_NAMESPACE_BEGIN
 
 // A set of channels, one bit each. Unless a tile operation says otherwise, the inputs of a pixel are blended front to
-// back, and channel by channel as said here; a mean over passes is one of the blended passes.
+// back, channel by channel as said here. With several passes each is blended first, then the passes are averaged.
 //
-// A pixel of an input is there if its colour or alpha is not 0. Else nothing of it counts, whatever its other channels
-// hold. One with colour and alpha 0 is emission: the colour adds, hides nothing, and gives no depth, position or id.
+// A pixel of an input is active if its colour or alpha is not 0. Only active pixels count, whatever the other channels
+// hold. A pixel with colour but alpha 0 is emission: its colour is added; it hides nothing, and gives no depth,
+// position or id.
 //
-// With DepthComposite, and any operation that says activeByDepth (tile_op.hpp), a pixel is there if its depth is below
+// With DepthComposite, and any operation that says activeByDepth (tile_op.hpp), a pixel is active if its depth is below
 // +infinity. With DepthComposite it then gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
@@ -24,11 +25,11 @@ inline constexpr ChannelMask depthChannel = 2;
 // Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they
 // come out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
 //
-// Position and ids are those of the front input: of the inputs with alpha > 0 the first in the order in which they are
-// blended, be that by (depth, source, part) or the order that OrderedBlend is told; an id is that of the first that has
-// one. Of several passes the one counts where that input is nearest, of equally near ones, or where inputs have no
-// depth, the first. For that depth travels if the image has one of these channels, even if it has no depth; with a
-// single pass, and an operation that needs none for itself, it does not.
+// Position and ids are those of the front input: the first input with alpha > 0 in the order of blending, which is that
+// of (depth, source, part), or the one given to OrderedBlend. An id comes from the first such input that has one. With
+// several passes, the pass with the nearest front input counts; of equally near ones, or without depths, the first
+// pass. To compare passes, depth is sent even if the image has none. With one pass it is sent only if the operation
+// needs it.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over

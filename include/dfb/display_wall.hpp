@@ -65,11 +65,11 @@ public:
         return config;
     }
 
-    // Waits until all displays have the frame of that number, which is the moment to show it on all of them.
-    // Collective, after the frame has ended. Throws Error, the same on all ranks; the displays then keep their picture:
-    // TimedOut if a display has not got all of the frame within `timeout` (0: no limit); MissingInput if the ranks have
-    // not sent all of it, because it ended partial or failed; MalformedMessage if a part of it cannot be right. Waits
-    // for all ranks to call it, whatever the limit. Throws TransportError.
+    // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective,
+    // after the frame has ended. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all
+    // ranks: TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the
+    // ranks have not sent all of it, because it failed or was partial; MalformedMessage if a part of it cannot be
+    // right. The displays then keep their picture. Throws TransportError if the connection fails.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

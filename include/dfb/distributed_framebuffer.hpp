@@ -39,7 +39,8 @@ public:
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 
-    // A frame that has begun. If it is destroyed before end(), the frame fails on all ranks.
+    // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks, and the destructor waits
+    // until all ranks have ended it.
     class Frame {
     public:
         Frame(Frame&& other) noexcept
@@ -73,11 +74,11 @@ public:
         }
 
         // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when it returns. Does
-        // nothing in a frame that has failed. Any thread. Waits only while this rank has more under way than
-        // messages.poolBytes, and runs tasks of the executor meanwhile; with Progress::Caller only a thread that may
-        // poll waits. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or
-        // pass that the frame does not have, and for a negative generation or number of children. An input that does
-        // not fit the others makes the frame fail: end() throws.
+        // nothing in a frame that has failed. Any thread. Waits only while this rank has more than messages.poolBytes
+        // under way, and runs tasks of the executor meanwhile; a thread that may not call MPI does not wait. Throws
+        // InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or pass that the frame
+        // does not have, and for a negative generation or number of children. Throws OutOfMemory. An input that
+        // contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
         // Sends pixels that lie in your own memory; they are not read any more when it returns, unless you promise
         // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Throws InvalidArgument also if a channel
@@ -102,13 +103,14 @@ public:
 
         // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
-        // Tells `rank` that inputs of this generation and higher ones are likely to be hidden by one of this rank: it
-        // had better wait for the word that must follow, which is hide(), or show() if they can be seen. Threads and
-        // exceptions as for hide().
+        // Announces to `rank` that an input of this rank will probably hide that rank's inputs of this generation and
+        // higher ones. `rank` had better wait before it renders them. This rank must then call hide() or, if they can
+        // be seen, show(). Threads and exceptions as for hide().
         void mayHide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
         }
+        // Tells `rank`, after mayHide(), that those inputs can be seen. Threads and exceptions as for hide().
         void show(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
@@ -116,9 +118,10 @@ public:
         // Whether another rank has said mayHide() about an input, and its word has not come yet. Any thread. Waits for
         // nothing.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
-        // Waits until heard(), which is called again with every word that comes, or the frame has failed. Runs tasks
-        // meanwhile. Returns false if it takes longer than FrameBufferConfig::quiet: then do not wait any more. By one
-        // thread, which must be able to move messages. Throws TransportError.
+        // Waits until heard() returns true or the frame has failed. heard() is called again after each hide(),
+        // mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
+        // FrameBufferConfig::quiet: then render without waiting. One thread at a time; with Progress::Caller one that
+        // may call MPI. Throws TransportError.
         bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
 
         // Declares the inputs of generation 1 that this rank will send in each pass. In a frame with
@@ -129,8 +132,8 @@ public:
         // a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-        // Sets FrameConfig::maxLayers for this rank's inputs, if it is not known before begin(). Ranks may differ. Call
-        // it before the first setTile().
+        // Sets FrameConfig::maxLayers for the inputs of this rank, if it was not known at begin(). Ranks may give
+        // different numbers. Call it before the first setTile(). Waits for nothing. Throws nothing.
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
         // The samples that a tile gets in this frame. Any thread.
@@ -138,8 +141,9 @@ public:
 
         // Returns the next range of jobs for this rank, out of [0, count) for all ranks together; each job goes to one
         // rank. An empty range: there are no more, or the frame has failed. `count` must be the same on all ranks and
-        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the answer of
-        // another rank, which was asked in the call before. Throws TransportError.
+        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for one other
+        // rank, which hands out the jobs and was asked ahead, in the call before; at most FrameConfig::timeout, then
+        // the frame fails. Throws TransportError.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds `value` to the sum over all ranks that FrameReport::figures will have for this key. For measurements
@@ -311,6 +315,8 @@ public:
     // Collective. No frame may be open. Waits for all ranks.
     ~DistributedFrameBuffer() = default;
 
+    // These wait for nothing and throw nothing. Any thread, but not during resize(). config() has the values in use:
+    // poolBytes is raised to its minimum, and a missing executor is filled in.
     int rank() const noexcept { return engine().rank(); }
     int size() const noexcept { return engine().size(); }
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
@@ -320,13 +326,15 @@ public:
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
     Executor& executor() const noexcept { return *config().executor; }
 
-    // On the display rank: the image of the last frame that ended well or partial. It is valid until its memory is
-    // needed again: until begin() has been called config.framesInFlight times after the begin() of its frame. Before
-    // the first frame, after that, and on other ranks it is empty. By the thread that begins and ends frames.
+    // On the display rank: the image of the last frame that ended well or partial. With config.framesInFlight = 1 it is
+    // valid until the next begin(); with n frames in flight until the n-th begin() after that of its own frame. Empty
+    // before the first frame, when it is no longer valid, and on other ranks. For the thread that begins and ends
+    // frames.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
-    // Returns a copy of the display rank's image() on every rank; empty if that is. Its bytes go along a tree of the
-    // ranks. Collective, outside frames. Waits for all ranks. Throws OutOfMemory, TransportError.
+    // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
+    // bytes travel along a tree of the ranks. Collective, outside frames. Waits for all ranks. Throws OutOfMemory and
+    // TransportError.
     Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(); }
 
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
@@ -336,15 +344,17 @@ public:
     // FrameConfig::allowPartial. Thread as above.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
-    // Moves messages with Progress::Caller, if this thread may call MPI, and runs waiting tasks if the executor has no
-    // workers. Returns whether there was anything to do. Call it now and then during long work without setTile(), so
-    // that compositing goes on and other ranks need not wait. In all other cases there is no need to. Any thread. Waits
-    // for nothing.
+    // For programs without a progress thread (Progress::Caller) or without workers (CallerExecutor); otherwise it does
+    // nothing. Moves messages, if this thread may call MPI, and runs waiting tasks. Returns whether there was anything
+    // to do. Call it now and then during long work without setTile(), so that compositing goes on and other ranks need
+    // not wait. Any thread. Waits for no other rank.
     bool poll() { return engine().poll(); }
 
-    // Begins a frame. Every rank calls it, with an equal `params`. All ranks call begin() and end() in the same order,
-    // because setTile() may wait for room that another rank makes only when it has begun that frame. Waits for no other
-    // rank. Throws InvalidArgument, with nothing sent, if config.framesInFlight frames are open or `params` cannot be.
+    // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
+    // same order: setTile() may wait for room at a rank, and there is none before that rank has begun the frame. Copies
+    // `tileData` and `pixelData`. Waits for no other rank. Throws InvalidArgument, with nothing sent, if
+    // config.framesInFlight frames are open, if a field of `params` is out of range, or on a thread that may not call
+    // MPI (see Progress). Throws TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
@@ -355,9 +365,10 @@ public:
         return Frame(this, &engine);
     }
 
-    // Changes the size of the image. image() is empty until the next frame has ended, operations begin anew, and frames
-    // are numbered from 1 again. Collective, outside frames. Waits for all ranks. Throws InvalidArgument, with nothing
-    // changed: on this rank if a frame is open, on all ranks if the size cannot be or differs between ranks.
+    // Changes the size of the image, in pixels. Afterwards image() is empty, tile operations are made anew and have
+    // lost what they kept, and frames are numbered from 1 again. Collective, outside frames. Waits for all ranks.
+    // Throws InvalidArgument, with nothing changed: on this rank if a frame is open, on all ranks if the size is not 1
+    // to 65536 or differs between ranks, or if memory is short. Throws TransportError.
     void resize(int width, int height)
     {
         for (const auto& engine : engines_)

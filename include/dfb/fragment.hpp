@@ -81,9 +81,9 @@ public:
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
     WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // that it came in
 
-    // Colour of the pixels that are stored: all that are active, or with FragmentEncoding::Constant a row of equal
-    // ones. Null with FragmentEncoding::InPlace, of which none are, and for an operation that readsInPlace also where
-    // they came as bytes.
+    // The colours of the storedPixels() pixels: the active ones, or with FragmentEncoding::Constant one row of equal
+    // pixels. Null with FragmentEncoding::InPlace; and, in an operation with readsInPlace, if the pixels came as bytes.
+    // forEachPixel() and FragmentCursor read those, too.
     const float* color() const noexcept { return parts_.color; }
     std::size_t storedPixels() const noexcept
     {

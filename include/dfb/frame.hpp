@@ -74,8 +74,8 @@ struct FrameBufferConfig {
     TileCallback onTile{};
     // end() waits this long before it checks whether any rank still has something under way, and checks again at
     // growing intervals. If nobody has, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs
-    // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then renders
-    // it. Ranks may give different ones.
+    // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then
+    // renders it. Ranks may give different ones.
     std::chrono::milliseconds quiet{2000};
     // Is told what this rank does for its frames, and when: see trace.hpp. Null: nobody is, which costs nothing. Ranks
     // may give different ones.
@@ -99,8 +99,8 @@ struct FrameConfig {
     // operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1 and a
     // pixel operation that is pointwise.
     SamplePlan samples;
-    // For an ErrorBudget: the most inputs that a pixel has in a pass. 0: not known, taken for 65536. Loops set it if
-    // they know.
+    // For an ErrorBudget: the most inputs that a pixel has in a pass. 0: not known, counts as 65536. ImageParallelLoop,
+    // MixedParallelLoop, OrderedLoop and ImageCompositor set it; DataParallelLoop and DeepParallelLoop do not.
     int maxLayers = 0;
     // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all frames with
     // this id. Give another id when camera, scene or background change; the samples of each tile then begin with 0.
@@ -114,11 +114,11 @@ struct FrameConfig {
     // within twice the time either, end() throws TransportError. 0: no limit. An input that is never sent needs no
     // time-out: the frame fails with ErrorKind::MissingInput some seconds after all ranks are in end().
     std::chrono::milliseconds timeout{0};
-    // Whether a frame that fails keeps the tiles that were finished by then. If so, end() throws no FrameError but sets
-    // FrameReport::failure. An exception of a renderer or an operation, and inputs that contradict each other, cost
-    // their tiles alone. A tile that misses an input is given up when nothing is under way any more, or after
-    // `timeout`. A message that cannot be read ends the frame at once unless there is a time-out. A frame whose ranks
-    // disagree about its parameters fails all the same. See DistributedFrameBuffer::isComplete().
+    // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
+    // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
+    // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile that misses an input
+    // is given up when nothing is under way any more, or after `timeout`. A message that cannot be read ends the frame
+    // at once, unless there is a time-out. If ranks disagree about these parameters, the frame fails all the same.
     bool allowPartial = false;
 };
 
@@ -165,19 +165,19 @@ struct FrameReport {
     double renderMs = 0;              // begin() to the call of end(), this rank
     double compositingOverheadMs = 0; // the call of end() to its return, this rank
     double renderMsMax = 0;           // all: the longest renderMs
-    // This rank: whether the calls of its user moved messages (Caller), or a thread of the library's own (Thread).
-    // Where ranks are threads, the sender delivers (Thread).
+    // This rank: who moved messages: calls of the program (Caller), or a thread of the library (Thread). With
+    // InprocTransport the sending thread delivers them, which counts as Thread.
     Progress progress = Progress::Thread;
     int threads = 1; // this rank: workers of its executor
     // All: bytes of messages to other ranks, without the transport's own headers; and bytes that owners wrote into the
     // display rank's image directly.
     std::int64_t bytesSent = 0;
-    std::int64_t messagesSent = 0;         // all
-    std::int64_t tilesTotal = 0;           // in the image
-    std::int64_t tilesTouched = 0;         // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;      // all: input pixels with an infinity or NaN (wire/active_pixels.hpp)
-    std::int64_t alphaOutsidePixels = 0;   // all: finite input pixels whose alpha is not within [0, 1]
-    std::int64_t orderUndefinedPixels = 0; // all: of finished tiles, see TileReport
+    std::int64_t messagesSent = 0;              // all
+    std::int64_t tilesTotal = 0;                // in the image
+    std::int64_t tilesTouched = 0;              // all: tiles that had an input
+    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinity or NaN (wire/active_pixels.hpp)
+    std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
+    std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: pairs of sender and receiver for which it paid

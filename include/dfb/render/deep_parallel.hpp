@@ -29,12 +29,12 @@ struct Segment {
     float depth = 0, farDepth = 0;
 };
 
-// At most `maxSegments` are kept per pixel, so memory and messages are bounded: of one more, the two neighbours are
-// merged that change the pixel least. To merge two is exact unless another brick has something between them; then what
-// lies between, (c', a'), is blended behind both, and the pixel is off by T |c' a2 - c2 a'|, where (c2, a2) is the
-// farther of the two and T gets through all that the brick has before it. That is at most T max(a2, |c2|) for colours
-// with c' <= a' <= 1, and the sum of it over all merges bounds the error of a pixel: errorBound(). Where c' is more
-// than a', multiply by the largest c' / a'.
+// The segments of one brick in one tile. A pixel keeps at most `maxSegments`, which bounds memory and messages. If one
+// more is added, two neighbours are merged: those that change the pixel least. A merge is exact unless another brick
+// has something between the two. Then that layer (c', a') is blended behind both. This puts the pixel off by
+// T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the part of the light that passes the brick's
+// segments in front of it. This is at most T max(a2, |c2|) for colours with c' <= a' <= 1. The sum over all merges
+// bounds the error of a pixel: errorBound(). Where c' is more than a', multiply it by the largest c' / a'.
 class DeepTile {
 public:
     explicit DeepTile(int maxSegments) : maxSegments_(std::max(1, maxSegments)) {}

@@ -3,12 +3,12 @@
 // image-parallel rendering. OrderedLoop: the same for bricks in a known order, without sorting.
 //
 // A tile-brick owner is any type with
-//   int operator()(const SharedBrick& brick, int tile, int pass);      the rank, one of brick.ranks
+//   int operator()(const SharedBrick& brick, int tile, int pass);      returns the rank, one of brick.ranks
 // and, if it decides about all pairs of brick and tile together,
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
-//                                  called before: all pairs of the frame, and the number of passes of each. The frame's
-//                                  report then has the cost of each pair, for the next plan.
-// It must decide alike on all ranks. If it picks a rank that does not hold the brick, the frame fails.
+//                                  called once a frame, before the other: with all pairs, and the number of passes of
+//                                  each. FrameReport::figures then has the cost of each pair, for the next plan.
+// All ranks must get the same answers. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -389,10 +389,11 @@ private:
     std::vector<TileInput> inputs_; // that this rank declares
 };
 
-// The mixed-parallel loop for OrderedBlend. Each tile's inputs form a list by generation, so that owners sort nothing
-// and wait for no manifest. Tiles that an opaque one hides are not sent, and not rendered by ranks that hear of it in
-// time. Inputs that an opaque tile hid in the last frame wait until that tile is rendered again. Use it only if one
-// order is right for all rays of a frame: not with an extended lens or several eyes.
+// The mixed-parallel loop for OrderedBlend. The generation of an input is its place in the order, so owners sort
+// nothing and wait for no manifest. An input behind an opaque one is not sent, nor rendered if its rank hears of that
+// in time. An input that was hidden in the last frame waits until the tile that hid it has been rendered again, at most
+// FrameBufferConfig::quiet. Use it only if one order of the bricks is right for all rays of a frame: not with an
+// extended lens or several eyes.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:

@@ -2,9 +2,10 @@
 //
 // A camera, for the loops in render/, is any type with
 //   Region project(const Box3& bounds, int width, int height) const;
-// the pixels of a width x height image that the box may cover for any sample position within a pixel: never too few;
-// too many cost a header each. Instead of a Region it may return a Footprint, which leaves out the tiles in the
-// corners, or a std::vector of those (a stereo camera has two).
+// It returns the pixels of a width x height image that the box may cover, for any sample position within a pixel. It
+// must not leave out a pixel; a tile too many only costs a header of 64 bytes. In place of a Region it may return a
+// Footprint, a convex polygon that leaves out tiles in the corners of the rectangle, or a std::vector of either: a
+// stereo camera returns two.
 #pragma once
 
 #include <dfb/frame.hpp>

@@ -277,22 +277,23 @@ enum class WireFormat : std::uint8_t {
     Bytes // 8-bit colours as the renderer wrote them, see TileView::color8; not to be asked for
 };
 
-// An error of the float image's colour and alpha, before they are converted to the output format, that may be made: the
-// greatest absolute difference of one of the four to its value with Float32.
+// The largest error that may come from rounding inputs: the absolute difference of any colour or alpha value from its
+// value with Float32, in the float image, before that is converted to the output format.
 struct ErrorBudget {
     double error = 0;
     float maxColor = 1; // see Precision
 };
 
-// Within half a level: an image of 8 bits a channel may be off by half a level before it is rounded, so no level is off
-// by more than one. Inputs for ranks whose memory this one does not share travel in the cheapest format that is sure to
-// keep that. All else, and an image of floats, is exact. So the image may depend on which ranks share a node.
+// For 8-bit images: a value may be off by half a level before the final rounding, so by at most one level after it.
+// Only inputs that go to another node (to a rank that shares no memory with this one) are rounded, to the cheapest
+// format that keeps this bound. Everything else is exact, and so are float images. The image may therefore depend on
+// which ranks share a node.
 struct HalfLevel {
     float maxColor = 1; // see Precision
 };
 
-// How inputs travel to the tiles' owners; and, but for HalfLevel, to a tile of the same rank as well, or else the image
-// would depend on who owns what. Rounded to nearest, ties to even.
+// The format in which the colours of inputs travel to the owners. It also applies to inputs of the owner's own
+// renderer, except with HalfLevel: otherwise the image would depend on the owner map. Rounded to nearest, ties to even.
 struct Precision {
     Precision() = default;
     Precision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
