@@ -104,8 +104,8 @@ int dfb_height(const dfb_framebuffer* framebuffer);
 // An image in memory of the program. dfb_input_init() fills it: there is nothing to show then.
 typedef struct dfb_input {
     size_t struct_size; // of the dfb.h that the program was compiled with
-    // One of these: 4 bytes or floats a pixel. 8-bit colours are blended as they are, level k as k / 255: if they are
-    // encoded for a display, ask for DFB_RGBA8.
+    // Set one of the two: 4 bytes or floats a pixel. 8-bit colours are blended as they are, level k as the float next
+    // to k / 255. If they are encoded for a display, ask for DFB_RGBA8, which does not encode them a second time.
     const uint8_t* rgba8;
     const float* rgba32f;
     const float* depth;     // a depth for each pixel, which grows away from the camera; null with DFB_IN_ORDER
