@@ -445,9 +445,8 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     if (image.rgba8 && image.rgba32f)
         detail::failArgument("an image of 8 bits and of floats");
     if (blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
-        detail::failArgument(
-            "ImageBlend::InOrder needs the place of this rank's image, from 0, in front, to %d; it is %d", size() - 1,
-            place);
+        detail::failArgument("place %d in an order of %d ranks: each rank gives its own, from 0, in front, to %d",
+                             place, size(), size() - 1);
     const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);
     const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
     inputs_.clear();

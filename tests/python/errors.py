@@ -153,7 +153,7 @@ class Errors(unittest.TestCase):
                 self.assertEqual({(str(e), e.rank) for e in errors}, {(str(errors[2]), 1)})
         errors = errors_of(lambda comm: compositor(comm, blend="order"),
                            lambda thing, rank: thing.composite(rgba, order=3 if rank == 1 else rank))
-        self.assertRegex(str(errors[0]), "from 0, in front, to 2; it is 3")
+        self.assertRegex(str(errors[0]), "place 3 in an order of 3 ranks")
 
     def test_wrong_scenes_on_one_rank(self):
         class Bare:
