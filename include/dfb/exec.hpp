@@ -128,20 +128,16 @@ public:
         if (threadCount <= 0)
             threadCount = Processors::ofThisThread().count();
         threads_.reserve(static_cast<std::size_t>(threadCount));
-        for (int i = 0; i < threadCount; ++i)
-            threads_.push_back(std::thread([this] { work(); }));
+        try {
+            for (int i = 0; i < threadCount; ++i)
+                threads_.push_back(std::thread([this] { work(); }));
+        } catch (...) { // the system gives no more
+            end();
+            throw;
+        }
     }
 
-    ~ThreadExecutor() override
-    {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            stop_ = true;
-        }
-        wakeUp_.notify_all();
-        for (std::thread& thread : threads_)
-            thread.join();
-    }
+    ~ThreadExecutor() override { end(); }
 
     int concurrency() const noexcept override { return static_cast<int>(threads_.size()); }
     bool hasWorkers() const noexcept override { return resting_ == 0; }
@@ -167,6 +163,17 @@ private:
         std::size_t next = 0; // under mutex_
         std::size_t done = 0; // under mutex_
     };
+
+    void end()
+    {
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            stop_ = true;
+        }
+        wakeUp_.notify_all();
+        for (std::thread& thread : threads_)
+            thread.join();
+    }
 
     void wake() override
     {
