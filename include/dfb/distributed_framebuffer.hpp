@@ -34,8 +34,8 @@ class DistributedFrameBuffer {
 public:
     using Config = FrameBufferConfig;
     using Communicator = typename Transport::Communicator;
-    using Tile = dfb::Tile<TileOp::channels, detail::TileSizeOf<TileOp>::value>;
-    using TileView = dfb::TileView<TileOp::channels, detail::TileSizeOf<TileOp>::value>;
+    using Tile = dfb::Tile<TileOp::channels, detail::tile_size_v<TileOp>>;
+    using TileView = dfb::TileView<TileOp::channels, detail::tile_size_v<TileOp>>;
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 

@@ -40,9 +40,6 @@ inline std::string printed(const char* format, std::va_list values)
 }
 
 } // namespace detail
-DFB_NAMESPACE_END
-
-DFB_NAMESPACE_BEGIN
 
 enum class ErrorKind : std::uint32_t {
     InvalidArgument,  // a call with a wrong argument; in a FrameError one between begin() and end()
@@ -185,9 +182,6 @@ private:
     }
 };
 
-DFB_NAMESPACE_END
-
-DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // Throws InvalidArgument, with what printf() would write.

@@ -16,7 +16,6 @@
 
 #include <dfb/tile_op.hpp>
 
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <type_traits>
@@ -42,33 +41,26 @@ struct PixelTile {
 namespace detail {
 
 template <class T, class = void>
-struct HasProcess : std::false_type {
-};
+inline constexpr bool has_process_v = false;
 template <class T>
-struct HasProcess<T, std::void_t<decltype(std::declval<const T&>().process(std::declval<PixelTile&>()))>>
-    : std::true_type {
-};
+inline constexpr bool
+    has_process_v<T, std::void_t<decltype(std::declval<const T&>().process(std::declval<PixelTile&>()))>> = true;
 
 template <class T, class = void>
-struct IsPointwise : std::false_type {
-};
+inline constexpr bool is_pointwise_v = false;
 template <class T>
-struct IsPointwise<T, std::void_t<decltype(T::pointwise)>> : std::bool_constant<T::pointwise> {
-};
+inline constexpr bool is_pointwise_v<T, std::void_t<decltype(T::pointwise)>> = T::pointwise;
 
 template <class T, class = void>
-struct HasPixelNewFrame : std::false_type {
-};
+inline constexpr bool has_pixel_new_frame_v = false;
 template <class T>
-struct HasPixelNewFrame<
-    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()))>>
-    : std::true_type {
-};
+inline constexpr bool has_pixel_new_frame_v<
+    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()))>> = true;
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::HasProcess<T>::value;
+inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::has_process_v<T>;
 
 // Leaves the tile as it is: it is rounded to the output format straight from double.
 struct NoPixelOp {
@@ -83,7 +75,7 @@ template <class T>
 constexpr bool checkPixelOp()
 {
     static_assert(std::is_copy_constructible_v<T>, "dfb: PixelOp must provide a copy constructor");
-    static_assert(HasProcess<T>::value, "dfb: PixelOp must provide void process(PixelTile&) const");
+    static_assert(has_process_v<T>, "dfb: PixelOp must provide void process(PixelTile&) const");
     return is_pixel_op_v<T>;
 }
 
@@ -121,7 +113,7 @@ private:
 // First, then Second.
 template <class First, class Second>
 struct PixelOpChain {
-    static constexpr bool pointwise = detail::IsPointwise<First>::value && detail::IsPointwise<Second>::value;
+    static constexpr bool pointwise = detail::is_pointwise_v<First> && detail::is_pointwise_v<Second>;
     struct FrameData {
         typename detail::FrameDataOf<First>::type first{};
         typename detail::FrameDataOf<Second>::type second{};
@@ -129,9 +121,9 @@ struct PixelOpChain {
 
     void newFrame(const FrameData& data)
     {
-        if constexpr (detail::HasPixelNewFrame<First>::value)
+        if constexpr (detail::has_pixel_new_frame_v<First>)
             first.newFrame(data.first);
-        if constexpr (detail::HasPixelNewFrame<Second>::value)
+        if constexpr (detail::has_pixel_new_frame_v<Second>)
             second.newFrame(data.second);
     }
 

@@ -7,7 +7,6 @@
 #include <tbb/task_arena.h>
 
 #include <condition_variable>
-#include <memory>
 #include <mutex>
 
 DFB_NAMESPACE_BEGIN

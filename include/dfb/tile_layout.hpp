@@ -10,10 +10,7 @@
 #include <cstdint>
 #include <functional>
 #include <numeric>
-#include <string>
 #include <vector>
-
-// TileLayout: how an image is divided into tiles; and OwnerMap: which rank owns which tile.
 
 DFB_NAMESPACE_BEGIN
 

@@ -328,117 +328,88 @@ struct FrameDataOf<T, std::void_t<typename T::FrameData>> {
 };
 
 template <class T, class = void>
-struct TileSizeOf : std::integral_constant<int, 64> {
-};
+inline constexpr int tile_size_v = 64;
 template <class T>
-struct TileSizeOf<T, std::void_t<decltype(T::tileSize)>> : std::integral_constant<int, T::tileSize> {
-};
+inline constexpr int tile_size_v<T, std::void_t<decltype(T::tileSize)>> = T::tileSize;
 
 template <class T, class = void>
-struct HasChannels : std::false_type {
-};
+inline constexpr bool has_channels_v = false;
 template <class T>
-struct HasChannels<T, std::void_t<decltype(T::channels)>> : std::is_convertible<decltype(T::channels), ChannelMask> {
-};
+inline constexpr bool has_channels_v<T, std::void_t<decltype(T::channels)>> =
+    std::is_convertible_v<decltype(T::channels), ChannelMask>;
 
 template <class T, class = void>
-struct NeededChannelsOf {
-    static constexpr ChannelMask value = T::channels;
-};
+inline constexpr ChannelMask needed_channels_v = T::channels;
 template <class T>
-struct NeededChannelsOf<T, std::void_t<decltype(T::neededChannels)>> {
-    static constexpr ChannelMask value = T::neededChannels;
-};
+inline constexpr ChannelMask needed_channels_v<T, std::void_t<decltype(T::neededChannels)>> = T::neededChannels;
 
 template <class T, class = void>
-struct HasNewFrame : std::false_type {
-};
+inline constexpr bool has_new_frame_v = false;
 template <class T>
-struct HasNewFrame<T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>()))>>
-    : std::true_type {
-};
+inline constexpr bool
+    has_new_frame_v<T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>()))>> = true;
 
 template <class T, class = void>
-struct HasNewFrameWithData : std::false_type {
-};
+inline constexpr bool has_new_frame_with_data_v = false;
 template <class T>
-struct HasNewFrameWithData<T,
-                           std::void_t<decltype(std::declval<T&>().newFrame(
-                               std::declval<const TileInfo&>(), std::declval<const typename FrameDataOf<T>::type&>()))>>
-    : std::true_type {
-};
+inline constexpr bool has_new_frame_with_data_v<
+    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>(),
+                                                        std::declval<const typename FrameDataOf<T>::type&>()))>> = true;
 
 template <class T, class = void>
-struct HasAdd : std::false_type {
-};
+inline constexpr bool has_add_v = false;
 template <class T>
-struct HasAdd<T, std::void_t<decltype(std::declval<T&>().add(std::declval<Fragment&&>()))>> : std::true_type {
-};
+inline constexpr bool has_add_v<T, std::void_t<decltype(std::declval<T&>().add(std::declval<Fragment&&>()))>> = true;
 
 template <class T, class = void>
-struct HasFinish : std::false_type {
-};
+inline constexpr bool has_finish_v = false;
 template <class T>
-struct HasFinish<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> : std::true_type {
-};
+inline constexpr bool has_finish_v<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> =
+    true;
 
 template <class T, class = void>
-struct ActiveByDepth : std::false_type {
-};
+inline constexpr bool active_by_depth_v = false;
 template <class T>
-struct ActiveByDepth<T, std::void_t<decltype(T::activeByDepth)>> : std::bool_constant<T::activeByDepth> {
-};
+inline constexpr bool active_by_depth_v<T, std::void_t<decltype(T::activeByDepth)>> = T::activeByDepth;
 
 template <class T, class = void>
-struct EmptyIsBackground : std::false_type {
-};
+inline constexpr bool empty_is_background_v = false;
 template <class T>
-struct EmptyIsBackground<T, std::void_t<decltype(T::emptyIsBackground)>> : std::bool_constant<T::emptyIsBackground> {
-};
+inline constexpr bool empty_is_background_v<T, std::void_t<decltype(T::emptyIsBackground)>> = T::emptyIsBackground;
 
 template <class T, class = void>
-struct ReadsInPlace : std::false_type {
-};
+inline constexpr bool reads_in_place_v = false;
 template <class T>
-struct ReadsInPlace<T, std::void_t<decltype(T::readsInPlace)>> : std::bool_constant<T::readsInPlace> {
-};
+inline constexpr bool reads_in_place_v<T, std::void_t<decltype(T::readsInPlace)>> = T::readsInPlace;
 
 template <class T, class = void>
-struct OpaqueHides : std::false_type {
-};
+inline constexpr bool opaque_hides_v = false;
 template <class T>
-struct OpaqueHides<T, std::void_t<decltype(T::opaqueHides(std::declval<const TileInfo&>()))>> : std::true_type {
-};
+inline constexpr bool opaque_hides_v<T, std::void_t<decltype(T::opaqueHides(std::declval<const TileInfo&>()))>> = true;
 
 template <class T, class = void>
-struct KeepsState : std::false_type {
-};
+inline constexpr bool keeps_state_v = false;
 template <class T>
-struct KeepsState<T, std::void_t<decltype(T::keepsState)>> : std::bool_constant<T::keepsState> {
-};
+inline constexpr bool keeps_state_v<T, std::void_t<decltype(T::keepsState)>> = T::keepsState;
 
 template <class T, class = void>
-struct HasReport : std::false_type {
-};
+inline constexpr bool has_report_v = false;
 template <class T>
-struct HasReport<T, std::void_t<decltype(std::declval<const T&>().report(std::declval<TileReport&>()))>>
-    : std::true_type {
-};
+inline constexpr bool
+    has_report_v<T, std::void_t<decltype(std::declval<const T&>().report(std::declval<TileReport&>()))>> = true;
 
 template <class T, class = void>
-struct HasIsComplete : std::false_type {
-};
+inline constexpr bool has_is_complete_v = false;
 template <class T>
-struct HasIsComplete<T, std::void_t<decltype(std::declval<const T&>().isComplete())>>
-    : std::is_same<bool, decltype(std::declval<const T&>().isComplete())> {
-};
+inline constexpr bool has_is_complete_v<T, std::void_t<decltype(std::declval<const T&>().isComplete())>> =
+    std::is_same_v<bool, decltype(std::declval<const T&>().isComplete())>;
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_tile_op_v = std::is_default_constructible_v<T>&& detail::HasChannels<T>::value
-                                     && (detail::HasNewFrame<T>::value || detail::HasNewFrameWithData<T>::value)
-                                     && detail::HasAdd<T>::value&& detail::HasFinish<T>::value;
+inline constexpr bool is_tile_op_v =
+    std::is_default_constructible_v<T>&& detail::has_channels_v<
+        T> && (detail::has_new_frame_v<T> || detail::has_new_frame_with_data_v<T>)&&detail::has_add_v<T>&& detail::has_finish_v<T>;
 
 namespace detail {
 
@@ -448,16 +419,16 @@ constexpr bool checkTileOp()
 {
     static_assert(std::is_default_constructible_v<T>,
                   "dfb: TileOp must provide a default constructor (the framebuffer makes one per owned tile)");
-    static_assert(HasChannels<T>::value, "dfb: TileOp must provide static constexpr ChannelMask channels");
-    static_assert(HasNewFrame<T>::value || HasNewFrameWithData<T>::value,
+    static_assert(has_channels_v<T>, "dfb: TileOp must provide static constexpr ChannelMask channels");
+    static_assert(has_new_frame_v<T> || has_new_frame_with_data_v<T>,
                   "dfb: TileOp must provide void newFrame(const TileInfo&) "
                   "or void newFrame(const TileInfo&, const FrameData&)");
-    static_assert(TileSizeOf<T>::value >= 8 && TileSizeOf<T>::value <= 256,
+    static_assert(tile_size_v<T> >= 8 && tile_size_v<T> <= 256,
                   "dfb: the tile size of a TileOp must be 8 to 256 pixels");
-    static_assert(HasAdd<T>::value, "dfb: TileOp must provide void add(Fragment&&)");
-    static_assert(HasFinish<T>::value, "dfb: TileOp must provide void finish(FinishedTile&)");
-    if constexpr (ActiveByDepth<T>::value)
-        static_assert((T::channels & NeededChannelsOf<T>::value & depthChannel) != 0,
+    static_assert(has_add_v<T>, "dfb: TileOp must provide void add(Fragment&&)");
+    static_assert(has_finish_v<T>, "dfb: TileOp must provide void finish(FinishedTile&)");
+    if constexpr (active_by_depth_v<T>)
+        static_assert((T::channels & needed_channels_v<T> & depthChannel) != 0,
                       "dfb: a TileOp with activeByDepth must have depthChannel in channels and neededChannels");
     return is_tile_op_v<T>;
 }

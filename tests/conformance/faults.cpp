@@ -422,10 +422,10 @@ struct Able : InprocTransport {
 TEST_CASE("What a transport need not have is passed on if the one below has it, and is not there else")
 {
     using Passing = testing::FaultTransport<Able>;
-    STATIC_REQUIRE(detail::CanAbort<Passing>::value);
-    STATIC_REQUIRE(detail::SharesMemory<Passing>::value);
-    STATIC_REQUIRE_FALSE(detail::CanAbort<Faulty>::value);
-    STATIC_REQUIRE_FALSE(detail::SharesMemory<Faulty>::value);
+    STATIC_REQUIRE(detail::can_abort_v<Passing>);
+    STATIC_REQUIRE(detail::shares_memory_v<Passing>);
+    STATIC_REQUIRE_FALSE(detail::can_abort_v<Faulty>);
+    STATIC_REQUIRE_FALSE(detail::shares_memory_v<Faulty>);
     std::string said;
     bool right = false;
     runRanks(1, [&](InprocCommunicator communicator) {

@@ -1,5 +1,5 @@
-#include "ranks.hpp"
 #include "catch.hpp"
+#include "ranks.hpp"
 
 #include <dfb/comm/mpi_transport.hpp>
 #include <dfb/testing/fault_transport.hpp>
@@ -159,8 +159,8 @@ TEST_CASE("A message that comes twice is found on all ranks")
 
 TEST_CASE("A rank that was built with another packet format is named on all ranks, and the communicator stays usable")
 {
-    STATIC_REQUIRE(detail::CanAbort<Faulty>::value);
-    STATIC_REQUIRE(detail::SharesMemory<Faulty>::value);
+    STATIC_REQUIRE(detail::can_abort_v<Faulty>);
+    STATIC_REQUIRE(detail::shares_memory_v<Faulty>);
     const int size = rankCount(), rank = rankIn(MPI_COMM_WORLD);
     for (const int odd : {0, size - 1}) {
         std::string text;

@@ -133,13 +133,9 @@ private:
 };
 
 } // namespace detail
-DFB_NAMESPACE_END
 
-// Processors: those that a thread may run on, and how many threads each of the ranks should have that share them.
-
-DFB_NAMESPACE_BEGIN
-
-// A set, as plain bytes that can be sent. Those from `limit` on are left out.
+// Processors: those that a thread may run on. A set, as plain bytes that can be sent. Those from `limit` on are left
+// out.
 class Processors {
 public:
     static constexpr int limit = 1024;

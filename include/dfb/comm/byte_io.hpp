@@ -64,8 +64,6 @@ private:
     std::vector<std::byte> many_; // all of them, if they are more than that
 };
 
-// ByteWriter and ByteReader: the small control messages (manifests, verdicts), field by field; a reader never
-// reads beyond its end.
 class ByteWriter {
 public:
     template <class T>

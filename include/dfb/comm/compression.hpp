@@ -42,16 +42,12 @@ enum class CompressionMode : std::uint8_t {
     Auto
 };
 
-DFB_NAMESPACE_END
-
-// CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
-// noise, those for another all alike.
-
-DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// A rank for which nearly nothing was gained is left alone for some frames and then tried again, more and more seldom.
-// add() may be called from any thread, the others between frames, as is isWorthwhile() during one.
+// CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
+// noise, those for another all alike. A rank for which nearly nothing was gained is left alone for some frames and then
+// tried again, more and more seldom. add() may be called from any thread, the others between frames, as is
+// isWorthwhile() during one.
 class CompressionGains {
 public:
     explicit CompressionGains(int rankCount) : peers_(static_cast<std::size_t>(rankCount)) {}

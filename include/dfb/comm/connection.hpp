@@ -157,11 +157,11 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         address = addresses_++;
         receivers_.push_back({address, &receiver});
-        std::vector<Early> all, its;
+        std::vector<detail::Arrival> all, its;
         all.swap(early_);
-        for (Early& e : all)
+        for (detail::Arrival& e : all)
             (e.header.receiver == address ? its : early_).push_back(std::move(e));
-        for (Early& e : its)
+        for (detail::Arrival& e : its)
             receiver.receive(e.source, e.header, std::move(e.message));
         if (stray_)
             receiver.malformed(stray_->first, stray_->second);
@@ -328,11 +328,6 @@ private:
     struct Peer {
         std::uint32_t sent = 0;
         detail::SequenceWindow received;
-    };
-    struct Early {
-        int source;
-        detail::MessageHeader header;
-        Buffer message;
     };
 
     void leave(const char* why)
@@ -560,7 +555,7 @@ private:
 
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::vector<Receiver> receivers_;
-    std::vector<Early> early_;                       // for receivers to come
+    std::vector<detail::Arrival> early_;             // for receivers to come
     std::optional<std::pair<int, ErrorInfo>> stray_; // the malformed message that came before its receiver
     std::uint32_t addresses_ = 0;
     int expecting_ = 0;

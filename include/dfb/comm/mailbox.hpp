@@ -17,12 +17,10 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstdint>
-#include <cstring>
 #include <exception>
 #include <memory>
 #include <mutex>
 #include <optional>
-#include <string>
 #include <thread>
 #include <type_traits>
 #include <utility>
@@ -618,12 +616,6 @@ private:
             connection_->giveUp(error);
         }
     }
-
-    struct Arrival {
-        int source;
-        MessageHeader header;
-        Buffer message;
-    };
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {

@@ -8,7 +8,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <string>
 #include <type_traits>
 #include <utility>
 
@@ -99,11 +98,6 @@ inline std::uint32_t crc32c(const std::byte* data, std::size_t byteCount, std::u
     return fastest(data, byteCount, before);
 }
 
-DFB_NAMESPACE_END
-
-// MessageHeader: what every message starts with, so that it is recognised before it is used.
-
-DFB_NAMESPACE_BEGIN
 namespace detail {
 
 enum class MessageKind : std::uint8_t {
@@ -188,6 +182,13 @@ inline MessageHeader readMessageHeader(const Buffer& message)
         failMalformed("unknown kind of message", -1, static_cast<std::int64_t>(header.kind));
     return header;
 }
+
+// A message that has come, with its header, and the rank that sent it.
+struct Arrival {
+    int source;
+    MessageHeader header;
+    Buffer message;
+};
 
 // A message of `byteCount` bytes after the header.
 inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const std::byte* body, std::size_t byteCount)

@@ -14,7 +14,6 @@
 #include <cstddef>
 #include <cstdlib>
 #include <exception>
-#include <string>
 #include <thread>
 #include <vector>
 

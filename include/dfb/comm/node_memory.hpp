@@ -18,7 +18,6 @@
 #include <mutex>
 #include <new>
 #include <string>
-#include <utility>
 
 #if defined(__linux__)
 #include <fcntl.h>

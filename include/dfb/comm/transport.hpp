@@ -30,8 +30,8 @@
 //                                               orderly: it waits for nobody; other ranks may get fail(), and messages
 //                                               under way may be lost
 //
-// Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp). Places in that memory are counted in
-// units of bytesOfPlace, at which the memory is aligned:
+// Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp). Places in that memory are counted
+// in units of bytesOfPlace, at which the memory is aligned:
 //   bool lendsTo(int other) const;              whether that rank sees this one's
 //   std::int32_t placeOf(const std::byte* p) const;
 //                                               the place that holds *p, or -1 if others do not see it
@@ -125,74 +125,60 @@ private:
 namespace detail {
 
 template <class T, class = void>
-struct HasCommunicator : std::false_type {
-};
+inline constexpr bool has_communicator_v = false;
 template <class T>
-struct HasCommunicator<T, std::void_t<typename T::Communicator>>
-    : std::is_constructible<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress> {
-};
+inline constexpr bool has_communicator_v<T, std::void_t<typename T::Communicator>> =
+    std::is_constructible_v<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress>;
 
 template <class T, class = void>
-struct HasRankAndSize : std::false_type {
-};
+inline constexpr bool has_rank_and_size_v = false;
 template <class T>
-struct HasRankAndSize<T,
-                      std::void_t<decltype(std::declval<const T&>().rank()), decltype(std::declval<const T&>().size())>>
-    : std::true_type {
-};
+inline constexpr bool has_rank_and_size_v<
+    T, std::void_t<decltype(std::declval<const T&>().rank()), decltype(std::declval<const T&>().size())>> = true;
 
 template <class T, class = void>
-struct HasSend : std::false_type {
-};
+inline constexpr bool has_send_v = false;
 template <class T>
-struct HasSend<T, std::void_t<decltype(std::declval<T&>().send(0, std::declval<Buffer&&>()))>> : std::true_type {
-};
+inline constexpr bool has_send_v<T, std::void_t<decltype(std::declval<T&>().send(0, std::declval<Buffer&&>()))>> = true;
 
 template <class T, class = void>
-struct HasPoll : std::false_type {
-};
+inline constexpr bool has_poll_v = false;
 template <class T>
-struct HasPoll<T, std::void_t<decltype(std::declval<T&>().poll()), decltype(std::declval<const T&>().needsPolling()),
-                              decltype(std::declval<const T&>().mayPoll()), decltype(std::declval<const T&>().quiet())>>
-    : std::is_same<bool, decltype(std::declval<T&>().poll())> {
-};
+inline constexpr bool has_poll_v<
+    T, std::void_t<decltype(std::declval<T&>().poll()), decltype(std::declval<const T&>().needsPolling()),
+                   decltype(std::declval<const T&>().mayPoll()), decltype(std::declval<const T&>().quiet())>> =
+    std::is_same_v<bool, decltype(std::declval<T&>().poll())>;
 
 template <class T, class = void>
-struct HasNap : std::false_type {
-};
+inline constexpr bool has_nap_v = false;
 template <class T>
-struct HasNap<
+inline constexpr bool has_nap_v<
     T, std::void_t<decltype(std::declval<T&>().nap(std::chrono::nanoseconds())),
-                   decltype(std::declval<T&>().interrupt()), decltype(std::declval<const T&>().wakesOnArrival())>>
-    : std::true_type {
-};
+                   decltype(std::declval<T&>().interrupt()), decltype(std::declval<const T&>().wakesOnArrival())>> =
+    true;
 
 template <class T, class = void>
-struct HasStartAndStop : std::false_type {
-};
+inline constexpr bool has_start_and_stop_v = false;
 template <class T>
-struct HasStartAndStop<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
-                                      decltype(std::declval<T&>().stop(true))>> : std::true_type {
-};
+inline constexpr bool
+    has_start_and_stop_v<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
+                                        decltype(std::declval<T&>().stop(true))>> = true;
 
 // Optional.
 template <class T, class = void>
-struct SharesMemory : std::false_type {
-};
+inline constexpr bool shares_memory_v = false;
 template <class T>
-struct SharesMemory<T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)),
-                                   decltype(std::declval<const T&>().placeOf(nullptr)),
-                                   decltype(std::declval<const T&>().blockAt(0, 0, 0))>> : std::true_type {
-};
+inline constexpr bool shares_memory_v<
+    T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)), decltype(std::declval<const T&>().placeOf(nullptr)),
+                   decltype(std::declval<const T&>().blockAt(0, 0, 0))>> = true;
 
 // Optional.
 template <class T, class = void>
-struct LimitsThreads : std::false_type {
-};
+inline constexpr bool limits_threads_v = false;
 template <class T>
-struct LimitsThreads<T, std::void_t<decltype(T::mayHaveThread(std::declval<const typename T::Communicator&>()))>>
-    : std::true_type {
-};
+inline constexpr bool
+    limits_threads_v<T, std::void_t<decltype(T::mayHaveThread(std::declval<const typename T::Communicator&>()))>> =
+        true;
 
 // Thread or Caller for Progress::Auto.
 template <class T>
@@ -200,7 +186,7 @@ Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communic
 {
     if (progress != Progress::Auto)
         return progress;
-    if constexpr (LimitsThreads<T>::value)
+    if constexpr (limits_threads_v<T>)
         return T::mayHaveThread(communicator) ? Progress::Thread : Progress::Caller;
     else
         return Progress::Thread;
@@ -208,42 +194,37 @@ Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communic
 
 // Optional.
 template <class T, class = void>
-struct KnowsSharing : std::false_type {
-};
+inline constexpr bool knows_sharing_v = false;
 template <class T>
-struct KnowsSharing<T, std::void_t<decltype(std::declval<const T&>().sharingRanks())>> : std::true_type {
-};
+inline constexpr bool knows_sharing_v<T, std::void_t<decltype(std::declval<const T&>().sharingRanks())>> = true;
 
 // Optional.
 template <class T, class = void>
-struct CanAbort : std::false_type {
-};
+inline constexpr bool can_abort_v = false;
 template <class T>
-struct CanAbort<T, std::void_t<decltype(std::declval<T&>().abort(std::declval<const std::string&>()))>>
-    : std::true_type {
-};
+inline constexpr bool
+    can_abort_v<T, std::void_t<decltype(std::declval<T&>().abort(std::declval<const std::string&>()))>> = true;
 
 } // namespace detail
 
 template <class T>
-inline constexpr bool is_transport_v =
-    detail::HasCommunicator<T>::value&& detail::HasRankAndSize<T>::value&& detail::HasSend<T>::value&&
-        detail::HasPoll<T>::value&& detail::HasNap<T>::value&& detail::HasStartAndStop<T>::value;
+inline constexpr bool is_transport_v = detail::has_communicator_v<T>&& detail::has_rank_and_size_v<T>&&
+    detail::has_send_v<T>&& detail::has_poll_v<T>&& detail::has_nap_v<T>&& detail::has_start_and_stop_v<T>;
 
 namespace detail {
 
 template <class T>
 constexpr bool checkTransport()
 {
-    static_assert(HasCommunicator<T>::value, "dfb: Transport must provide a type Communicator and a constructor "
-                                             "(const Communicator&, std::shared_ptr<MemoryPool>, Progress)");
-    static_assert(HasRankAndSize<T>::value, "dfb: Transport must provide int rank() const and int size() const");
-    static_assert(HasSend<T>::value, "dfb: Transport must provide void send(int destination, Buffer&&)");
-    static_assert(HasPoll<T>::value, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
-                                     "bool mayPoll() const and bool quiet() const");
-    static_assert(HasNap<T>::value, "dfb: Transport must provide void nap(std::chrono::nanoseconds), void interrupt() "
-                                    "and bool wakesOnArrival() const");
-    static_assert(HasStartAndStop<T>::value,
+    static_assert(has_communicator_v<T>, "dfb: Transport must provide a type Communicator and a constructor "
+                                         "(const Communicator&, std::shared_ptr<MemoryPool>, Progress)");
+    static_assert(has_rank_and_size_v<T>, "dfb: Transport must provide int rank() const and int size() const");
+    static_assert(has_send_v<T>, "dfb: Transport must provide void send(int destination, Buffer&&)");
+    static_assert(has_poll_v<T>, "dfb: Transport must provide bool poll(), bool needsPolling() const, "
+                                 "bool mayPoll() const and bool quiet() const");
+    static_assert(has_nap_v<T>, "dfb: Transport must provide void nap(std::chrono::nanoseconds), void interrupt() "
+                                "and bool wakesOnArrival() const");
+    static_assert(has_start_and_stop_v<T>,
                   "dfb: Transport must provide void start(TransportHandler&) and void stop(bool orderly)");
     return is_transport_v<T>;
 }
@@ -307,14 +288,14 @@ public:
 
     bool lendsTo([[maybe_unused]] int other) const override
     {
-        if constexpr (SharesMemory<Transport>::value)
+        if constexpr (shares_memory_v<Transport>)
             return transport_.lendsTo(other);
         else
             return false;
     }
     std::int32_t placeOf([[maybe_unused]] const std::byte* block) const override
     {
-        if constexpr (SharesMemory<Transport>::value)
+        if constexpr (shares_memory_v<Transport>)
             return transport_.placeOf(block);
         else
             return -1;
@@ -322,22 +303,22 @@ public:
     std::byte* blockAt([[maybe_unused]] int other, [[maybe_unused]] std::int32_t place,
                        [[maybe_unused]] std::size_t byteCount) const override
     {
-        if constexpr (SharesMemory<Transport>::value)
+        if constexpr (shares_memory_v<Transport>)
             return transport_.blockAt(other, place, byteCount);
         else
             return nullptr;
     }
     int sharingRanks() const override
     {
-        if constexpr (KnowsSharing<Transport>::value)
+        if constexpr (knows_sharing_v<Transport>)
             return transport_.sharingRanks();
         else
             return 1;
     }
-    bool canAbort() const override { return CanAbort<Transport>::value; }
+    bool canAbort() const override { return can_abort_v<Transport>; }
     void abort([[maybe_unused]] const std::string& text) override
     {
-        if constexpr (CanAbort<Transport>::value)
+        if constexpr (can_abort_v<Transport>)
             transport_.abort(text);
     }
 

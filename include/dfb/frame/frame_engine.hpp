@@ -23,9 +23,7 @@
 #include <exception>
 #include <limits>
 #include <memory>
-#include <mutex>
 #include <optional>
-#include <string>
 #include <utility>
 #include <vector>
 
@@ -464,8 +462,8 @@ private:
         open_.expectTiles(tiles + static_cast<std::int64_t>(withoutSamples.size()));
         if (userError) // comes out of end(), on all ranks; nothing is made with half of the frame's data
             outcome_->failWhole(userError);
-        for (OpenFrame::Message& message : early)
-            incoming(message.source, message.header, std::move(message.bytes));
+        for (Arrival& a : early)
+            incoming(a.source, a.header, std::move(a.message));
         early.clear(); // some may still be there, if the frame has failed
         failForDamage();
         for (const int tile : withoutSamples)

@@ -15,7 +15,6 @@
 #include <exception>
 #include <mutex>
 #include <optional>
-#include <string>
 #include <utility>
 
 DFB_NAMESPACE_BEGIN

@@ -37,16 +37,10 @@ enum class FrameState : std::uint8_t {
 // All members may be called from any thread, but for open(), finish() and close(): one at a time.
 class OpenFrame {
 public:
-    struct Message {
-        int source;
-        MessageHeader header;
-        Buffer bytes;
-    };
-
     // Frames are numbered from `first`, every `step`.
     explicit OpenFrame(std::int64_t first = 1, std::int64_t step = 1) : number_(first - step), step_(step)
     {
-        for (std::vector<Message>* messages : {&early_, &opened_})
+        for (std::vector<Arrival>* messages : {&early_, &opened_})
             messages->reserve(256); // how many come early depends on time: mostly no more
     }
 
@@ -59,7 +53,7 @@ public:
 
     // Opens the next frame and returns the messages that came too early for it, to be taken before the next open().
     // Throws InvalidArgument unless it is closed.
-    std::vector<Message>& open()
+    std::vector<Arrival>& open()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (state_ != FrameState::Closed)
@@ -304,7 +298,7 @@ private:
     std::int64_t tilesLeft_ = 0;
     int inside_ = 0, readers_ = 0;
     bool hasInPlace_ = false;
-    std::vector<Message> early_, opened_; // for the next frame; for the one that is open
+    std::vector<Arrival> early_, opened_; // for the next frame; for the one that is open
 };
 
 } // namespace detail

@@ -27,18 +27,18 @@ struct OperationTraits {
     static OperationTraits of()
     {
         OperationTraits t;
-        t.tileWidth = t.tileHeight = TileSizeOf<TileOp>::value;
+        t.tileWidth = t.tileHeight = tile_size_v<TileOp>;
         t.channels = TileOp::channels;
-        t.neededChannels = NeededChannelsOf<TileOp>::value;
-        t.activeByDepth = ActiveByDepth<TileOp>::value;
-        t.emptyIsBackground = EmptyIsBackground<TileOp>::value;
-        t.keepsState = KeepsState<TileOp>::value;
-        t.endsEarly = HasIsComplete<TileOp>::value;
-        t.opaqueHides = OpaqueHides<TileOp>::value;
-        t.readsInPlace = ReadsInPlace<TileOp>::value;
-        t.reports = HasReport<TileOp>::value;
+        t.neededChannels = needed_channels_v<TileOp>;
+        t.activeByDepth = active_by_depth_v<TileOp>;
+        t.emptyIsBackground = empty_is_background_v<TileOp>;
+        t.keepsState = keeps_state_v<TileOp>;
+        t.endsEarly = has_is_complete_v<TileOp>;
+        t.opaqueHides = opaque_hides_v<TileOp>;
+        t.readsInPlace = reads_in_place_v<TileOp>;
+        t.reports = has_report_v<TileOp>;
         t.hasPixelOp = !std::is_same_v<PixelOp, NoPixelOp>;
-        t.pixelOpIsPointwise = IsPointwise<PixelOp>::value;
+        t.pixelOpIsPointwise = is_pointwise_v<PixelOp>;
         t.tileOp = typeid(TileOp).name();
         t.pixelOp = typeid(PixelOp).name();
         return t;
@@ -101,7 +101,7 @@ public:
     void newFrame() override
     {
         tileData_ = *offeredTileData_;
-        if constexpr (HasPixelNewFrame<PixelOp>::value)
+        if constexpr (has_pixel_new_frame_v<PixelOp>)
             pixelOp_.newFrame(*offeredPixelData_);
     }
 
@@ -109,7 +109,7 @@ public:
 
     bool opaqueHides([[maybe_unused]] const TileInfo& info) const override
     {
-        if constexpr (OpaqueHides<TileOp>::value)
+        if constexpr (opaque_hides_v<TileOp>)
             return TileOp::opaqueHides(info);
         else
             return false;
@@ -124,7 +124,7 @@ private:
 
         void newFrame(const TileInfo& info) override
         {
-            if constexpr (HasNewFrameWithData<TileOp>::value)
+            if constexpr (has_new_frame_with_data_v<TileOp>)
                 op_.newFrame(info, data_);
             else
                 op_.newFrame(info);
@@ -132,7 +132,7 @@ private:
         void add(Fragment&& fragment) override { op_.add(std::move(fragment)); }
         bool isComplete() const override
         {
-            if constexpr (HasIsComplete<TileOp>::value)
+            if constexpr (has_is_complete_v<TileOp>)
                 return op_.isComplete();
             else
                 return false;
@@ -141,7 +141,7 @@ private:
         TileReport report() const override
         {
             TileReport report;
-            if constexpr (HasReport<TileOp>::value)
+            if constexpr (has_report_v<TileOp>)
                 op_.report(report);
             return report;
         }

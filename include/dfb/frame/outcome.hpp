@@ -10,7 +10,6 @@
 #include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
-#include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <exception>
@@ -18,7 +17,6 @@
 #include <optional>
 #include <string>
 #include <utility>
-#include <vector>
 
 DFB_NAMESPACE_BEGIN
 namespace detail {

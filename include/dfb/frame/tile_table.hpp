@@ -160,7 +160,7 @@ public:
         }
     }
 
-    // Takes the number of inputs that each tile will get in each pass; a tile that is not named gets none. First calls
+    // Takes the inputs that each tile will get in each pass; a tile that is not named gets none. First calls
     // `counted(tile)` for each tile that waits for inputs, then `ready(tile)` for each tile whose inputs are all there.
     // With `all`, also calls them for tiles without inputs. `expected` must live as long as the frame. If the tracker
     // or the operation throws, this goes on with the other tiles and throws at the end; `where` then names the first

@@ -10,7 +10,6 @@
 #include <dfb/tile_layout.hpp>
 
 #include <algorithm>
-#include <atomic>
 #include <chrono>
 #include <cstddef>
 #include <cstdint>

@@ -10,7 +10,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
-#include <string>
 #include <type_traits>
 #include <vector>
 
@@ -79,10 +78,10 @@ struct Moments {
 template <class Base>
 class Progressive {
 public:
-    static constexpr int tileSize = detail::TileSizeOf<Base>::value;
+    static constexpr int tileSize = detail::tile_size_v<Base>;
     static constexpr ChannelMask channels = Base::channels;
-    static constexpr ChannelMask neededChannels = detail::NeededChannelsOf<Base>::value;
-    static constexpr bool activeByDepth = detail::ActiveByDepth<Base>::value;
+    static constexpr ChannelMask neededChannels = detail::needed_channels_v<Base>;
+    static constexpr bool activeByDepth = detail::active_by_depth_v<Base>;
     static constexpr bool keepsState = true;
 
     void newFrame(const TileInfo& info)

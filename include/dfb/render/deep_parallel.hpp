@@ -156,9 +156,6 @@ private:
     double errorBound_ = 0;
 };
 
-// DeepParallelLoop: data-parallel rendering with deep fragments: bricks need not be convex, and may be interleaved (A
-// before B before A along a ray).
-//
 // Sorts segments, also those of one brick, and counts the pixels in which some overlap:
 // FrameReport::orderUndefinedPixels.
 template <int TileSize = 64>

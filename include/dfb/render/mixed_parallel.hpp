@@ -21,7 +21,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <mutex>
-#include <string>
 #include <tuple>
 #include <type_traits>
 #include <unordered_map>
@@ -160,14 +159,13 @@ private:
 namespace detail {
 
 template <class Owner, class = void>
-struct HasPlan : std::false_type {
-};
+inline constexpr bool has_plan_v = false;
 template <class Owner>
-struct HasPlan<Owner, std::void_t<decltype(std::declval<Owner&>().plan(std::declval<const SharedWorld&>(),
+inline constexpr bool
+    has_plan_v<Owner, std::void_t<decltype(std::declval<Owner&>().plan(std::declval<const SharedWorld&>(),
                                                                        std::declval<const std::vector<BrickInTile>&>(),
-                                                                       std::declval<const std::vector<int>&>()))>>
-    : std::true_type {
-};
+                                                                       std::declval<const std::vector<int>&>()))>> =
+        true;
 
 struct MixedJob {
     std::size_t pair = 0;
@@ -197,7 +195,7 @@ struct MixedWork {
         passes.clear();
         for (const BrickInTile& pair : pairs)
             passes.push_back(frame.samples(pair.tile).count);
-        if constexpr (HasPlan<Owner>::value)
+        if constexpr (has_plan_v<Owner>)
             owner.plan(world, pairs, passes);
         jobs.clear();
         for (std::size_t p = 0; p < pairs.size(); ++p) {
@@ -308,7 +306,7 @@ struct OrderedWork : MixedWork {
 template <class Owner, class Frame, class RenderBrick, class Tile>
 void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& renderBrick, Tile& tile)
 {
-    if constexpr (!HasPlan<Owner>::value) {
+    if constexpr (!has_plan_v<Owner>) {
         renderBrick(brick, tile);
         return;
     }

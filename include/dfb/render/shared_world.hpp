@@ -11,7 +11,6 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
-#include <string>
 #include <utility>
 #include <vector>
 
@@ -85,28 +84,6 @@ private:
     int rank_;
     std::vector<SharedBrick> bricks_;
 };
-
-namespace detail {
-
-template <class Camera>
-void findVisibleTiles(const SharedWorld& world, const Camera& camera, const TileLayout& layout,
-                      std::vector<BrickInTile>& result)
-{
-    findVisibleTiles(
-        world.bricks().size(), [&](std::size_t b) -> const Box3& { return world.bricks()[b].brick.bounds; }, camera,
-        layout, result);
-}
-
-} // namespace detail
-
-// All pairs of a brick, by its place in SharedWorld::bricks(), and a tile that it may project to; tile by tile.
-template <class Camera>
-std::vector<BrickInTile> visibleTiles(const SharedWorld& world, const Camera& camera, const TileLayout& layout)
-{
-    std::vector<BrickInTile> result;
-    detail::findVisibleTiles(world, camera, layout, result);
-    return result;
-}
 
 namespace detail {
 

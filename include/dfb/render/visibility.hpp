@@ -16,6 +16,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -277,7 +278,7 @@ private:
     double tan_;
 };
 
-// A brick of the world, by its place in World::bricks(), and a tile that it may project to.
+// A brick, by its place in bricks() of a World or a SharedWorld, and a tile that it may project to.
 struct BrickInTile {
     int brick = 0;
     int tile = 0;
@@ -309,16 +310,27 @@ void forEachTile(const std::vector<Projection>& projections, const TileLayout& l
         forEachTile(projection, layout, found);
 }
 
-// visibleTiles() into memory that is there already. `boundsOf(b)`: the bounds of brick b.
-template <class BoundsOf, class Camera>
-void findVisibleTiles(std::size_t brickCount, const BoundsOf& boundsOf, const Camera& camera, const TileLayout& layout,
+// Of a brick of a World or a SharedWorld.
+template <class AnyBrick>
+const Box3& boundsOf(const AnyBrick& brick) noexcept
+{
+    if constexpr (std::is_same_v<AnyBrick, Brick>)
+        return brick.bounds;
+    else
+        return brick.brick.bounds;
+}
+
+// visibleTiles() into memory that is there already.
+template <class AnyWorld, class Camera>
+void findVisibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout,
                       std::vector<BrickInTile>& result)
 {
     result.clear();
-    for (std::size_t b = 0; b < brickCount; ++b)
-        forEachTile(camera.project(boundsOf(b), layout.width(), layout.height()), layout, [&](int tile) {
-            result.push_back({static_cast<int>(b), tile});
-        });
+    for (std::size_t b = 0; b < world.bricks().size(); ++b)
+        forEachTile(camera.project(boundsOf(world.bricks()[b]), layout.width(), layout.height()), layout,
+                    [&](int tile) {
+                        result.push_back({static_cast<int>(b), tile});
+                    });
     const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
     std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
     result.erase(
@@ -326,20 +338,11 @@ void findVisibleTiles(std::size_t brickCount, const BoundsOf& boundsOf, const Ca
         result.end());
 }
 
-template <class Camera>
-void findVisibleTiles(const World& world, const Camera& camera, const TileLayout& layout,
-                      std::vector<BrickInTile>& result)
-{
-    findVisibleTiles(
-        world.bricks().size(), [&](std::size_t b) -> const Box3& { return world.bricks()[b].bounds; }, camera, layout,
-        result);
-}
-
 } // namespace detail
 
-// All pairs, tile by tile, so that the inputs of a tile are rendered one after the other.
-template <class Camera>
-std::vector<BrickInTile> visibleTiles(const World& world, const Camera& camera, const TileLayout& layout)
+// All pairs, tile by tile, so that the inputs of a tile are rendered one after the other. Of a World or a SharedWorld.
+template <class AnyWorld, class Camera>
+std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout)
 {
     std::vector<BrickInTile> result;
     detail::findVisibleTiles(world, camera, layout, result);

@@ -12,10 +12,6 @@
 #include <limits>
 #include <type_traits>
 
-#if defined(DFB_HAS_AVX2_CLONES)
-#include <immintrin.h>
-#endif
-
 // WireCodes: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
 // Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
 
@@ -241,11 +237,7 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 }
 
 } // namespace detail
-DFB_NAMESPACE_END
 
-// Wire formats: how exactly the colour of inputs travels, what that costs in accuracy, and the choice of the cheapest
-// that keeps an error budget.
-//
 // Which channels are rounded: colour and alpha, and the bound is for these. All others travel as they are. Depth,
 // positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0
 // counts for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with
@@ -266,8 +258,6 @@ DFB_NAMESPACE_END
 // A mean of passes is no worse than its worst pass. Unorm is converted in float, four roundings of 2^-24 M: 2^-21 (M +
 // B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire/wire_format.cpp
 // looks for pixels that are worse, also at the edges.
-
-DFB_NAMESPACE_BEGIN
 
 enum class WireFormat : std::uint8_t {
     Float32, // as the renderer wrote it
@@ -401,7 +391,7 @@ private:
 } // namespace detail
 
 // The most that a pixel may be off if no pixel has more than `layers` inputs in a pass, all in this format and in
-// range, over a background of at most `background` in a channel. See the top of this file.
+// range, over a background of at most `background` in a channel. See the comment above WireFormat.
 inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxColor, double background)
 {
     const double reach = maxColor + std::max(maxColor, background); // M + B; of alpha |1 - A|, A of those behind

@@ -118,7 +118,7 @@ ByteOutput runBytes(const std::vector<ByteInput>& inputs, const dfb::TileInfo& i
     namespace d = dfb::detail;
     const auto pool = dfb::MemoryPool::create();
     const dfb::TileLayout layout(50, 20, 64);
-    const d::WireCoder coder(dfb::Precision(), d::ActiveByDepth<Op>::value, true);
+    const d::WireCoder coder(dfb::Precision(), d::active_by_depth_v<Op>, true);
     const auto sent = static_cast<dfb::ChannelMask>(dfb::colorChannel | dfb::depthChannel | info.wanted);
     ByteOutput out;
     d::InputFaults faults;

@@ -26,7 +26,7 @@
 namespace dfb::testing {
 
 template <class Op>
-inline constexpr int tileSizeOf = dfb::detail::TileSizeOf<Op>::value;
+inline constexpr int tileSizeOf = dfb::detail::tile_size_v<Op>;
 
 // One tile of an image, and the inputs that it gets.
 template <int Size>
@@ -108,8 +108,8 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     info.wanted = withDepth ? depthChannel : 0;
     info.background = in.background;
     info.minTransmittance = wire.minTransmittance;
-    const d::WireCoder coder(wire.precision, d::ActiveByDepth<Op>::value);
-    const auto wanted = static_cast<ChannelMask>(d::NeededChannelsOf<Op>::value | (withDepth ? depthChannel : 0));
+    const d::WireCoder coder(wire.precision, d::active_by_depth_v<Op>);
+    const auto wanted = static_cast<ChannelMask>(d::needed_channels_v<Op> | (withDepth ? depthChannel : 0));
     TileOutput out;
     op.newFrame(info);
     for (const std::size_t i : order) {
@@ -128,7 +128,7 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     planes.at[d::Depth] = withDepth ? reinterpret_cast<std::byte*>(out.depth.data()) : nullptr;
     FinishedTile finished(region, format, planes, width, dither);
     op.finish(finished);
-    if constexpr (d::HasReport<Op>::value)
+    if constexpr (d::has_report_v<Op>)
         op.report(out.report);
     if (written)
         *written = finished.writtenPixels();
