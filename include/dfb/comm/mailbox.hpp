@@ -77,8 +77,8 @@ public:
 
     ~Mailbox() { stop(); }
 
-    // Ends the calls of the handler, and waits for those under way. Tells the others, for one that still waits for this
-    // rank.
+    // Ends the calls of the handler, and waits for those under way. Tells the neighbours that this rank takes part in
+    // nothing that begins from now on.
     void stop()
     {
         if (!isEnding_ && !failed())
@@ -593,7 +593,7 @@ private:
         Leaving how;
     };
 
-    // What this rank has begun after such a rank has left would never end.
+    // Gives up if this rank has begun something in which a rank that has left takes no part: it would never end.
     void checkLeft()
     {
         std::vector<Left> all;
