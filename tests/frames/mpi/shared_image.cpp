@@ -96,7 +96,8 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
     const int rank = rankIn(MPI_COMM_WORLD);
     const Scene s = sceneFor(5, 2);
     for (const bool allowPartial : {false, true}) {
-        dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s));
+        constexpr int threads = 2; // the slow tile keeps one of them
+        dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s, threads));
         dfb::FrameReport report;
         CHECK(goodFrame(fb, s, report));
         CHECK(goodFrame(fb, s, report));
