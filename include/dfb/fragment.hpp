@@ -212,11 +212,11 @@ public:
     // Leaves out rows.
     void skip(int count)
     {
-        if (isInPlace())
-            row_ += count;
-        else
-            for (int i = 0; i < count; ++i)
-                next();
+        for (const int end = row_ + count; row_ < end; ++row_) {
+            FragmentRow row;
+            if (!isInPlace() && findRow(row_, row))
+                advance(row);
+        }
     }
 
 private:

@@ -39,6 +39,7 @@ enum class Defect {
     LosesWhatComesBeforeStart,
     MixesTransports, // of those on a rank the one that was started last gets some messages of the others
     BlocksInSend,
+    BlocksInInterrupt, // of a handler
     WaitsInAbandon,
     CallsAfterStop,
     Oversleeps,
@@ -130,6 +131,8 @@ public:
     }
     void interrupt()
     {
+        while (has(Defect::BlocksInInterrupt) && inHandler() && !testIsOver)
+            std::this_thread::sleep_for(milliseconds(1));
         signal_.interrupt();
         if (!has(Defect::IsNotInterrupted) && (!has(Defect::ForgetsAnEarlyInterrupt) || napping_))
             base_.interrupt();
@@ -155,6 +158,11 @@ public:
 private:
     bool has(Defect defect) const { return defect_ == defect; }
     std::size_t own() const { return static_cast<std::size_t>(base_.rank()); }
+    static bool& inHandler()
+    {
+        static thread_local bool is = false;
+        return is;
+    }
 
     void receive(int source, Buffer&& message) override
     {
@@ -172,7 +180,9 @@ private:
             const std::lock_guard<std::mutex> lock(started.mutex);
             started.handlers[own()].back()->receive(source, std::move(message));
         } else {
+            inHandler() = true;
             handler_->receive(source, std::move(message));
+            inHandler() = false;
         }
     }
     void fail(const ErrorInfo& error) override { handler_->fail(error); }
@@ -255,6 +265,7 @@ TEST_CASE("Calls that do not return, and those that come too late, are found")
 {
     testIsOver = false;
     CHECK_FINDS(failuresOf(Defect::BlocksInSend), "", "has not ended: a call of the transport does not return");
+    CHECK_FINDS(failuresOf(Defect::BlocksInInterrupt), "", "has not ended: a call of the transport does not return");
     testIsOver = true;
     CHECK_FINDS(failuresOf(Defect::WaitsInAbandon), "stop(false) waits for nobody", "it took ");
     CHECK_FINDS(failuresOf(Defect::CallsAfterStop), "", "the handler was called after stop()");

@@ -22,7 +22,8 @@
 //                                               this rank does not poll any more
 //   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until soon after there is something to
 //                                               send, interrupt() is called, or `limit` has passed
-//   void interrupt();                           any thread. Ends the nap under way, or else the next one
+//   void interrupt();                           any thread, also within a call of the handler. Ends the nap under way,
+//                                               or else the next one
 //   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
 //                                               the handler is not called. Orderly: this rank expects no more messages;
 //                                               what it has sent reaches all ranks that have not called stop(); it may
@@ -84,7 +85,7 @@ enum class Progress {
 };
 
 // Gets the messages that a transport delivers. Its members are quick and never block. Any thread may call them. They
-// must not call the transport.
+// call nothing of the transport but interrupt().
 class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;

@@ -642,6 +642,8 @@ private:
             }
             --running;
         };
+        // As a connection does that passes a message on.
+        session_->mailbox.interruptOnReceive([this] { session_->transport.interrupt(); });
         meet();
         Ledger ledger = expect(*session_, everyone, count, sizeOf);
         if (threadCount == 1) {
@@ -657,6 +659,8 @@ private:
             if (!error.empty())
                 throw GaveUp("send() throws: " + error);
         receive(*session_, ledger);
+        meet();
+        session_->mailbox.interruptOnReceive(nullptr);
     }
 
     void checkFlood()

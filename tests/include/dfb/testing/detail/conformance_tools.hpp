@@ -123,6 +123,8 @@ public:
                 messages_.emplace_back(source, std::move(message));
         }
         bell_.interrupt();
+        if (interrupt_)
+            interrupt_();
     }
 
     void fail(const ErrorInfo& error) override
@@ -148,6 +150,8 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         failsAt_ = time;
     }
+    // Call `interrupt` for each message that comes; null: nothing. Not while messages may come.
+    void interruptOnReceive(std::function<void()> interrupt) { interrupt_ = std::move(interrupt); }
     void failWithMessage()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -181,6 +185,7 @@ public:
 
 private:
     NapSignal& bell_;
+    std::function<void()> interrupt_;
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> messages_;
     std::string failure_;
