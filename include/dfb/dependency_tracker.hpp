@@ -12,7 +12,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <map>
 #include <optional>
 #include <string>
 #include <utility>
@@ -28,14 +27,12 @@ public:
     void reset(int rootCount = 1)
     {
         generations_.assign(2, {}); // nearly every tree has as many
-        if (!far_.empty())
-            far_.clear();
         inputs_.clear();
         declared_.clear();
         hasDeclaration_ = false;
         current_ = 0;
         closed_ = false;
-        generation(0).expected = rootCount;
+        generations_[0].expected = rootCount;
     }
 
     // The owner's own root (generation 0) has come, and generation 1 has exactly these (source, part) pairs, each once.
@@ -52,7 +49,7 @@ public:
         for (const Input& input : inputs_)
             if (input.generation == 1)
                 checkDeclared(input);
-        Generation& root = generation(0);
+        Generation& root = generations_[0];
         if (++root.arrived > root.expected)
             failAt(0, ErrorKind::TooManyInputs, root.expected, root.arrived);
         root.children += static_cast<std::int64_t>(declared_.size());
@@ -81,8 +78,11 @@ public:
             checkDeclared(input);
         if (closed_ && generationIndex >= current_)
             fail(ErrorKind::UnannouncedInput, generationIndex, source, rank, 0, 1, "no parent announced it");
+        const bool isNear = reach(static_cast<std::size_t>(generationIndex));
         inputs_.insert(place, input);
-        Generation& g = generation(generationIndex);
+        if (!isNear)
+            return; // it is counted when the tree gets there
+        Generation& g = generations_[static_cast<std::size_t>(generationIndex)];
         ++g.arrived;
         g.children += children;
         if (generationIndex < current_ || (generationIndex == current_ && g.arrived > g.expected))
@@ -99,16 +99,15 @@ public:
     [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
                                        int otherRank)
     {
-        ErrorInfo info;
-        info.kind = ErrorKind::DuplicateInput;
+        ErrorInfo info = detail::errorInfo(ErrorKind::DuplicateInput,
+                                           detail::printed("source %u (in the library's loops the id of a brick; in an "
+                                                           "ImageCompositor the place of an image)",
+                                                           source));
         info.from = std::max(rank, otherRank);
         info.generation = generation;
         info.source = source;
         info.expected = 1;
         info.got = 2;
-        info.message = detail::printed(
-            "source %u (in the library's loops the id of a brick; in an ImageCompositor the place of an image)",
-            source);
         if (part > 0)
             info.message += detail::printed(" part %d", part);
         if (std::min(rank, otherRank) < 0 || rank == otherRank)
@@ -186,44 +185,48 @@ private:
         }
     };
 
-    Generation& generation(int index)
-    {
-        const auto place = static_cast<std::size_t>(index);
-        if (place >= generations_.size() && !reach(place))
-            return far_[index];
-        return generations_[place];
-    }
-    // False if it is too far.
+    // Sees to it that there is a generation `place`, with what has come of it. False if it is too far.
     bool reach(std::size_t place)
     {
-        if (place > generations_.size() + mostAhead)
+        const std::size_t before = generations_.size();
+        if (place >= before + mostAhead)
             return false;
+        if (place < before)
+            return true;
         generations_.resize((place / 8 + 1) * 8); // whichever of them comes first, the same memory
-        for (; !far_.empty() && static_cast<std::size_t>(far_.begin()->first) < generations_.size();
-             far_.erase(far_.begin()))
-            generations_[static_cast<std::size_t>(far_.begin()->first)] = far_.begin()->second;
+        for (auto input = firstFrom(static_cast<int>(before)); input != inputs_.end(); ++input) {
+            const auto g = static_cast<std::size_t>(input->generation);
+            if (g >= generations_.size())
+                break;
+            ++generations_[g].arrived;
+            generations_[g].children += input->children;
+        }
         return true;
+    }
+
+    // The first input of a generation, or else of a later one.
+    std::vector<Input>::const_iterator firstFrom(int generation) const
+    {
+        return std::lower_bound(inputs_.begin(), inputs_.end(), Input{generation, 0, 0, -1, 0});
     }
 
     // Steps over every generation that is complete; the next one expects its children.
     void advance()
     {
         while (!closed_) {
-            const Generation done = generation(current_);
+            const Generation done = generations_[static_cast<std::size_t>(current_)];
             if (done.arrived < done.expected)
                 return;
             if (done.arrived > done.expected)
                 failAt(current_, ErrorKind::TooManyInputs, done.expected, done.arrived);
-            ++current_;
-            generation(current_).expected = done.children;
-            if (done.children == 0) {
-                closed_ = true;
-                for (std::size_t g = static_cast<std::size_t>(current_); g < generations_.size(); ++g)
-                    if (generations_[g].arrived > 0)
-                        failAt(static_cast<int>(g), ErrorKind::UnannouncedInput, 0, generations_[g].arrived);
-                if (!far_.empty())
-                    failAt(far_.begin()->first, ErrorKind::UnannouncedInput, 0, far_.begin()->second.arrived);
-            }
+            reach(static_cast<std::size_t>(++current_));
+            generations_[static_cast<std::size_t>(current_)].expected = done.children;
+            closed_ = done.children == 0;
+            if (!closed_)
+                continue;
+            if (const auto next = firstFrom(current_); next != inputs_.end())
+                failAt(next->generation, ErrorKind::UnannouncedInput, 0,
+                       firstFrom(next->generation + 1) - firstFrom(next->generation));
         }
     }
 
@@ -237,7 +240,7 @@ private:
     // Blames the first input of a generation, where the culprit cannot be told from the others.
     [[noreturn]] void failAt(int generationIndex, ErrorKind kind, std::int64_t expected, std::int64_t got) const
     {
-        const auto first = std::lower_bound(inputs_.begin(), inputs_.end(), Input{generationIndex, 0, 0, -1, 0});
+        const auto first = firstFrom(generationIndex);
         const bool isThere = first != inputs_.end();
         fail(kind, generationIndex, isThere ? first->source : 0, isThere ? first->rank : -1, expected, got, "");
     }
@@ -245,14 +248,12 @@ private:
     [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, int rank,
                                   std::int64_t expected, std::int64_t got, std::string message)
     {
-        ErrorInfo info;
-        info.kind = kind;
+        ErrorInfo info = detail::errorInfo(kind, std::move(message));
         info.from = rank;
         info.generation = generationIndex;
         info.source = source;
         info.expected = expected;
         info.got = got;
-        info.message = std::move(message);
         throw Error(std::move(info));
     }
 
@@ -260,8 +261,7 @@ private:
     static constexpr std::size_t mostAhead = 64;
 
     std::vector<Generation> generations_;                           // the first ones
-    std::map<int, Generation> far_;                                 // those behind that have come
-    std::vector<Input> inputs_;                                     // sorted
+    std::vector<Input> inputs_;                                     // sorted; also of generations behind those
     std::vector<std::pair<std::uint32_t, std::uint16_t>> declared_; // sorted
     bool hasDeclaration_ = false;
     int current_ = 0; // the first generation that is not complete

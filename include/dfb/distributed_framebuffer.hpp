@@ -300,13 +300,7 @@ public:
             config.executor = detail::makeThreads(*connection_);
         for (int slot = 0; slot < std::max(1, config.framesInFlight); ++slot)
             operations_.push_back(std::make_unique<Operations>(pixelOp));
-        try {
-            makeEngines(config);
-        } catch (const InvalidArgument&) {
-            // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
-            connection_.reset();
-            throw;
-        }
+        makeEngines(config);
     }
 
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
@@ -410,13 +404,8 @@ private:
     void makeEngines(const Config& config)
     {
         std::vector<std::unique_ptr<Engine>> engines;
-        try {
-            for (std::size_t slot = 0; slot < operations_.size(); ++slot)
-                engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
-        } catch (...) {
-            engines.clear(); // in order, before the exception passes
-            throw;
-        }
+        for (std::size_t slot = 0; slot < operations_.size(); ++slot)
+            engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
         engines_ = std::move(engines);
         next_ = 0;
         lastEnded_ = engines_.front().get();

@@ -128,57 +128,57 @@ struct ErrorInfo {
     }
 };
 
+namespace detail {
+
+// Makes a record of an error that was noticed on that rank.
+inline ErrorInfo errorInfo(ErrorKind kind, std::string message, int rank = -1)
+{
+    ErrorInfo info;
+    info.kind = kind;
+    info.rank = rank;
+    info.message = std::move(message);
+    return info;
+}
+
+} // namespace detail
+
 class Error : public std::runtime_error {
 public:
-    explicit Error(ErrorInfo info) : std::runtime_error(info.describe()), info_(std::move(info)) {}
+    // `whileThrown` lives as long as the exception does.
+    explicit Error(ErrorInfo info, std::shared_ptr<const void> whileThrown = {})
+        : std::runtime_error(info.describe()), info_(std::move(info)), whileThrown_(std::move(whileThrown))
+    {
+    }
     const ErrorInfo& info() const noexcept { return info_; }
 
 private:
     ErrorInfo info_;
+    std::shared_ptr<const void> whileThrown_;
 };
 
 // A call that can never be right. Nothing was sent, the object is unchanged.
 class InvalidArgument : public Error {
 public:
     using Error::Error;
-    explicit InvalidArgument(std::string message) : Error(make(std::move(message))) {}
-
-private:
-    static ErrorInfo make(std::string message)
+    explicit InvalidArgument(std::string message)
+        : Error(detail::errorInfo(ErrorKind::InvalidArgument, std::move(message)))
     {
-        ErrorInfo info;
-        info.message = std::move(message);
-        return info;
     }
 };
 
 // A frame failed. Every rank throws the same one out of Frame::end(); the framebuffer can begin a new frame.
 class FrameError : public Error {
 public:
-    // `whileThrown` lives as long as the exception does.
-    explicit FrameError(ErrorInfo info, std::shared_ptr<const void> whileThrown = {})
-        : Error(std::move(info)), whileThrown_(std::move(whileThrown))
-    {
-    }
-
-private:
-    std::shared_ptr<const void> whileThrown_;
+    using Error::Error;
 };
 
 // The transport cannot work or has failed; the framebuffer is of no further use.
 class TransportError : public Error {
 public:
     using Error::Error;
-    explicit TransportError(std::string message, int rank = -1) : Error(make(std::move(message), rank)) {}
-
-private:
-    static ErrorInfo make(std::string message, int rank)
+    explicit TransportError(std::string message, int rank = -1)
+        : Error(detail::errorInfo(ErrorKind::Transport, std::move(message), rank))
     {
-        ErrorInfo info;
-        info.kind = ErrorKind::Transport;
-        info.rank = rank;
-        info.message = std::move(message);
-        return info;
     }
 };
 
@@ -192,6 +192,14 @@ namespace detail {
     std::string text = printed(format, values);
     va_end(values);
     throw InvalidArgument(std::move(text));
+}
+
+[[noreturn]] inline void failMalformed(const char* message, std::int64_t expected = -1, std::int64_t got = -1)
+{
+    ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, message);
+    info.expected = expected;
+    info.got = got;
+    throw Error(std::move(info));
 }
 
 } // namespace detail

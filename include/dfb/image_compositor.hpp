@@ -351,14 +351,7 @@ DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOpera
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
 {
     auto operations = makeOperations(config.image);
-    try {
-        engine_ = detail::makeEngine(connection_, config, *operations, 0);
-    } catch (const InvalidArgument&) {
-        // All ranks throw it: the connection's end is in order, so it must not come while an exception passes.
-        if (!engine_)
-            connection_.reset();
-        throw;
-    }
+    engine_ = detail::makeEngine(connection_, config, *operations, 0);
     operations_ = std::move(operations);
 }
 

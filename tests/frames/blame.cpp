@@ -372,27 +372,57 @@ struct BlamedLoop {
     }
 };
 
-// A frame's error that ends the framebuffer, too: one rank has it first, and its leaving must not hide it from others.
+// An error of all ranks that ends the framebuffer, too: one rank has it first, and its leaving must not hide it from
+// others.
 struct BlamedOutside {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
+        using Fb = BlameFrameBuffer<Transport>;
         Result result;
         dfb::FrameBufferConfig config(64, 48);
         config.quiet = std::chrono::milliseconds(1);
-        for (int round = 0; round < 10; ++round) {
-            const std::string text = scene::outcomeOf([&] {
-                BlameFrameBuffer<Transport> fb(communicator, config);
-                auto frame = fb.begin();
-                frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
-                    tile.children = 1; // which nobody sends
-                    frame.setTile(tile);
-                });
-                frame.end();
+        const auto endWithMissingInput = [](Fb& fb) {
+            auto frame = fb.begin();
+            frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
+                tile.children = 1; // which nobody sends
+                frame.setTile(tile);
             });
-            expectText(result, "an error that leaves the framebuffer's scope", text,
-                       {"FrameError: dfb: missing input"});
-        }
+            frame.end();
+        };
+        const auto reduceUnequal = [](Fb& fb) {
+            const bool isLast = fb.rank() == fb.size() - 1;
+            fb.allReduce(std::vector<std::int64_t>(isLast ? 2 : 1), Fb::Reduce::Sum);
+        };
+        const auto resizeUnequal = [](Fb& fb) { fb.resize(fb.rank() == fb.size() - 1 ? 80 : 64, 48); };
+        struct Case {
+            std::string name, text;
+            std::function<void(Fb&)> call;
+            int leastRanks;
+        };
+        for (const Case& c : {Case{"end()", "FrameError: dfb: missing input", endWithMissingInput, 1},
+                              Case{"allReduce()", "the number of values in allReduce()", reduceUnequal, 2},
+                              Case{"resize()", "width is ", resizeUnequal, 2}})
+            for (int round = 0; round < 10; ++round) {
+                int size = 0;
+                const std::string text = scene::outcomeOf([&] {
+                    Fb fb(communicator, config);
+                    size = fb.size();
+                    c.call(fb);
+                });
+                if (size >= c.leastRanks)
+                    expectText(result, c.name + " that leaves the framebuffer's scope", text, {c.text});
+            }
+        for (int round = 0; round < 10; ++round)
+            expectText(result, "finish() that leaves the wall's scope", scene::outcomeOf([&] {
+                           dfb::WallLayout layout;
+                           layout.displayWidth = layout.displayHeight = 32;
+                           layout.ranks = {0};
+                           dfb::DisplayWall wall(dfb::connect<Transport>(communicator), layout,
+                                                 dfb::OutputFormat::SRGBA8);
+                           wall.finish(1); // which nobody has begun
+                       }),
+                       {"dfb: missing input"});
         return result;
     }
 };
@@ -449,7 +479,7 @@ TEST_CASE("An exception between begin() and end() is told to all ranks", "[blame
 {
     everywhere<frame_cases::BlamedLoop>();
 }
-TEST_CASE("A frame's error is the same on all ranks when it ends their framebuffers", "[blame]")
+TEST_CASE("An error of all ranks is the same on all when it ends their framebuffers", "[blame]")
 {
     everywhere<frame_cases::BlamedOutside>();
 }

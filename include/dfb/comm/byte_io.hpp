@@ -21,6 +21,11 @@ namespace detail {
 class SmallBytes {
 public:
     SmallBytes() = default;
+    [[gnu::noinline]] SmallBytes(const SmallBytes&) = default; // these not inlined: they are called in many places
+    [[gnu::noinline]] SmallBytes(SmallBytes&&) = default;
+    [[gnu::noinline]] SmallBytes& operator=(const SmallBytes&) = default;
+    [[gnu::noinline]] SmallBytes& operator=(SmallBytes&&) = default;
+    [[gnu::noinline]] ~SmallBytes() = default;
     explicit SmallBytes(std::size_t count) : fewCount_(std::min(count, most)), many_(count > most ? count : 0) {}
     SmallBytes(const std::byte* first, const std::byte* last) { append(first, last); }
 
@@ -115,31 +120,22 @@ public:
     void end() const
     {
         if (left_ > 0)
-            fail("a control message is too long", 0);
+            failMalformed("a control message is too long", 0, static_cast<std::int64_t>(left_));
     }
     // Throws Error (MalformedMessage) unless the value read is a possible one.
     void require(bool canBe) const
     {
         if (!canBe)
-            fail("a control message says what cannot be", 0);
+            failMalformed("a control message says what cannot be", 0, static_cast<std::int64_t>(left_));
     }
     std::size_t left() const noexcept { return left_; }
 
 private:
-    [[noreturn]] void fail(const char* message, std::size_t expected) const
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::MalformedMessage;
-        info.expected = static_cast<std::int64_t>(expected);
-        info.got = static_cast<std::int64_t>(left_);
-        info.message = message;
-        throw Error(std::move(info));
-    }
-
     const std::byte* take(std::size_t count)
     {
         if (count > left_)
-            fail("a control message is too short", count);
+            failMalformed("a control message is too short", static_cast<std::int64_t>(count),
+                          static_cast<std::int64_t>(left_));
         const std::byte* first = next_;
         next_ += count;
         left_ -= count;

@@ -330,14 +330,7 @@ private:
         detail::SequenceWindow received;
     };
 
-    void leave(const char* why)
-    {
-        ErrorInfo error;
-        error.kind = ErrorKind::Transport;
-        error.rank = rank();
-        error.message = why;
-        giveUp(error);
-    }
+    void leave(const char* why) { giveUp(detail::errorInfo(ErrorKind::Transport, why, rank())); }
 
     void end()
     {
@@ -515,12 +508,11 @@ private:
 
     void lose(int other)
     {
-        ErrorInfo error;
-        error.kind = ErrorKind::Transport;
-        error.rank = other;
-        error.message = detail::printed("this rank is lost: it has ended, is stopped or cannot be reached. Rank %d "
-                                        "has heard nothing of it for %lld ms (peerTimeout)",
-                                        rank(), static_cast<long long>(config_.peerTimeout.count()));
+        const std::string text =
+            detail::printed("this rank is lost: it has ended, is stopped or cannot be reached. Rank %d has heard "
+                            "nothing of it for %lld ms (peerTimeout)",
+                            rank(), static_cast<long long>(config_.peerTimeout.count()));
+        const ErrorInfo error = detail::errorInfo(ErrorKind::Transport, text, other);
         if (link_->canAbort() && !config_.onPeerLost)
             link_->abort(error.describe());
         if (giveUp(error) && config_.onPeerLost)

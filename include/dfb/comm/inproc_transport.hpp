@@ -212,8 +212,7 @@ private:
 };
 
 static_assert(is_transport_v<InprocTransport>);
-DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&,
-                                                                           NetworkConfig));
+DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&, NetworkConfig));
 
 // Calls `body(communicator)` on `rankCount` threads, one per rank, and waits for all. If a body throws, the ranks that
 // wait for it get a TransportError, and the first exception is rethrown. With `shuffleSeed` messages arrive in a
@@ -226,29 +225,29 @@ inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)
     const auto hub = std::make_shared<detail::InprocHub>(rankCount, shuffleSeed);
     std::mutex mutex;
     std::exception_ptr first;
+    const auto leave = [&](int rank, const std::string& why) { // in a handler of an exception
+        {
+            const std::lock_guard<std::mutex> lock(mutex);
+            if (!first)
+                first = std::current_exception();
+        }
+        hub->fail(detail::errorInfo(ErrorKind::Transport, "this rank has left: " + why, rank));
+    };
     std::vector<std::thread> threads;
-    for (int rank = 0; rank < rankCount; ++rank)
-        threads.emplace_back([&, rank] {
-            std::string what = "it ended with an exception that is not a std::exception";
-            try {
-                body(InprocCommunicator(hub, rank));
-                return;
-            } catch (const std::exception& e) {
-                what = e.what();
-                std::lock_guard<std::mutex> lock(mutex);
-                if (!first)
-                    first = std::current_exception();
-            } catch (...) {
-                std::lock_guard<std::mutex> lock(mutex);
-                if (!first)
-                    first = std::current_exception();
-            }
-            ErrorInfo error;
-            error.kind = ErrorKind::Transport;
-            error.rank = rank;
-            error.message = "this rank has left: " + what;
-            hub->fail(error);
-        });
+    try {
+        for (int rank = 0; rank < rankCount; ++rank)
+            threads.emplace_back([&, rank] {
+                try {
+                    body(InprocCommunicator(hub, rank));
+                } catch (const std::exception& e) {
+                    leave(rank, e.what());
+                } catch (...) {
+                    leave(rank, "it ended with an exception that is not a std::exception");
+                }
+            });
+    } catch (const std::exception& e) { // the system gives no more threads
+        leave(static_cast<int>(threads.size()), e.what());
+    }
     for (std::thread& thread : threads)
         thread.join();
     if (first)

@@ -403,8 +403,10 @@ public:
         });
         ByteReader in(result);
         if (in.get<std::int32_t>() < 0)
-            throw InvalidArgument("the number of values in allReduce() is " + in.getText()
-                                  + ": it must be the same on all ranks");
+            throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, "the number of values in allReduce() is "
+                                                                            + in.getText()
+                                                                            + ": it must be the same on all ranks"),
+                                  connection_->throwByAll());
         in.require(in.left() == values.size() * sizeof(std::int64_t));
         std::vector<std::int64_t> reduced(values.size());
         for (std::int64_t& value : reduced)

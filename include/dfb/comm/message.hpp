@@ -144,16 +144,6 @@ T loadAs(const std::byte* bytes)
     return value;
 }
 
-[[noreturn]] inline void failMalformed(const char* message, std::int64_t expected = -1, std::int64_t got = -1)
-{
-    ErrorInfo info;
-    info.kind = ErrorKind::MalformedMessage;
-    info.expected = expected;
-    info.got = got;
-    info.message = message;
-    throw Error(std::move(info));
-}
-
 // Returns the body of a message that has a header, one Body, and nothing else. Throws Error (MalformedMessage)
 // otherwise.
 template <class Body>

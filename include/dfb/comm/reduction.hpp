@@ -11,10 +11,9 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <deque>
 #include <functional>
-#include <map>
 #include <mutex>
+#include <optional>
 #include <string>
 #include <utility>
 #include <vector>
@@ -41,10 +40,8 @@ public:
         for (int bit = 1; bit < size_ && !(rank_ & bit); bit <<= 1)
             if (rank_ + bit < size_)
                 children_.push_back(rank_ + bit);
-        for (int i = 0; i < 4; ++i) { // more are hardly under way at once
-            states_.emplace_back();
-            states_.back().parts.reserve(children_.size() + 1);
-        }
+        for (int i = 0; i < 4; ++i) // more are hardly under way at once
+            states_.emplace_back(children_.size() + 1);
     }
 
     // The ranks that this one exchanges parts and results with.
@@ -88,8 +85,7 @@ public:
     {
         std::unique_lock<std::mutex> lock(mutex_);
         State& state = stateOf(key);
-        state.entered = true;
-        state.parts.emplace_back(rank_, std::move(own));
+        state.parts.front() = std::move(own);
         state.combine = std::move(combine);
         state.done = std::move(done);
         advance(lock, state);
@@ -99,19 +95,18 @@ public:
     void receive(int source, const ReductionKey& key, bool up, Bytes bytes)
     {
         std::unique_lock<std::mutex> lock(mutex_);
-        const bool isNeighbour = up ? std::find(children_.begin(), children_.end(), source) != children_.end()
-                                    : rank_ != 0 && source == parent();
-        if (!isNeighbour)
+        const auto child = std::find(children_.begin(), children_.end(), source);
+        if (up ? child == children_.end() : rank_ == 0 || source != parent())
             detail::failMalformed("a part of a reduction from a rank that has none", up ? -1 : parent(), source);
-        const auto floor = forgotten_.find(key.scope);
-        if (floor != forgotten_.end() && key.number <= floor->second)
-            return;
+        for (const ReductionKey& last : forgotten_)
+            if (last.scope == key.scope && key.number <= last.number)
+                return;
         if (up) {
             State& state = stateOf(key);
-            if (std::any_of(state.parts.begin(), state.parts.end(),
-                            [&](const auto& part) { return part.first == source; }))
+            auto& part = state.parts[static_cast<std::size_t>(child - children_.begin()) + 1];
+            if (part)
                 detail::failMalformed("a second part of a reduction", -1, source);
-            state.parts.emplace_back(source, std::move(bytes));
+            part = std::move(bytes);
             advance(lock, state);
         } else if (State* state = find(key)) {
             if (!hasAll(*state))
@@ -140,9 +135,8 @@ public:
         if (!state)
             return {};
         std::vector<Missing> parts;
-        for (int child : children_)
-            if (std::none_of(state->parts.begin(), state->parts.end(),
-                             [child](const auto& part) { return part.first == child; }))
+        for (std::size_t i = 0; i < children_.size(); ++i)
+            if (const int child = children_[i]; !state->parts[i + 1])
                 parts.push_back({child, std::min(child + (child & -child), size_) - 1});
         if (parts.empty() && rank_ != 0)
             parts.push_back({parent(), parent()});
@@ -153,8 +147,12 @@ public:
     void forget(std::uint32_t scope, std::int64_t number)
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        auto& floor = forgotten_.try_emplace(scope, number).first->second;
-        floor = std::max(floor, number);
+        ReductionKey* last = nullptr;
+        for (ReductionKey& its : forgotten_)
+            last = its.scope == scope ? &its : last;
+        if (!last)
+            last = &forgotten_.emplace_back(ReductionKey{scope, number});
+        last->number = std::max(last->number, number);
         for (State& state : states_)
             if (state.isUsed && state.key.scope == scope && state.key.number <= number)
                 state.reset();
@@ -165,16 +163,19 @@ private:
 
     // Those that are over are used again.
     struct State {
+        explicit State(std::size_t partCount) : parts(partCount) {}
+
         ReductionKey key;
-        bool isUsed = false, entered = false;
-        std::vector<std::pair<int, Bytes>> parts; // of the children and our own
+        bool isUsed = false;
+        std::vector<std::optional<Bytes>> parts; // our own and the children's, by rank
         Combine combine;
         Done done;
 
         void reset()
         {
-            isUsed = entered = false;
-            parts.clear();
+            isUsed = false;
+            for (auto& part : parts)
+                part.reset();
             combine = nullptr;
             done = nullptr;
         }
@@ -187,32 +188,33 @@ private:
                 return &state;
         return nullptr;
     }
-    // Its place, which stays, or a new one.
+    // Its place, or a new one.
     State& stateOf(const ReductionKey& key)
     {
-        if (State* state = find(key))
-            return *state;
-        auto place = std::find_if(states_.begin(), states_.end(), [](const State& s) { return !s.isUsed; });
-        if (place == states_.end())
-            place = states_.emplace(place);
-        place->key = key;
-        place->isUsed = true;
-        return *place;
+        State* state = find(key);
+        for (std::size_t i = 0; !state && i < states_.size(); ++i)
+            state = states_[i].isUsed ? nullptr : &states_[i];
+        if (!state)
+            state = &states_.emplace_back(children_.size() + 1);
+        state->key = key;
+        state->isUsed = true;
+        return *state;
     }
 
     // All parts are here.
-    bool hasAll(const State& state) const { return state.entered && state.parts.size() > children_.size(); }
+    static bool hasAll(const State& state)
+    {
+        return std::all_of(state.parts.begin(), state.parts.end(), [](const auto& part) { return part.has_value(); });
+    }
 
     void advance(std::unique_lock<std::mutex>& lock, State& state)
     {
         if (!hasAll(state))
             return;
         // In order of rank, so that the result does not depend on the order of arrival.
-        std::sort(state.parts.begin(), state.parts.end(),
-                  [](const auto& a, const auto& b) { return a.first < b.first; });
-        Bytes result = std::move(state.parts.front().second);
+        Bytes result = std::move(*state.parts.front());
         for (std::size_t i = 1; i < state.parts.size(); ++i)
-            result = state.combine(result, state.parts[i].second);
+            result = state.combine(result, *state.parts[i]);
         if (rank_ == 0) {
             finish(lock, state, result);
             return;
@@ -238,8 +240,8 @@ private:
     Send send_;
     std::vector<int> children_;
     std::mutex mutex_;
-    std::deque<State> states_; // few
-    std::map<std::uint32_t, std::int64_t> forgotten_;
+    std::vector<State> states_;           // few
+    std::vector<ReductionKey> forgotten_; // the last of each scope
 };
 
 DFB_NAMESPACE_END

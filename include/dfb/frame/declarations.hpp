@@ -157,14 +157,18 @@ public:
     {
         std::lock_guard<std::mutex> lock(mutex_);
         if (isComplete_)
-            fail("a manifest after all ranks have declared");
+            failMalformed("a manifest after all ranks have declared");
         changedRanks_.push_back(from);
         while (in.left() > 0) {
             const int tile = in.get<std::int32_t>();
             const auto source = in.get<std::uint32_t>();
             const auto part = in.get<std::uint16_t>();
-            if (!isMine(tile))
-                fail("a manifest names a tile of another owner", tile, source);
+            if (!isMine(tile)) {
+                ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, "a manifest names a tile of another owner");
+                info.tile = tile;
+                info.source = source;
+                throw Error(std::move(info));
+            }
             changedInputs_.push_back({tile, source, part, from});
         }
     }
@@ -175,7 +179,7 @@ public:
         std::lock_guard<std::mutex> lock(mutex_);
         const auto place = std::find(acksMissing_.begin(), acksMissing_.end(), from);
         if (place == acksMissing_.end())
-            fail("an answer to a manifest that was not sent");
+            failMalformed("an answer to a manifest that was not sent");
         acksMissing_.erase(place);
         return acksMissing_.empty();
     }
@@ -222,16 +226,6 @@ private:
         while (ownerAt(list, end) == owner)
             ++end;
         return {owner, static_cast<std::ptrdiff_t>(begin), static_cast<std::ptrdiff_t>(end)};
-    }
-
-    [[noreturn]] static void fail(const char* message, std::int64_t tile = -1, std::int64_t source = -1)
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::MalformedMessage;
-        info.tile = tile;
-        info.source = source;
-        info.message = message;
-        throw Error(std::move(info));
     }
 
     mutable std::mutex mutex_;

@@ -6,14 +6,15 @@
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/accumulation.hpp>
+#include <dfb/frame/agreement.hpp>
 #include <dfb/frame/declarations.hpp>
 #include <dfb/frame/engine.hpp>
-#include <dfb/frame/frame_figures.hpp>
 #include <dfb/frame/hidden_tiles.hpp>
 #include <dfb/frame/job_share.hpp>
 #include <dfb/frame/open_frame.hpp>
 #include <dfb/frame/outcome.hpp>
 #include <dfb/frame/tile_pipeline.hpp>
+#include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
 #include <atomic>
@@ -91,13 +92,8 @@ public:
             mine = {false, e.what(), rank()};
         }
         const auto all = agree(*mailbox_, mine);
-        if (!all.fine) {
-            mailbox_->stop(); // messages that have come are handled while this object is whole
-            jobs_.reset();
-            outcome_.reset();
-            mailbox_.reset(); // before the exception passes: all ranks throw it, so this end is in order
-            all.refuse();
-        }
+        if (!all.fine)
+            all.refuse(mailbox_->connection());
         mailbox_->connection().setAlike();
         tellImagePlace();
     }
@@ -237,10 +233,7 @@ public:
         const std::chrono::milliseconds limit = params_.timeout;
         if (mailbox_->waitForRoom([this] { return outcome_->failed(); }, limit))
             return;
-        ErrorInfo info;
-        info.kind = ErrorKind::TimedOut;
-        info.message = "no room for more tiles: " + mailbox_->flow().notTaken();
-        outcome_->fail(std::make_exception_ptr(Error(std::move(info))));
+        outcome_->fail(errorInfo(ErrorKind::TimedOut, "no room for more tiles: " + mailbox_->flow().notTaken()));
     }
 
     void declare(const std::vector<TileInput>& inputs) override
@@ -303,9 +296,9 @@ public:
         isEnding_ = true;
         if (params_.declared && !declarations_.declared() && !outcome_->failed()) {
             const auto reason = open_.reason(); // why declare() was not called, in a frame that may be partial
-            outcome_->failWhole(reason ? std::make_exception_ptr(Error(*reason))
-                                       : std::make_exception_ptr(
-                                           InvalidArgument("end() of a frame with declared inputs without declare()")));
+            outcome_->failWhole(reason ? *reason
+                                       : errorInfo(ErrorKind::InvalidArgument,
+                                                   "end() of a frame with declared inputs without declare()"));
         }
         if (pipeline_->gather().displays())
             outcome_->guarded([this] { pipeline_->finishBackground(); });
@@ -360,7 +353,7 @@ public:
     {
         if (!open_.enter(frame))
             return; // it is over
-        outcome_->fail(std::make_exception_ptr(Error(cancelled("the frame was cancelled"))));
+        outcome_->fail(errorInfo(ErrorKind::Cancelled, "the frame was cancelled"));
         open_.leave();
     }
 
@@ -372,7 +365,8 @@ public:
             if (outcome_->failed())
                 outcome_->dropRest();
             else
-                outcome_->failWhole(cancelled("the frame was left without end(). If by an exception: Frame::guard() "
+                outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
+                                              "the frame was left without end(). If by an exception: Frame::guard() "
                                               "around what throws tells all ranks its text"));
             outcome_->conclude();
         } catch (const TransportError&) {
@@ -490,11 +484,9 @@ private:
         case OpenFrame::Entry::Absurd: {
             if (hasCredit)
                 mailbox_->flow().discarded(byteCount);
-            ErrorInfo info;
-            info.kind = ErrorKind::MalformedMessage;
+            ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, "a message of a frame that no rank can have begun");
             info.expected = open_.next();
             info.got = header.number;
-            info.message = "a message of a frame that no rank can have begun";
             undecodable(source, info);
             return;
         }
@@ -552,15 +544,12 @@ private:
     void failForDamage()
     {
         const auto damage = mailbox_->takeDamage();
-        if (damage && !outcome_->fail(std::make_exception_ptr(Error(damage->second)), messageFrom(damage->first)))
+        if (!damage)
+            return;
+        ErrorInfo info = damage->second;
+        info.from = info.from < 0 ? damage->first : info.from;
+        if (!outcome_->fail(std::move(info)))
             mailbox_->keepDamage(damage->first, damage->second);
-    }
-
-    static ErrorInfo messageFrom(int source)
-    {
-        ErrorInfo where;
-        where.from = source;
-        return where;
     }
 
     // Each kind of message goes to the object that it is for.
@@ -612,10 +601,8 @@ private:
             return;
         }
         if (!params_.declared) {
-            ErrorInfo info;
-            info.kind = ErrorKind::Disagreement;
-            info.message = "the sender declares its inputs, this rank expects no declaration";
-            throw Error(std::move(info));
+            throw Error(
+                errorInfo(ErrorKind::Disagreement, "the sender declares its inputs, this rank expects no declaration"));
         }
         declarations_.receive(source, ByteReader(message.data() + sizeof header, message.size() - sizeof header),
                               [this](int tile) { return pipeline_->table().isMine(tile); });
@@ -761,25 +748,16 @@ private:
 
     // ---- the end
 
-    static ErrorInfo cancelled(const char* text)
-    {
-        ErrorInfo info;
-        info.kind = ErrorKind::Cancelled;
-        info.message = text;
-        return info;
-    }
-
     // Adds this rank's counts of the frame to the verdict, and a promise of its renderer that was not kept.
     void addFigures(Verdict& v)
     {
         if (const int tile = pipeline_->brokenPromise(); tile >= 0 && !v.error) {
-            v.error = ErrorInfo();
-            v.error->kind = ErrorKind::InvalidArgument;
-            v.error->rank = rank();
+            v.error = errorInfo(ErrorKind::InvalidArgument,
+                                "its pixels were to stay until the end of the frame (TileView::staysUntilEnd), and "
+                                "have changed",
+                                rank());
             v.error->frame = open_.number();
             v.error->tile = tile;
-            v.error->message = "its pixels were to stay until the end of the frame (TileView::staysUntilEnd), and have "
-                               "changed";
         }
         const std::int64_t repeated = mailbox_->connection().duplicates();
         const auto reports = pipeline_->reports();

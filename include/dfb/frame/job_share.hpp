@@ -132,11 +132,10 @@ public:
             if (timeout.count() > 0)
                 deadline = Mailbox::Clock::now() + timeout;
             if (!mailbox_.wait([this] { return share_.ready() || outcome_.failed(); }, deadline)) {
-                ErrorInfo info;
-                info.kind = ErrorKind::TimedOut;
+                ErrorInfo info =
+                    errorInfo(ErrorKind::TimedOut, printed("no word of rank %d on what there is to render", server_));
                 info.from = server_;
-                info.message = printed("no word of rank %d on what there is to render", server_);
-                outcome_.fail(std::make_exception_ptr(Error(std::move(info))));
+                outcome_.fail(std::move(info));
             }
             range = take(count);
         }

@@ -78,7 +78,11 @@ public:
     // voted already, so that its vote does not say it.
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
-        const ErrorInfo info = placed(errorInfoOf(reason, where));
+        return fail(errorInfoOf(reason, where));
+    }
+    bool fail(ErrorInfo reason)
+    {
+        const ErrorInfo info = placed(std::move(reason));
         if (!isBearable(info.kind))
             return failWhole(info);
         const bool inTime = frame_.note(info);
@@ -168,7 +172,7 @@ public:
             lookInTime(now);
         const bool isLate = terms_.timeout.count() > 0 && now >= endedAt_ + terms_.timeout;
         if (!isDecided && isLate && !failed())
-            fail(std::make_exception_ptr(Error(missing(ErrorKind::TimedOut))));
+            fail(missing(ErrorKind::TimedOut));
         return isDecided || (isLate && now >= endedAt_ + 2 * terms_.timeout);
     }
 
@@ -283,7 +287,7 @@ private:
                 failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
             }
             if (differs)
-                fail(std::make_exception_ptr(Error(Verdict::disagreement())));
+                fail(Verdict::disagreement());
             mailbox_.receiveReduction(source, header, message);
         } catch (const Error& e) {
             // Without this message there would never be a result.
@@ -318,7 +322,7 @@ private:
         if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout))
             return *verdict;
         if (!failed())
-            fail(std::make_exception_ptr(Error(missing(ErrorKind::TimedOut))));
+            fail(missing(ErrorKind::TimedOut));
         if (const Verdict* verdict = wait(endedAt_ + 2 * terms_.timeout))
             return *verdict;
         giveUpVerdict(2 * terms_.timeout);
@@ -415,7 +419,7 @@ private:
         mailbox_.reductions().enter({Quiet, frame_.number()}, mine.bytes(), Round::combine,
                                     [this, isWaiting](const Bytes& all) {
                                         if (quiescence_.endRound(Round::from(all).report) && isWaiting())
-                                            fail(std::make_exception_ptr(Error(missing(ErrorKind::MissingInput))));
+                                            fail(missing(ErrorKind::MissingInput));
                                     });
     }
 
@@ -470,10 +474,9 @@ private:
 
     [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
     {
-        ErrorInfo info = placed({});
-        info.kind = ErrorKind::Transport;
-        info.message =
-            printed("not all ranks have ended this frame after %lld ms", static_cast<long long>(after.count()));
+        ErrorInfo info =
+            placed(errorInfo(ErrorKind::Transport, printed("not all ranks have ended this frame after %lld ms",
+                                                           static_cast<long long>(after.count()))));
         addWaitedFor(info, verdictKey());
         if (const std::string lost = mailbox_.connection().lost(); !lost.empty())
             info.message += "; " + lost;

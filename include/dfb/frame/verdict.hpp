@@ -1,25 +1,21 @@
 // Verdict: the content of the reduction that ends each frame. It says whether any rank failed and which error all ranks
-// report, and has the figures of the frame that are sums or maxima over the ranks. Agreement: the content of the
-// reduction with which a framebuffer is made; it says whether all ranks have the same configuration.
+// report, and has the figures of the frame that are sums or maxima over the ranks. FrameTerms: the parameters of the
+// frame that must be equal on all ranks. FrameFigures: the figures that a rank collects while the frame is open.
 #pragma once
 
 #include <dfb/comm/byte_io.hpp>
-#include <dfb/comm/mailbox.hpp>
 #include <dfb/frame.hpp>
-#include <dfb/frame/frame_terms.hpp>
-#include <dfb/frame/operations.hpp>
+#include <dfb/frame/agreement.hpp>
 
 #include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
-#include <cstdlib>
-#include <cxxabi.h>
+#include <cstring>
 #include <exception>
 #include <iterator>
-#include <limits>
-#include <memory>
+#include <mutex>
 #include <optional>
 #include <string>
 #include <tuple>
@@ -39,11 +35,9 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     } catch (const Error& e) {
         info = e.info();
     } catch (const std::exception& e) {
-        info.kind = ErrorKind::UserCode;
-        info.message = e.what();
+        info = errorInfo(ErrorKind::UserCode, e.what());
     } catch (...) {
-        info.kind = ErrorKind::UserCode;
-        info.message = "an exception that is not a std::exception";
+        info = errorInfo(ErrorKind::UserCode, "an exception that is not a std::exception");
     }
     const auto fill = [](std::int64_t& to, std::int64_t from) { to = to < 0 ? from : to; };
     if (info.from < 0)
@@ -62,6 +56,93 @@ inline bool isMissing(ErrorKind kind) noexcept
 {
     return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
 }
+
+// The fields of FrameConfig; travels with each verdict as it is.
+struct FrameTerms {
+    std::uint64_t samplesHash = 0; // 0: there is no plan
+    std::int64_t sampleCount = 0;  // of all tiles in the plan
+    std::uint64_t accumulationId = 0;
+    std::array<std::uint32_t, 4> background{}; // bits: so that a NaN equals itself
+    std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
+    std::int32_t declared = 0, allowPartial = 0;
+    std::int32_t rank = 0; // whose; the lowest of those that are alike
+
+    static FrameTerms of(const FrameConfig& p, int rank)
+    {
+        FrameTerms t;
+        if (p.samples) {
+            Fingerprint f;
+            for (const TileSamples& s : *p.samples) {
+                f.add(static_cast<std::uint64_t>(s.first) << 32 | static_cast<std::uint32_t>(s.count));
+                t.sampleCount += s.count;
+            }
+            t.samplesHash = f.value();
+        }
+        t.accumulationId = p.accumulationId;
+        std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
+        t.passes = p.passes;
+        t.maxLayers = p.maxLayers;
+        t.timeoutMs = static_cast<std::int32_t>(p.timeout.count());
+        t.declared = p.declared;
+        t.allowPartial = p.allowPartial;
+        t.rank = rank;
+        return t;
+    }
+
+    // The first field that is not the same in both, with its values and ranks; "" if they are alike.
+    std::string difference(const FrameTerms& o) const
+    {
+        FrameTerms its = o;
+        its.rank = rank;
+        if (std::memcmp(this, &its, sizeof its) == 0) // as nearly always
+            return {};
+        std::string text;
+        const auto compare = [&](const char* name, bool differs, const std::string& here, const std::string& there) {
+            if (text.empty() && differs)
+                text = printed("FrameConfig::%s is %s on rank %d and %s on rank %d", name, here.c_str(), rank,
+                               there.c_str(), o.rank);
+        };
+        const auto number = [&](const char* name, std::uint64_t here, std::uint64_t there) {
+            compare(name, here != there, numberText(here), numberText(there));
+        };
+        const auto flag = [&](const char* name, std::int32_t here, std::int32_t there) {
+            compare(name, here != there, here ? "true" : "false", there ? "true" : "false");
+        };
+        const auto planText = [&](const FrameTerms& t) {
+            if (t.samplesHash == 0)
+                return std::string("null");
+            std::string plan = "a plan of " + numberText(static_cast<std::uint64_t>(t.sampleCount)) + " samples";
+            if (sampleCount == o.sampleCount) // else that tells them apart
+                plan += " with hash " + numberText(t.samplesHash);
+            return plan;
+        };
+        compare("background", background != o.background, backgroundText(*this), backgroundText(o));
+        number("passes", static_cast<std::uint64_t>(passes), static_cast<std::uint64_t>(o.passes));
+        compare("samples", samplesHash != o.samplesHash, planText(*this), planText(o));
+        number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
+        number("accumulationId", accumulationId, o.accumulationId);
+        flag("declared", declared, o.declared);
+        number("timeout", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
+        flag("allowPartial", allowPartial, o.allowPartial);
+        return text;
+    }
+
+private:
+    static std::string numberText(std::uint64_t value)
+    {
+        return printed("%llu", static_cast<unsigned long long>(value)); // all are 0 or more
+    }
+    static std::string backgroundText(const FrameTerms& t)
+    {
+        std::array<float, 4> c{};
+        std::memcpy(c.data(), t.background.data(), sizeof c);
+        char text[80];
+        std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g, %.9g)", static_cast<double>(c[0]),
+                      static_cast<double>(c[1]), static_cast<double>(c[2]), static_cast<double>(c[3]));
+        return text;
+    }
+};
+static_assert(std::has_unique_object_representations_v<FrameTerms>); // no byte of a verdict is undefined
 
 struct Verdict {
     std::optional<ErrorInfo> error;
@@ -201,11 +282,8 @@ struct Verdict {
     // `what`: which parameters differ, or "" if only the hashes are known to differ.
     static ErrorInfo disagreement(const std::string& what = "")
     {
-        ErrorInfo info;
-        info.kind = ErrorKind::Disagreement;
-        info.message = what.empty() ? "the frame was begun with different parameters"
-                                    : what + ": it must be the same on all ranks";
-        return info;
+        return errorInfo(ErrorKind::Disagreement, what.empty() ? "the frame was begun with different parameters"
+                                                               : what + ": it must be the same on all ranks");
     }
 
     // The error of inputs that came when their tiles were finished: another input may have been taken in their place.
@@ -215,11 +293,10 @@ struct Verdict {
         const std::int64_t count = sums[TilesEndedEarly] == 0 ? sums[InputsLeft] : 0;
         if (count == 0)
             return std::nullopt;
-        ErrorInfo info;
-        info.kind = ErrorKind::Disagreement;
+        ErrorInfo info = errorInfo(ErrorKind::Disagreement, "more inputs were sent than had been announced: so many "
+                                                            "came when their tiles were finished");
         info.expected = 0;
         info.got = count;
-        info.message = "more inputs were sent than had been announced: so many came when their tiles were finished";
         return info;
     }
 
@@ -275,191 +352,58 @@ struct Verdict {
     }
 };
 
-// The configuration of one rank, or its error. Combined: whether all are right and equal.
-struct Agreement {
-    bool fine = true;
-    std::string text; // of Settings; or the error
-    int rank = 0;     // the lowest rank that has it; -1 if two ranks differ
-
-    // Names and values, a line each.
-    class Settings {
-    public:
-        void add(const char* name, const char* value) { text_ += printed("%s%c%s\n", name, separator, value); }
-        void add(const char* name, const std::string& value) { add(name, value.c_str()); }
-        template <class Value>
-        void add(const char* name, Value value)
-        {
-            if constexpr (std::is_same_v<Value, bool>)
-                add(name, value ? "true" : "false");
-            else if constexpr (std::is_floating_point_v<Value>)
-                add(name, digitsOf(value));
-            else if constexpr (std::is_unsigned_v<Value>)
-                add(name, printed("%llu", static_cast<unsigned long long>(value)));
-            else
-                add(name, printed("%lld", static_cast<long long>(value)));
-        }
-        const std::string& text() const noexcept { return text_; }
-
-    private:
-        std::string text_;
-    };
-
-    // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
-    // the owner map's answers.
-    template <class OwnerOf>
-    static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, int rank,
-                        ChannelMask sent, int tileCount, const OwnerOf& ownerOf)
+// Numbers of one rank that all ranks get to know with the verdict. All members may be called from any thread.
+class FrameFigures {
+public:
+    void newFrame()
     {
-        Fingerprint owners;
-        for (int tile = 0; tile < tileCount; ++tile)
-            owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
-        Settings s;
-        s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
-        s.add("width", c.image.width);
-        s.add("height", c.image.height);
-        s.add(tileOperation, operations.tileOp);
-        s.add(pixelOperation, operations.pixelOp);
-        s.add("the size of tiles", printed("%dx%d", operations.tileWidth, operations.tileHeight));
-        s.add("the mask of channels", operations.channels);
-        s.add("the mask of channels that travel", sent);
-        s.add("format", nameOf(c.image.format));
-        s.add("depth", c.image.depth);
-        s.add("aux", c.image.aux);
-        s.add("dither", c.image.dither);
-        s.add("displayRank", c.image.displayRank);
-        s.add("framesInFlight", c.framesInFlight);
-        s.add(ownerMap, owners.value());
-        s.add("the id of messages.codec", c.messages.codec ? c.messages.codec->id() : 0);
-        s.add("messages.compression", c.messages.compression == CompressionMode::Auto ? "Auto" : "Always");
-        s.add("precision.color", nameOf(c.precision.color));
-        s.add("precision.budget", c.precision.budget);
-        s.add("precision.isHalfLevel", c.precision.isHalfLevel);
-        s.add("precision.maxColor", c.precision.maxColor);
-        s.add("minTransmittance", c.minTransmittance);
-        s.add("messages.poolBytes", c.messages.poolBytes);
-        s.add("checksums", checksums);
-        return {true, s.text(), rank};
+        const std::lock_guard<std::mutex> lock(mutex_);
+        figures_.clear();
+        mergeErrors_.clear();
     }
 
-    // The exception for a result that is not fine.
-    [[noreturn]] void refuse() const
+    // See Frame::addFigure().
+    void add(std::uint64_t key, double value)
     {
-        ErrorInfo info;
-        info.rank = rank;
-        info.message = text;
-        throw InvalidArgument(std::move(info));
+        const std::lock_guard<std::mutex> lock(mutex_);
+        figures_.push_back({key, value});
     }
 
-    SmallBytes bytes() const
+    // An input of that tile may be off by so much.
+    void addMergeError(int tile, double bound)
     {
-        ByteWriter out;
-        out.put(static_cast<std::uint8_t>(fine));
-        out.put(static_cast<std::int32_t>(rank));
-        out.putText(text);
-        return out.bytes();
+        const std::lock_guard<std::mutex> lock(mutex_);
+        mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound});
     }
 
-    static Agreement from(const SmallBytes& bytes)
+    // Of the tiles that this rank has finished: what their operation says.
+    static std::vector<Figure> of(const std::vector<TileError>& errors)
     {
-        ByteReader in(bytes);
-        Agreement a;
-        const auto fine = in.get<std::uint8_t>();
-        in.require(fine <= 1);
-        a.fine = fine != 0;
-        a.rank = in.get<std::int32_t>();
-        a.text = in.getText();
-        in.end();
-        return a;
+        std::vector<Figure> figures;
+        for (const TileError& e : errors)
+            figures.push_back({static_cast<std::uint64_t>(e.tile), e.error});
+        return sums(std::move(figures));
     }
 
-    static SmallBytes combine(const SmallBytes& first, const SmallBytes& second)
+    void addTo(Verdict& verdict) const
     {
-        const Agreement a = from(first), b = from(second);
-        if (!a.fine || (b.fine && a.text == b.text))
-            return first;
-        if (!b.fine)
-            return second;
-        return Agreement{false, difference(a, b), -1}.bytes();
+        const std::lock_guard<std::mutex> lock(mutex_);
+        verdict.figures = sums(figures_);
+        verdict.mergeErrors = sums(mergeErrors_);
     }
 
 private:
-    static constexpr const char* tileOperation = "the tile operation";
-    static constexpr const char* pixelOperation = "the pixel operation";
-    static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
-    static constexpr char separator = '=';
-
-    // The fewest digits that give this value back.
-    template <class Value>
-    static std::string digitsOf(Value value)
+    // One per key. Of values of one key, too, the order must not be that of the threads: they are added.
+    static std::vector<Figure> sums(std::vector<Figure> figures)
     {
-        char digits[40];
-        const int most = std::numeric_limits<Value>::max_digits10;
-        for (int count = 1; count <= most; ++count) {
-            std::snprintf(digits, sizeof digits, "%.*g", count, static_cast<double>(value));
-            if (static_cast<Value>(std::strtod(digits, nullptr)) == value)
-                break;
-        }
-        return digits;
+        std::sort(figures.begin(), figures.end(),
+                  [](const Figure& a, const Figure& b) { return a.key != b.key ? a.key < b.key : a.value < b.value; });
+        return Verdict::summed(std::move(figures));
     }
 
-    // Types are compared by their mangled names, and shown as a program writes them: demangled, without the namespace
-    // of the version.
-    static std::string readable(const std::string& name, const std::string& value)
-    {
-        if (name != tileOperation && name != pixelOperation)
-            return value;
-        const std::unique_ptr<char, decltype(&std::free)> written(
-            abi::__cxa_demangle(value.c_str(), nullptr, nullptr, nullptr), &std::free);
-        std::string text = written ? written.get() : value;
-        const std::string version = printed("v%d_%d::", DFB_VERSION_MAJOR, DFB_VERSION_MINOR);
-        for (std::size_t at; (at = text.find(version)) != std::string::npos;)
-            text.erase(at, version.size());
-        return text;
-    }
-
-    // Which settings differ, in words.
-    static std::string difference(const Agreement& a, const Agreement& b)
-    {
-        const auto as = settingsOf(a.text), bs = settingsOf(b.text);
-        const std::string ranks[] = {printed(" on rank %d", a.rank), printed(" on rank %d", b.rank)};
-        std::string differing;
-        for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
-            if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name != ownerMap || differing.empty()))
-                differing += (differing.empty() ? "" : "; ") + name + " is " + readable(name, value) + ranks[0]
-                             + " and " + readable(name, bs[i].second) + ranks[1];
-        if (differing.empty())
-            differing = "the settings" + ranks[0] + " are not those" + ranks[1];
-        return differing + ": it must be the same on all ranks";
-    }
-    static std::vector<std::pair<std::string, std::string>> settingsOf(const std::string& text)
-    {
-        std::vector<std::pair<std::string, std::string>> settings;
-        for (std::size_t at = 0; at < text.size();) {
-            const std::size_t end = std::min(text.find('\n', at), text.size());
-            const std::string line = text.substr(at, end - at);
-            const std::size_t middle = std::min(line.find(separator), line.size());
-            settings.push_back({line.substr(0, middle), line.substr(std::min(middle + 1, line.size()))});
-            at = end + 1;
-        }
-        return settings;
-    }
+    mutable std::mutex mutex_;
+    std::vector<Figure> figures_, mergeErrors_; // by key, by tile
 };
-
-// Finds out whether all ranks have the same configuration, and returns it, or the error. Collective. If something is
-// wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
-// heard the reason by then would report another error.
-inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
-{
-    const auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
-    if (!all.fine) {
-        try {
-            mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
-        } catch (const TransportError&) {
-            // One rank has left already, so all know.
-        }
-    }
-    return all;
-}
 
 } // namespace detail
 DFB_NAMESPACE_END

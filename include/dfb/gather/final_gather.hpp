@@ -582,10 +582,8 @@ private:
     void receiveOnce(int tile)
     {
         if (state_[static_cast<std::size_t>(tile)].exchange(TileState::Received) == TileState::Received) {
-            ErrorInfo info;
-            info.kind = ErrorKind::DuplicateInput;
+            ErrorInfo info = errorInfo(ErrorKind::DuplicateInput, "a finished tile came twice");
             info.tile = tile;
-            info.message = "a finished tile came twice";
             throw Error(std::move(info));
         }
     }

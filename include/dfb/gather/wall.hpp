@@ -3,7 +3,7 @@
 
 #include <dfb/comm/mailbox.hpp>
 #include <dfb/exec.hpp>
-#include <dfb/frame/verdict.hpp>
+#include <dfb/frame/agreement.hpp>
 #include <dfb/fwd.hpp>
 #include <dfb/image.hpp>
 #include <dfb/pixel_op.hpp>
@@ -51,11 +51,8 @@ public:
                 mine = {false, e.what(), mailbox_->rank()};
             }
         const auto all = agree(*mailbox_, mine);
-        if (!all.fine) {
-            mailbox_->stop();
-            mailbox_.reset();
-            all.refuse();
-        }
+        if (!all.fine)
+            all.refuse(mailbox_->connection());
         mailbox_->connection().setAlike();
     }
 
@@ -100,14 +97,12 @@ public:
         if (isMalformed(missing) && frame >= errorFrame_)
             error_.clear();
         if (!all.fine) {
-            ErrorInfo info;
             const bool isUnsent = all.text.find(unsent) != std::string::npos;
-            info.kind = isMalformed(all.text) ? ErrorKind::MalformedMessage
-                        : isUnsent            ? ErrorKind::MissingInput
-                                              : ErrorKind::TimedOut;
+            ErrorInfo info = isMalformed(all.text)
+                                 ? errorInfo(ErrorKind::MalformedMessage, all.text.substr(malformed.size()))
+                                 : errorInfo(isUnsent ? ErrorKind::MissingInput : ErrorKind::TimedOut, all.text);
             info.frame = frame;
-            info.message = all.text.substr(isMalformed(all.text) ? malformed.size() : 0);
-            throw Error(std::move(info));
+            throw Error(std::move(info), mailbox_->connection().throwByAll());
         }
     }
 
@@ -252,10 +247,7 @@ private:
             else // it may have been one that finish() waits for
                 mailbox_->giveUp(source, e.info());
         } catch (const std::bad_alloc& e) { // for more frames than one
-            ErrorInfo info;
-            info.kind = ErrorKind::Transport;
-            info.message = e.what();
-            mailbox_->giveUp(source, info);
+            mailbox_->giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
         }
     }
 

@@ -1,0 +1,220 @@
+// Agreement: the content of the reduction with which a framebuffer is made. It says whether all ranks have the same
+// configuration.
+#pragma once
+
+#include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/mailbox.hpp>
+#include <dfb/frame.hpp>
+#include <dfb/frame/operations.hpp>
+
+#include <algorithm>
+#include <cstddef>
+#include <cstdint>
+#include <cstdio>
+#include <cstdlib>
+#include <cxxabi.h>
+#include <limits>
+#include <memory>
+#include <string>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+DFB_NAMESPACE_BEGIN
+namespace detail {
+
+// FNV-1a over 64-bit words.
+class Fingerprint {
+public:
+    void add(std::uint64_t v) noexcept { value_ = (value_ ^ v) * 1099511628211u; }
+    std::uint64_t value() const noexcept { return value_; }
+
+private:
+    std::uint64_t value_ = 1469598103934665603u;
+};
+
+// The configuration of one rank, or its error. Combined: whether all are right and equal.
+struct Agreement {
+    bool fine = true;
+    std::string text; // of Settings; or the error
+    int rank = 0;     // the lowest rank that has it; -1 if two ranks differ
+
+    // Names and values, a line each.
+    class Settings {
+    public:
+        void add(const char* name, const char* value) { text_ += printed("%s%c%s\n", name, separator, value); }
+        void add(const char* name, const std::string& value) { add(name, value.c_str()); }
+        template <class Value>
+        void add(const char* name, Value value)
+        {
+            if constexpr (std::is_same_v<Value, bool>)
+                add(name, value ? "true" : "false");
+            else if constexpr (std::is_floating_point_v<Value>)
+                add(name, digitsOf(value));
+            else if constexpr (std::is_unsigned_v<Value>)
+                add(name, printed("%llu", static_cast<unsigned long long>(value)));
+            else
+                add(name, printed("%lld", static_cast<long long>(value)));
+        }
+        const std::string& text() const noexcept { return text_; }
+
+    private:
+        std::string text_;
+    };
+
+    // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
+    // the owner map's answers.
+    template <class OwnerOf>
+    static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, int rank,
+                        ChannelMask sent, int tileCount, const OwnerOf& ownerOf)
+    {
+        Fingerprint owners;
+        for (int tile = 0; tile < tileCount; ++tile)
+            owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
+        Settings s;
+        s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
+        s.add("width", c.image.width);
+        s.add("height", c.image.height);
+        s.add(tileOperation, operations.tileOp);
+        s.add(pixelOperation, operations.pixelOp);
+        s.add("the size of tiles", printed("%dx%d", operations.tileWidth, operations.tileHeight));
+        s.add("the mask of channels", operations.channels);
+        s.add("the mask of channels that travel", sent);
+        s.add("format", nameOf(c.image.format));
+        s.add("depth", c.image.depth);
+        s.add("aux", c.image.aux);
+        s.add("dither", c.image.dither);
+        s.add("displayRank", c.image.displayRank);
+        s.add("framesInFlight", c.framesInFlight);
+        s.add(ownerMap, owners.value());
+        s.add("the id of messages.codec", c.messages.codec ? c.messages.codec->id() : 0);
+        s.add("messages.compression", c.messages.compression == CompressionMode::Auto ? "Auto" : "Always");
+        s.add("precision.color", nameOf(c.precision.color));
+        s.add("precision.budget", c.precision.budget);
+        s.add("precision.isHalfLevel", c.precision.isHalfLevel);
+        s.add("precision.maxColor", c.precision.maxColor);
+        s.add("minTransmittance", c.minTransmittance);
+        s.add("messages.poolBytes", c.messages.poolBytes);
+        s.add("checksums", checksums);
+        return {true, s.text(), rank};
+    }
+
+    // Throws the exception for a result that is not fine, as all ranks do.
+    [[noreturn]] void refuse(Connection& connection) const
+    {
+        throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, text, rank), connection.throwByAll());
+    }
+
+    SmallBytes bytes() const
+    {
+        ByteWriter out;
+        out.put(static_cast<std::uint8_t>(fine));
+        out.put(static_cast<std::int32_t>(rank));
+        out.putText(text);
+        return out.bytes();
+    }
+
+    static Agreement from(const SmallBytes& bytes)
+    {
+        ByteReader in(bytes);
+        Agreement a;
+        const auto fine = in.get<std::uint8_t>();
+        in.require(fine <= 1);
+        a.fine = fine != 0;
+        a.rank = in.get<std::int32_t>();
+        a.text = in.getText();
+        in.end();
+        return a;
+    }
+
+    static SmallBytes combine(const SmallBytes& first, const SmallBytes& second)
+    {
+        const Agreement a = from(first), b = from(second);
+        if (!a.fine || (b.fine && a.text == b.text))
+            return first;
+        if (!b.fine)
+            return second;
+        return Agreement{false, difference(a, b), -1}.bytes();
+    }
+
+private:
+    static constexpr const char* tileOperation = "the tile operation";
+    static constexpr const char* pixelOperation = "the pixel operation";
+    static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
+    static constexpr char separator = '=';
+
+    // The fewest digits that give this value back.
+    template <class Value>
+    static std::string digitsOf(Value value)
+    {
+        char digits[40];
+        const int most = std::numeric_limits<Value>::max_digits10;
+        for (int count = 1; count <= most; ++count) {
+            std::snprintf(digits, sizeof digits, "%.*g", count, static_cast<double>(value));
+            if (static_cast<Value>(std::strtod(digits, nullptr)) == value)
+                break;
+        }
+        return digits;
+    }
+
+    // Types are compared by their mangled names, and shown as a program writes them: demangled, without the namespace
+    // of the version.
+    static std::string readable(const std::string& name, const std::string& value)
+    {
+        if (name != tileOperation && name != pixelOperation)
+            return value;
+        const std::unique_ptr<char, decltype(&std::free)> written(
+            abi::__cxa_demangle(value.c_str(), nullptr, nullptr, nullptr), &std::free);
+        std::string text = written ? written.get() : value;
+        const std::string version = printed("v%d_%d::", DFB_VERSION_MAJOR, DFB_VERSION_MINOR);
+        for (std::size_t at; (at = text.find(version)) != std::string::npos;)
+            text.erase(at, version.size());
+        return text;
+    }
+
+    // Which settings differ, in words.
+    static std::string difference(const Agreement& a, const Agreement& b)
+    {
+        const auto as = settingsOf(a.text), bs = settingsOf(b.text);
+        const std::string ranks[] = {printed(" on rank %d", a.rank), printed(" on rank %d", b.rank)};
+        std::string differing;
+        for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
+            if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name != ownerMap || differing.empty()))
+                differing += (differing.empty() ? "" : "; ") + name + " is " + readable(name, value) + ranks[0]
+                             + " and " + readable(name, bs[i].second) + ranks[1];
+        if (differing.empty())
+            differing = "the settings" + ranks[0] + " are not those" + ranks[1];
+        return differing + ": it must be the same on all ranks";
+    }
+    static std::vector<std::pair<std::string, std::string>> settingsOf(const std::string& text)
+    {
+        std::vector<std::pair<std::string, std::string>> settings;
+        for (std::size_t at = 0; at < text.size();) {
+            const std::size_t end = std::min(text.find('\n', at), text.size());
+            const std::string line = text.substr(at, end - at);
+            const std::size_t middle = std::min(line.find(separator), line.size());
+            settings.push_back({line.substr(0, middle), line.substr(std::min(middle + 1, line.size()))});
+            at = end + 1;
+        }
+        return settings;
+    }
+};
+
+// Finds out whether all ranks have the same configuration, and returns it, or the error. Collective. If something is
+// wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
+// heard the reason by then would report another error.
+inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
+{
+    const auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
+    if (!all.fine) {
+        try {
+            mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
+        } catch (const TransportError&) {
+            // One rank has left already, so all know.
+        }
+    }
+    return all;
+}
+
+} // namespace detail
+DFB_NAMESPACE_END
