@@ -144,6 +144,9 @@ public:
         return dfb::threadShare(Processors::ofThisThread().count(), link_->sharingRanks());
     }
 
+    // More than two ranks share a processor.
+    bool isCrowded() const noexcept { return isCrowded_; }
+
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
     // may not call MPI. Never blocks.
     bool poll() { return progress_.needsCaller() && link_->mayPoll() && progress_.tryPoll(); }
@@ -533,6 +536,7 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     std::unique_ptr<Link> link_;
     const int rank_ = link_->rank(), size_ = link_->size();
+    const bool isCrowded_ = link_->sharingRanks() > 2 * Processors::ofThisThread().count();
     std::atomic<std::int64_t> duplicates_{0};
     std::atomic<bool> isAlike_{false};
 

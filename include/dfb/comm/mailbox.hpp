@@ -330,9 +330,11 @@ public:
                 lock.lock();
             }
         } else {
+            // A nap takes about 0.1 ms, and a frame waits for some five messages one after the other. But a rank that is
+            // awake takes time from those that it shares a processor with.
+            Alertness alertness(std::chrono::microseconds(connection_->isCrowded() ? 30 : 1000));
             // Messages that were just queued must leave also when this is over, such as results for ranks below in the
             // tree.
-            Alertness alertness(std::chrono::microseconds(30)); // a nap is not much longer
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
                 // Before a task, as other ranks may wait for messages that this one has queued.
