@@ -457,6 +457,7 @@ private:
 
     void begin(End& end)
     {
+        end.mailbox.setInterrupt([&transport = end.transport] { transport.interrupt(); });
         end.transport.start(end.mailbox);
         end.started = true;
         if (end.polledByThread)
@@ -643,7 +644,7 @@ private:
             --running;
         };
         // As a connection does that passes a message on.
-        session_->mailbox.interruptOnReceive([this] { session_->transport.interrupt(); });
+        session_->mailbox.interruptOnReceive(true);
         meet();
         Ledger ledger = expect(*session_, everyone, count, sizeOf);
         if (threadCount == 1) {
@@ -660,7 +661,7 @@ private:
                 throw GaveUp("send() throws: " + error);
         receive(*session_, ledger);
         meet();
-        session_->mailbox.interruptOnReceive(nullptr);
+        session_->mailbox.interruptOnReceive(false);
     }
 
     void checkFlood()

@@ -123,7 +123,7 @@ public:
                 messages_.emplace_back(source, std::move(message));
         }
         bell_.interrupt();
-        if (interrupt_)
+        if (interrupts_)
             interrupt_();
     }
 
@@ -150,8 +150,10 @@ public:
         const std::lock_guard<std::mutex> lock(mutex_);
         failsAt_ = time;
     }
-    // Call `interrupt` for each message that comes; null: nothing. Not while messages may come.
-    void interruptOnReceive(std::function<void()> interrupt) { interrupt_ = std::move(interrupt); }
+    // What interrupts the transport. Before its start.
+    void setInterrupt(std::function<void()> interrupt) { interrupt_ = std::move(interrupt); }
+    // Whether each message that comes does so, within receive().
+    void interruptOnReceive(bool interrupts) { interrupts_ = interrupts; }
     void failWithMessage()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -186,6 +188,7 @@ public:
 private:
     NapSignal& bell_;
     std::function<void()> interrupt_;
+    std::atomic<bool> interrupts_{false};
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> messages_;
     std::string failure_;
