@@ -21,7 +21,7 @@ namespace detail {
 class SmallBytes {
 public:
     SmallBytes() = default;
-    [[gnu::noinline]] SmallBytes(const SmallBytes&) = default; // these not inlined: they are called in many places
+    [[gnu::noinline]] SmallBytes(const SmallBytes&) = default; // not inlined: these are called in many places
     [[gnu::noinline]] SmallBytes(SmallBytes&&) = default;
     [[gnu::noinline]] SmallBytes& operator=(const SmallBytes&) = default;
     [[gnu::noinline]] SmallBytes& operator=(SmallBytes&&) = default;
