@@ -14,10 +14,11 @@ namespace example {
 
 struct BrickVolume {
     VoxelBlock block;
-    Placement placement;
+    Placement placement; // before the rotation
     VolumeLook look;
     Box shown; // in voxels
     std::uint32_t geometry = 0;
+    Rotation rotation = {};
 };
 
 struct BrickMesh {
@@ -50,9 +51,13 @@ namespace detail {
 
 inline void addVolume(Brick& brick, const VolumeObject& object)
 {
-    const Box part = intersection(brick.cell, object.bounds().padded(1e-5f * object.bounds().largestExtent()));
+    const auto padded = [](const Box& box) { return box.padded(1e-5f * box.largestExtent()); };
+    Box part = intersection(brick.cell, padded(object.bounds()));
+    if (!object.rotation.isNone())
+        part = intersection(object.rotation.boxBack(part), padded(object.upright()));
     if (part.empty())
         return;
+    const float rounding = object.rotation.isNone() ? 0.01f : 0.25f; // in voxels; see VolumeSampler::toVoxel()
     Index3 lo, hi;
     for (int i = 0; i < 3; ++i) {
         const float offset = component(object.placement.offset, i), scale = component(object.placement.scale, i);
@@ -60,16 +65,16 @@ inline void addVolume(Brick& brick, const VolumeObject& object)
         const float low = component(part.lo, i), high = component(part.hi, i);
         const float first = scale > 0 ? low : high, behind = scale > 0 ? high : low;
         const int last = object.source.info.dims[axis] - 1;
-        // One voxel before and two behind the first of a cell are what its gradients use; 0.01 for rounding.
+        // One voxel before and two behind the first of a cell are what its gradients use.
         const auto voxel = [&](float world, float slack) {
             return static_cast<int>(
                 std::floor(std::clamp((world - offset) / scale + slack, -1.0f, static_cast<float>(last) + 1.0f)));
         };
-        lo[axis] = std::max(voxel(first, -0.01f) - 1, -1);
-        hi[axis] = std::min(voxel(behind, 0.01f) + 3, last + 3);
+        lo[axis] = std::max(voxel(first, -rounding) - 1, -1);
+        hi[axis] = std::min(voxel(behind, rounding) + 3, last + 3);
     }
-    brick.volumes.push_back(
-        {VoxelBlock(object.source, lo, hi), object.placement, object.source.look, object.shown, object.geometry});
+    brick.volumes.push_back({VoxelBlock(object.source, lo, hi), object.placement, object.source.look, object.shown,
+                             object.geometry, object.rotation});
 }
 
 // A part of an object without its primitives.

@@ -38,6 +38,58 @@ inline Placement fitToUnitCube(const Box& box, bool fit)
     return placement;
 }
 
+// A rotation about a point: by degrees about x, then y, then z.
+class Rotation {
+public:
+    Rotation() = default; // none
+    Rotation(const Vec3& degrees, const Vec3d& center) : isNone_(isZero(degrees)), center_(center)
+    {
+        for (int axis = 0; axis < 3 && !isNone_; ++axis) {
+            const double angle = static_cast<double>(component(degrees, axis)) * (3.14159265358979323846 / 180.0);
+            const int b = (axis + 1) % 3, c = (axis + 2) % 3;
+            for (Vec3d& column : columns_) {
+                const double u = component(column, b), v = component(column, c);
+                component(column, b) = std::cos(angle) * u - std::sin(angle) * v;
+                component(column, c) = std::sin(angle) * u + std::cos(angle) * v;
+            }
+        }
+    }
+
+    bool isNone() const { return isNone_; }
+    Vec3d direction(const Vec3d& d) const { return columns_[0] * d.x + columns_[1] * d.y + columns_[2] * d.z; }
+    Vec3d directionBack(const Vec3d& d) const
+    {
+        return {dot(columns_[0], d), dot(columns_[1], d), dot(columns_[2], d)};
+    }
+    Vec3d point(const Vec3d& p) const { return isNone_ ? p : center_ + direction(p - center_); }
+    Vec3d pointBack(const Vec3d& p) const { return isNone_ ? p : center_ + directionBack(p - center_); }
+    // The box around a box that is turned.
+    Box box(const Box& b) const
+    {
+        return around(b, [this](const Vec3d& p) { return point(p); });
+    }
+    Box boxBack(const Box& b) const
+    {
+        return around(b, [this](const Vec3d& p) { return pointBack(p); });
+    }
+
+private:
+    template <class Move>
+    Box around(const Box& b, const Move& move) const
+    {
+        if (isNone_ || b.empty())
+            return b;
+        Box all;
+        for (int i = 0; i < 8; ++i)
+            all.grow(rounded(move(Vec3d(b.corner(i)))));
+        return all;
+    }
+
+    bool isNone_ = true;
+    Vec3d center_;
+    Vec3d columns_[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}};
+};
+
 // A placement, and behind it what a FileLook adds: scale and rotation about the box's centre, then a translation.
 class FileToWorld {
 public:
@@ -49,15 +101,7 @@ public:
         if (!isPlaced_)
             return;
         center_ = Vec3d(fit.toWorld(box.center()));
-        for (int axis = 0; axis < 3; ++axis) {
-            const double angle = static_cast<double>(component(look.rotate, axis)) * (3.14159265358979323846 / 180.0);
-            const int b = (axis + 1) % 3, c = (axis + 2) % 3;
-            for (Vec3d& column : columns_) {
-                const double u = component(column, b), v = component(column, c);
-                component(column, b) = std::cos(angle) * u - std::sin(angle) * v;
-                component(column, c) = std::sin(angle) * u + std::cos(angle) * v;
-            }
-        }
+        rotation_ = Rotation(look.rotate, center_);
     }
 
     float size() const { return fit_.size() * static_cast<float>(scale_); }
@@ -66,17 +110,14 @@ public:
         const Vec3 world = fit_.toWorld(p);
         if (!isPlaced_)
             return world;
-        const Vec3d arm = (Vec3d(world) - center_) * scale_;
-        return rounded(center_ + columns_[0] * arm.x + columns_[1] * arm.y + columns_[2] * arm.z + translate_);
+        return rounded(rotation_.point(center_ + (Vec3d(world) - center_) * scale_) + translate_);
     }
     // A function of the point alone.
     Vec3d toFile(const Vec3& world) const
     {
         Vec3d p(world);
-        if (isPlaced_) {
-            const Vec3d arm = p - translate_ - center_;
-            p = center_ + Vec3d(dot(columns_[0], arm), dot(columns_[1], arm), dot(columns_[2], arm)) * (1 / scale_);
-        }
+        if (isPlaced_)
+            p = center_ + (rotation_.pointBack(p - translate_) - center_) * (1 / scale_);
         return (p - Vec3d(fit_.offset)) * (1 / static_cast<double>(fit_.scale.x));
     }
 
@@ -85,7 +126,7 @@ private:
     bool isPlaced_;
     double scale_;
     Vec3d center_, translate_;
-    Vec3d columns_[3] = {{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}; // of the rotation
+    Rotation rotation_;
 };
 
 // The part of an object that is shown: the points that lie in a box of its file's coordinates.

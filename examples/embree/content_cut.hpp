@@ -162,11 +162,11 @@ private:
                         }
                         block.grow(object.placement.toWorld(p));
                     }
-                    block = intersection(block, object.bounds());
+                    block = intersection(block, object.upright());
                     if (block.empty())
                         continue;
                     const Vec3 e = block.extent();
-                    add(content, block,
+                    add(content, object.rotation.box(block),
                         samplesPerLength * static_cast<double>(e.x) * static_cast<double>(e.y)
                             * static_cast<double>(e.z),
                         [](double v) { return v; });

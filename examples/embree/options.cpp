@@ -403,10 +403,6 @@ private:
             const bool isVolume = isInHdf5 || isVolumeEnding(endingOf(file.path));
             if (!isVolume && (!file.look.transfer.empty() || file.look.range || !file.look.isovalues.empty()))
                 throw CLI::ValidationError("scene", "'" + word + "': transfer, range and isovalue are for volumes");
-            if (isVolume && !isZero(file.look.rotate))
-                throw CLI::ValidationError("scene", "'" + word
-                                                        + "': a volume cannot be rotated; the camera can, with "
-                                                          "--up");
             LookOptions::requireTransfer(file.look.transfer, "scene", "'" + word + "': transfer: ");
             file.look = merged(file.look, options_.look);
             options_.files.push_back(file);

@@ -321,7 +321,7 @@ Renderer::Accumulator Renderer::trace(const Vec3& origin, const Vec3& direction,
             continue;
         rays[i].next = std::max(1, static_cast<int>(first / scene_.step) - 1);
         rays[i].end = static_cast<int>(last / scene_.step) + 2;
-        rays[i].inverseStep = volumes_[i].inverseAdvance(inverse, scene_.step);
+        rays[i].inverseStep = volumes_[i].inverseAdvance(direction, scene_.step);
     }
 
     auto hit = hits.begin();

@@ -24,12 +24,13 @@ namespace example {
 // itself, with z backwards.
 struct VolumeObject {
     VolumeSource source;
-    Placement placement;        // of voxels by their index
+    Placement placement;        // of voxels by their index, before the rotation
+    Rotation rotation;          // in the world
     Box shown;                  // in voxels; what is outside is clipped away
     std::uint32_t geometry = 0; // if it has isosurfaces
 
     // Throws std::runtime_error, which names the file, if floats have too few digits to tell the volume's voxels apart,
-    // or nothing of it is left. It cannot be rotated.
+    // or nothing of it is left.
     VolumeObject(VolumeSource volume, bool fit, const FileLook& look = {}) : source(std::move(volume))
     {
         const Index3& d = source.info.dims;
@@ -39,19 +40,20 @@ struct VolumeObject {
         shown.hi = last;
         placement.scale = spacing;
         placement.offset = fit ? Vec3() : origin; // it is centred
-        const Placement fitted = fitToUnitCube(bounds(), fit);
+        const Placement fitted = fitToUnitCube(upright(), fit);
         placement.offset = fitted.toWorld(placement.offset);
         placement.scale = placement.scale * fitted.size();
-        const Vec3 sum = bounds().lo + bounds().hi;
+        const Vec3 sum = upright().lo + upright().hi;
         placement.scale = {placement.scale.x, -placement.scale.y, -placement.scale.z};
         placement.offset = {placement.offset.x, sum.y - placement.offset.y, sum.z - placement.offset.z};
         if (look.isPlaced()) {
-            const Vec3 center = bounds().center();
+            const Vec3 center = upright().center();
             placement.scale = placement.scale * look.scale;
             placement.offset = center + (placement.offset - center) * look.scale + look.translate;
+            rotation = Rotation(look.rotate, Vec3d(upright().center()));
         }
         for (int axis = 0; axis < 3; ++axis)
-            if (!(std::max(std::fabs(component(bounds().lo, axis)), std::fabs(component(bounds().hi, axis)))
+            if (!(std::max(std::fabs(component(upright().lo, axis)), std::fabs(component(upright().hi, axis)))
                   <= 131072 * std::fabs(component(placement.scale, axis)))) // what addVolume() allows for rounding
                 throw std::runtime_error(source.name + ": its voxels are too small beside "
                                          + (fit ? "its extent" : "the distance from 0 to its end")
@@ -73,8 +75,11 @@ struct VolumeObject {
                                      + textOf(inFile.toWorld({0, 0, 0})) + " to " + textOf(inFile.toWorld(last)));
     }
 
+    Vec3 toWorld(const Vec3& voxel) const { return rounded(rotation.point(Vec3d(placement.toWorld(voxel)))); }
     // The part of the domain that is shown. The domain is between the centres of the outer voxels.
-    Box bounds() const
+    Box bounds() const { return rotation.box(upright()); }
+    // The same before the rotation.
+    Box upright() const
     {
         Box box;
         box.grow(placement.toWorld(shown.lo));
@@ -125,15 +130,12 @@ struct Scene {
             bool isEmpty = true;
             for (const Vec3& p : visible.points)
                 if (const float s = static_cast<float>(visible.slack); object.shown.padded(s).overlaps({p, p})) {
-                    take(object.placement.toWorld(clamped(p, object.shown)), slack);
+                    take(object.toWorld(clamped(p, object.shown)), slack);
                     isEmpty = false;
                 }
             if (isEmpty) // the whole
                 for (int i = 0; i < 8; ++i)
-                    take({i & 1 ? object.bounds().hi.x : object.bounds().lo.x,
-                          i & 2 ? object.bounds().hi.y : object.bounds().lo.y,
-                          i & 4 ? object.bounds().hi.z : object.bounds().lo.z},
-                         0);
+                    take(object.toWorld(object.shown.corner(i)), 0);
         });
         noteOn(object.source, visible.points.empty());
         volumes.push_back(std::move(object));

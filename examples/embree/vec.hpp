@@ -90,6 +90,8 @@ struct Box {
     bool empty() const { return !(lo.x <= hi.x && lo.y <= hi.y && lo.z <= hi.z); }
     Vec3 extent() const { return hi - lo; }
     Vec3 center() const { return (lo + hi) * 0.5f; }
+    // Number `i` of 8.
+    Vec3 corner(int i) const { return {i & 1 ? hi.x : lo.x, i & 2 ? hi.y : lo.y, i & 4 ? hi.z : lo.z}; }
     float largestExtent() const { return std::max({hi.x - lo.x, hi.y - lo.y, hi.z - lo.z}); }
     void grow(const Vec3& p, float radius = 0)
     {

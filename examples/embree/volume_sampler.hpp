@@ -26,6 +26,8 @@ public:
                  -volume_.placement.offset.z * inverseScale_.z},
           transferFunction_(stepIn256ths(step), volume_.look.points), valueScale_(volume_.look.scale())
     {
+        if (!volume_.rotation.isNone())
+            turnAxes();
         for (int i = 0; i < 3; ++i)
             component(slopeScale_, i) = std::copysign(
                 0.5f * valueScale_ * (volume_.placement.size() / std::fabs(component(volume_.placement.scale, i))),
@@ -33,17 +35,25 @@ public:
         dispatch([this](const auto* voxels) { buildSkipGrid(voxels); });
     }
 
+    // Of a rotated volume right to a quarter of a voxel, as floats are rounded.
     Vec3 toVoxel(const Vec3& world) const
     {
+        if (!volume_.rotation.isNone()) {
+            const auto along = [&](const Vec3& axis, float shift) {
+                return mulAdd(world.x, axis.x, mulAdd(world.y, axis.y, mulAdd(world.z, axis.z, shift)));
+            };
+            return {along(axes_[0], shift_.x), along(axes_[1], shift_.y), along(axes_[2], shift_.z)};
+        }
         return {mulAdd(world.x, inverseScale_.x, shift_.x), mulAdd(world.y, inverseScale_.y, shift_.y),
                 mulAdd(world.z, inverseScale_.z, shift_.z)};
     }
     // One over the voxels that a ray advances along each axis in one step.
-    Vec3 inverseAdvance(const Vec3& inverseDirection, float step) const
+    Vec3 inverseAdvance(const Vec3& direction, float step) const
     {
         const Vec3& scale = volume_.placement.scale;
-        return {inverseDirection.x * scale.x / step, inverseDirection.y * scale.y / step,
-                inverseDirection.z * scale.z / step};
+        const Vec3 along =
+            volume_.rotation.isNone() ? direction : rounded(volume_.rotation.directionBack(Vec3d(direction)));
+        return {1 / along.x * scale.x / step, 1 / along.y * scale.y / step, 1 / along.z * scale.z / step};
     }
 
     // The domain in world space, for clipping rays with some slack; who is inside is decided by inDomain().
@@ -52,7 +62,7 @@ public:
         Box box;
         box.grow(volume_.placement.toWorld(volume_.shown.lo));
         box.grow(volume_.placement.toWorld(volume_.shown.hi));
-        return box;
+        return volume_.rotation.box(box);
     }
     // Whether a point is in the part of the domain that a clip box has left.
     bool inDomain(const Vec3& v) const
@@ -85,8 +95,8 @@ public:
     {
         return dispatch([&](const auto* voxels) {
             const auto at = cornerOf(voxels, v);
-            return unit(gradientOf(at, at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
-                                   at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy)));
+            return inWorld(unit(gradientOf(at, at.plane(at.p, at.dx, at.dy, at.fx, at.fy),
+                                           at.plane(at.p + at.dz, at.dx, at.dy, at.fx, at.fy))));
         });
     }
 
@@ -119,6 +129,23 @@ public:
 private:
     static constexpr int cellShift = 3, cellWidth = 1 << cellShift; // of the skip grid, in voxels
     static_assert(cellWidth == skipWidth);
+
+    // Makes toVoxel() one of the rotated volume.
+    void turnAxes()
+    {
+        for (int i = 0; i < 3; ++i) {
+            Vec3d one;
+            component(one, i) = 1;
+            const double inverse = 1 / static_cast<double>(component(volume_.placement.scale, i));
+            axes_[i] = rounded(volume_.rotation.direction(one) * inverse);
+            Vec3d origin = volume_.rotation.pointBack({0, 0, 0}) - Vec3d(volume_.placement.offset);
+            component(shift_, i) = static_cast<float>(component(origin, i) * inverse);
+        }
+    }
+    Vec3 inWorld(const Vec3& direction) const
+    {
+        return volume_.rotation.isNone() ? direction : rounded(volume_.rotation.direction(Vec3d(direction)));
+    }
 
     float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }
     // In units of 1/256 of the volume's largest extent.
@@ -190,7 +217,7 @@ private:
         const float steepness = length(gradient);
         if (steepness > 0) {
             // Where the value hardly changes its direction is noise: there the colour is left as it is.
-            const Vec3 normal = gradient * (1 / steepness);
+            const Vec3 normal = inWorld(gradient * (1 / steepness));
             const float weight = std::min(1.0f, 25.0f * steepness);
             const float lit = 1 + weight * (light.diffuse(normal) - 1);
             const float highlight = weight * light.specular(normal, view);
@@ -270,6 +297,7 @@ private:
     BrickVolume volume_;
     Vec3 inverseScale_;
     Vec3 shift_;
+    Vec3 axes_[3]; // of a rotated volume: one voxel along each, in the world
     TransferFunction transferFunction_;
     float valueScale_;
     // From differences of voxels to a gradient along the world's axes, in values per least side of a voxel.

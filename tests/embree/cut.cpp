@@ -611,6 +611,22 @@ TEST_CASE("Cutting a volume leaves no seam", "[cut]")
     checkCuts(scene, settingsOf(96, 64));
 }
 
+TEST_CASE("Cutting a turned volume leaves no seam", "[cut]")
+{
+    Scene scene;
+    example::FileLook turned;
+    for (const auto& [key, value] : {std::pair("rotate", "20,35,50"), {"scale", "0.8"}, {"translate", "0.1,0,-0.2"}})
+        CHECK(setLook(turned, key, value));
+    scene.add(example::detail::generatedVolume({48, 40, 33}, example::detail::WaveField({48, 40, 33}, 7)), true,
+              turned);
+    const Picture whole = render(scene, settingsOf(96, 64), {1, 1});
+    CHECK(whole.meanAlpha() > 0.1);
+    checkCuts(scene, settingsOf(96, 64));
+    Run byContent{2, 5};
+    byContent.byContent = true;
+    checkNoSeams(render(scene, settingsOf(96, 64), byContent), whole);
+}
+
 TEST_CASE("Cutting a volume, a mesh and spheres leaves no seam", "[cut]")
 {
     const Scene scene = example::demoScene(1);

@@ -546,6 +546,31 @@ TEST_CASE("A placement scales and turns about the file's centre and then moves i
     CHECK(volume.bounds.largestExtent() == Approx(0.5).epsilon(1e-3));
 }
 
+// Of 33 x 33 voxels, (x, y) shows after a quarter of a turn about z what was at (32 - y, x).
+TEST_CASE("A turned volume looks as the volume of the turned voxels", "[look]")
+{
+    const example::detail::WaveField field({33, 33, 33}, 5);
+    for (const std::string isovalue : {"", "100"}) {
+        INFO("isovalue " << isovalue);
+        FileLook look = lookWith({{"rotate", "0,0,90"}});
+        if (!isovalue.empty())
+            CHECK(setLook(look, "isovalue", isovalue));
+        VolumeSource source = example::detail::generatedVolume({33, 33, 33}, field);
+        VolumeSource voxels =
+            example::detail::generatedVolume({33, 33, 33}, [&](int x, int y, int z) { return field(32 - y, x, z); });
+        source.look = voxels.look = lookOf(source, look, {}); // a look of its own depends on which rows are looked at
+        Scene turned, moved;
+        turned.add(std::move(source), true, look);
+        moved.add(std::move(voxels), true);
+        const auto a = render(turned, turned.bounds, settingsFor()), b = render(moved, moved.bounds, settingsFor());
+        CHECK(coveredPixels(*a) > 1000);
+        int wrong = 0;
+        for (int i = 0; i < 4 * 64 * 64; ++i) // a ray may graze the outline
+            wrong += !(std::fabs(a->color[i] - b->color[i]) < 1e-3f);
+        CHECK(wrong <= 16);
+    }
+}
+
 // ---- the camera -----------------------------------------------------------------------------------------------------
 
 TEST_CASE("The camera is where it is told to be", "[look][camera]")
