@@ -5,7 +5,8 @@
 //   mpirun -n 3 test_icet_client absent      a rank that does not call (DFB_ICET_TIMEOUT=1)
 //   mpirun -n 3 test_icet_client stopped     a rank that hangs and goes on later (DFB_ICET_TIMEOUT=1)
 //   mpirun -n 3 test_icet_client killed      a rank that dies; prints "all were told", then the launcher may end the
-//   job mpirun -n 2 test_icet_client finalised   a context that outlives MPI
+//                                            job
+//   mpirun -n 2 test_icet_client finalised   a context that outlives MPI
 // With "multiple" as the second word at MPI_THREAD_MULTIPLE, else at MPI_THREAD_SINGLE. Returns 0 if all is well.
 #include <IceT.h>
 #include <mpi.h>
@@ -147,6 +148,13 @@ void trySettings()
     expectError(ICET_INVALID_VALUE, "an unknown option");
     icetDisable(7);
     expectError(ICET_INVALID_VALUE, "an unknown option");
+    for (const bool isOn : {true, false}) {
+        (isOn ? icetEnable : icetDisable)(ICET_ORDERED_COMPOSITE);
+        IceTBoolean state = !isOn;
+        icetGetBooleanv(ICET_ORDERED_COMPOSITE, &state);
+        expect(state == isOn, "an option that was set");
+    }
+    expect(icetImageIsNull(icetImageNull()), "an image that is null");
     IceTInt value = 0;
     icetGetIntegerv(0x7f, &value);
     expectError(ICET_INVALID_ENUM, "an unknown state");
@@ -161,6 +169,24 @@ void trySettings()
     expectError(ICET_NO_ERROR, "an error that was read");
     icetPhysicalRenderSize(40, 30);
     icetGetError();
+}
+
+// The left half of the wall, as a box.
+void tryBounds()
+{
+    icetBoundingBoxf(-1, 0, -1, 1, 0, 0);
+    const Picture picture(40, 30);
+    const IceTImage image = picture.composite();
+    IceTInt contained[4] = {-1, -1, -1, -1};
+    icetGetIntegerv(ICET_CONTAINED_VIEWPORT, contained);
+    expect(contained[0] == 0 && contained[1] == 0 && contained[2] == 20 && contained[3] == 30, "the pixels of a box");
+    if (rank == 0) {
+        const auto* words = reinterpret_cast<const std::uint32_t*>(icetImageGetColorcub(image));
+        for (int i = 0; i < 40 * 30; ++i)
+            expect((words[i] == 0) == (i % 40 >= 20), "pixel " + std::to_string(i) + " of a box");
+    }
+    icetBoundingVertices(0, ICET_VOID, 0, 0, nullptr);
+    expectGoodFrame("one with bounds");
 }
 
 void expectFailure(IceTImage image, const std::string& what)
@@ -239,6 +265,7 @@ void tryErrors()
     tryWithoutContext();
     IceTContext context = makeContext();
     trySettings();
+    tryBounds();
     tryFrames();
     IceTContext other = makeContext();
     icetCopyState(other, context);

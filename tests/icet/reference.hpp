@@ -51,24 +51,28 @@ inline Pixel nearest(const std::vector<Layer>& layers, Kind kind, const std::arr
     return pixel;
 }
 
-// Front to back, over the background.
+// Front to back, over the background. The library takes a level as the float next to level / 255.
 inline Pixel blended(const std::vector<const Layer*>& frontToBack, Kind kind, const std::array<double, 4>& background,
                      int x, int y)
 {
     Pixel pixel;
-    const double one = isBytes(kind) ? 255 : 1;
+    const auto taken = [kind](std::array<double, 4> color) {
+        for (double& value : color)
+            value = isBytes(kind) ? static_cast<double>(static_cast<float>(value) / 255.0f) : value;
+        return color;
+    };
     double open = 1; // the part of the light that comes through
     for (const Layer* layer : frontToBack) {
         if (!layer->part.contains(x, y))
             continue;
         pixel.isTied = pixel.isTied || layer->picture.isEmissive(x, y);
-        const auto color = colorOf(layer->picture, kind, x, y);
+        const auto color = taken(colorOf(layer->picture, kind, x, y));
         for (std::size_t c = 0; c < 4; ++c)
             pixel.color[c] += open * color[c];
-        open *= 1 - color[3] / one;
+        open *= 1 - color[3];
     }
     for (std::size_t c = 0; c < 4; ++c)
-        pixel.color[c] += open * background[c];
+        pixel.color[c] = (pixel.color[c] + open * taken(background)[c]) * (isBytes(kind) ? 255 : 1);
     return pixel;
 }
 

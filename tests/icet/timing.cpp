@@ -63,7 +63,9 @@ Images makeImages(int size, int rank, int ranks, bool isBricks)
 
 // ---- what is timed
 
-enum class Way { BlendBytes, BlendFloats, NearestBytes };
+enum class Way { BlendBytes, BlendFloats, NearestBytes, NearestFloats };
+bool blends(Way way) { return way == Way::BlendBytes || way == Way::BlendFloats; }
+bool isFloat(Way way) { return way == Way::BlendFloats || way == Way::NearestFloats; }
 
 struct Strategy {
     const char* name;
@@ -74,8 +76,11 @@ const Strategy strategies[] = {
     {"sequential, binary swap", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_BSWAP},
     {"sequential, tree", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_TREE},
     {"sequential, radix-k", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_RADIXK},
+    {"sequential, radix-kr", ICET_STRATEGY_SEQUENTIAL, ICET_SINGLE_IMAGE_STRATEGY_RADIXKR},
     {"reduce", ICET_STRATEGY_REDUCE, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
     {"direct", ICET_STRATEGY_DIRECT, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
+    {"split", ICET_STRATEGY_SPLIT, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
+    {"vtree", ICET_STRATEGY_VTREE, ICET_SINGLE_IMAGE_STRATEGY_AUTOMATIC},
 };
 
 struct Client {
@@ -118,10 +123,9 @@ void set(const Client& client, Way way, int size)
     api.icetDiagnostics(ICET_DIAG_ERRORS | ICET_DIAG_ALL_NODES);
     api.icetResetTiles();
     api.icetAddTile(0, 0, size, size, 0);
-    const bool blends = way != Way::NearestBytes;
-    api.icetSetColorFormat(way == Way::BlendFloats ? ICET_IMAGE_COLOR_RGBA_FLOAT : ICET_IMAGE_COLOR_RGBA_UBYTE);
-    api.icetSetDepthFormat(blends ? ICET_IMAGE_DEPTH_NONE : ICET_IMAGE_DEPTH_FLOAT);
-    api.icetCompositeMode(blends ? ICET_COMPOSITE_MODE_BLEND : ICET_COMPOSITE_MODE_Z_BUFFER);
+    api.icetSetColorFormat(isFloat(way) ? ICET_IMAGE_COLOR_RGBA_FLOAT : ICET_IMAGE_COLOR_RGBA_UBYTE);
+    api.icetSetDepthFormat(blends(way) ? ICET_IMAGE_DEPTH_NONE : ICET_IMAGE_DEPTH_FLOAT);
+    api.icetCompositeMode(blends(way) ? ICET_COMPOSITE_MODE_BLEND : ICET_COMPOSITE_MODE_Z_BUFFER);
     api.icetEnable(ICET_ORDERED_COMPOSITE);
     api.icetStrategy(client.strategy.strategy);
     api.icetSingleImageStrategy(client.strategy.single);
@@ -132,12 +136,12 @@ void timeFrame(Client& client, Way way, const Images& images, bool counts)
 {
     constexpr IceTDouble identity[16] = {1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1};
     constexpr IceTFloat background[4] = {0, 0, 0, 0};
-    const void* color = way == Way::BlendFloats ? static_cast<const void*>(images.floats.data()) : images.bytes.data();
+    const void* color = isFloat(way) ? static_cast<const void*>(images.floats.data()) : images.bytes.data();
     client.api->icetSetContext(client.context);
     barrier();
     const double before = MPI_Wtime(), cpuBefore = cpuSeconds();
-    client.api->icetCompositeImage(color, way == Way::NearestBytes ? images.depth.data() : nullptr, images.valid,
-                                   identity, identity, background);
+    client.api->icetCompositeImage(color, blends(way) ? nullptr : images.depth.data(), images.valid, identity, identity,
+                                   background);
     const double seconds = MPI_Wtime() - before, cpu = cpuSeconds() - cpuBefore;
     double longest = 0, all = 0;
     MPI_Request requests[2];
@@ -174,7 +178,8 @@ int run(int count, char** words)
         const Images images = makeImages(size, rank, ranks, isBricks);
         for (const auto& [way, name] :
              {std::make_pair(Way::BlendBytes, "blend, 8 bit"), std::make_pair(Way::BlendFloats, "blend, float"),
-              std::make_pair(Way::NearestBytes, "nearest, 8 bit")}) {
+              std::make_pair(Way::NearestBytes, "nearest, 8 bit"),
+              std::make_pair(Way::NearestFloats, "nearest, float")}) {
             for (Client& client : clients) {
                 set(client, way, size);
                 client.seconds.clear();

@@ -1,7 +1,8 @@
 #!/bin/sh
 # sh tests/vtk/vtk.sh [--root FOLDER] [--output FOLDER] [--help]
-# Builds examples/vtk with Debian's VTK and runs it on 1 to 4 ranks: surfaces and a volume, of VTK's wavelet and of a
-# file. Each picture is compared with VTK's own, and the surfaces of all runs with each other.
+# Builds examples/vtk with Debian's VTK and runs it on 1 to 4 ranks: surfaces and a volume, of VTK's wavelet, of a file
+# and, where ../shared/data is, of a simulated molecule. Each picture is compared with VTK's own, and the surfaces of all
+# runs with each other.
 # VTK is installed into a Debian system of its own, since it brings Open MPI.
 #   --root FOLDER    that system; made if it is not there, 2 GB, and used again. Default: build/vtk-root
 #   --output FOLDER  for the pictures. Default: build/vtk
@@ -38,13 +39,30 @@ writer = vtk.vtkXMLImageDataWriter()
 writer.SetFileName("/out/mandelbrot.vti")
 writer.SetInputConnection(source.GetOutputPort())
 writer.Write()' || give_up "VTK writes no file"
+real=
+neghip=$source/../shared/data/neghip_64x64x64_uint8.raw
+if [ -e "$neghip" ]; then
+    real=/out/real.vti
+    cp "$neghip" "$root/out/real.raw"
+    in_root python3 -c 'import vtk
+reader = vtk.vtkImageReader2()
+reader.SetFileName("/out/real.raw")
+reader.SetFileDimensionality(3)
+reader.SetDataExtent(0, 63, 0, 63, 0, 63)
+reader.SetDataScalarTypeToUnsignedChar()
+writer = vtk.vtkXMLImageDataWriter()
+writer.SetFileName("/out/real.vti")
+writer.SetInputConnection(reader.GetOutputPort())
+writer.Write()' || give_up "VTK does not read $neghip"
+fi
 
 verdict=passed
 for count in 1 2 3 4; do
     draw $count surfaces
     draw $count volume --volume
     draw $count file /out/mandelbrot.vti
-    for name in surfaces file; do
+    [ -z "$real" ] || draw $count real $real
+    for name in surfaces file ${real:+real}; do
         if ! cmp "$root/out/${name}1.ppm" "$root/out/$name$count.ppm"; then
             say "the $name on $count ranks is not that on one"
             verdict=FAILED
@@ -52,6 +70,7 @@ for count in 1 2 3 4; do
     done
 done
 draw 4 file_volume --volume /out/mandelbrot.vti
+[ -z "$real" ] || draw 4 real_volume --volume $real
 mkdir -p "$output"
 cp "$root"/out/*.ppm "$output"
 say "$verdict; the pictures are in $output"

@@ -1,0 +1,89 @@
+#!/bin/sh
+# sh tests/icet/faults.sh [--cases N]
+# Puts faults into libdfb_icet, one at a time, in a copy of the tree, and checks that the differential test fails with
+# each. The faults are at the end of this file. 10 minutes on 2 cores.
+#   --cases N   of the differential test; default 200
+# Exits with 0 if each fault was found, and with 77 if IceT is not there (sh bench/get_icet.sh).
+set -eu
+
+source=$(CDPATH='' cd -- "$(dirname -- "$0")/../.." && pwd)
+copy=$source/build/icet-faults
+adapter=$copy/examples/adapters/icet
+cases=200
+[ "${1:-}" != --cases ] || cases=$2
+if [ ! -d "$source/build/peers/icet" ]; then
+    echo "faults.sh: SKIPPED: there is no IceT; sh bench/get_icet.sh gets it" >&2
+    exit 77
+fi
+
+rm -rf --one-file-system "$copy"
+mkdir -p "$copy"
+(cd "$source" && tar -cf - --exclude=./build --exclude=./.git .) | tar -xf - -C "$copy"
+cmake -S "$copy" -B "$copy/build" -G Ninja -DCMAKE_BUILD_TYPE=Debug -DCMAKE_CXX_FLAGS_DEBUG="-O1" -DDFB_BUILD_BENCH=OFF \
+    -DDFB_ICET_DIR="$source/build/peers/icet" >"$copy/cmake.log"
+
+build() {
+    cmake --build "$copy/build" --target dfb_icet test_icet_differential >"$copy/build.log" 2>&1
+}
+
+# differential: the test's output in $copy/test.log
+differential() {
+    timeout 300 mpiexec -n 3 "$copy/build/tests/icet/test_icet_differential" "$(find "$source/build/peers/icet/lib" -name '*IceTCore*.so' | head -n 1)" \
+        "$copy/build/examples/adapters/icet/libdfb_icet.so" --cases "$cases" >"$copy/test.log" 2>&1
+}
+
+build
+if ! differential; then
+    echo "faults.sh: FAILED: the test fails without a fault: see $copy/test.log" >&2
+    exit 1
+fi
+echo "no fault: $(tail -n 1 "$copy/test.log")"
+
+# put FILE OLD NEW: the text OLD of one line becomes NEW. It must be there once.
+put() {
+    cp "$adapter/$1" "$copy/before"
+    awk -v old="$2" -v new="$3" '
+        { at = index($0, old) }
+        at { ++count; $0 = substr($0, 1, at - 1) new substr($0, at + length(old)) }
+        { print }
+        END { exit count != 1 }' "$copy/before" >"$adapter/$1"
+}
+
+verdict=0
+count=0
+while IFS='|' read -r name file old new; do
+    case $name in '' | '#'*) continue ;; esac
+    count=$((count + 1))
+    if ! put "$file" "$old" "$new"; then
+        result="NOT PUT IN: $file has not one line with: $old"
+        verdict=1
+    elif ! build; then
+        result="DOES NOT COMPILE: see $copy/build.log"
+        verdict=1
+    elif differential; then
+        result="NOT FOUND"
+        verdict=1
+    else
+        result="found: $(grep -m 1 'case' "$copy/test.log" || tail -n 1 "$copy/test.log")"
+    fi
+    echo "$name: $result"
+    cp "$copy/before" "$adapter/$file"
+    touch "$adapter/$file"
+done <<'END'
+order of the ranks ignored|composite.cpp|if (s.isEnabled(ICET_ORDERED_COMPOSITE))|if (false)
+8-bit background not rounded down|composite.cpp|value = std::floor(255 * std::clamp(value, 0.0f, 1.0f)) / 255;|value = std::clamp(value, 0.0f, 1.0f);
+no background behind nearest pixels|composite.cpp|plan.fillsBackground = hasColor &&|plan.fillsBackground = false &&
+depth of nothing is infinite|composite.cpp|return depth == nothing ? 1.0f : depth;|return depth;
+pixels at depth 1 count|composite.cpp|input.farDepth = 1;|
+pixels outside of the client's limits are read|composite.cpp|input.valid = regionIn(tile, part);|input.valid = regionIn(tile, memory);
+all tiles displayed by one rank|composite.cpp|tile.displayRank, plan.format,|0, plan.format,
+display rank of an old frame kept|composite.cpp|k.tile, k.width, k.height, k.displayRank, k.format|k.tile, k.width, k.height, k.format
+alpha kept in an image of three channels|image.cpp|std::copy_n(rgba + 4 * i, 3, out + 3 * i);|std::copy_n(rgba + 3 * i, 3, out + 3 * i);
+bounds a pixel too narrow|bounds.cpp|pixel(std::ceil(right), wall.x, wall.width)|pixel(std::floor(right), wall.x, wall.width)
+near plane ignored|bounds.cpp|if (before(v) >= 0) {|if (true) {
+same data of two ranks counted twice|bounds.cpp|if (context.replicas.size() > 1)|if (false)
+floating window used for a tile of its own|draw.cpp|fits && !tile.contains(all))|fits)
+projection half a pixel off|draw.cpp|double(wall.width + 2 * (wall.x - window.x) - window.width)|double(wall.width + 2 * (wall.x - window.x) + 1 - window.width)
+END
+echo "faults.sh: $count faults, $([ $verdict = 0 ] && echo "each was found" || echo "NOT ALL were found")"
+exit $verdict
