@@ -330,8 +330,8 @@ public:
                 lock.lock();
             }
         } else {
-            // A nap takes about 0.1 ms, and a frame waits for some five messages one after the other. But a rank that is
-            // awake takes time from those that it shares a processor with.
+            // A nap takes about 0.1 ms, and a frame waits for some five messages one after the other. But a rank that
+            // is awake takes time from those that it shares a processor with.
             Alertness alertness(std::chrono::microseconds(connection_->isCrowded() ? 30 : 1000));
             // Messages that were just queued must leave also when this is over, such as results for ranks below in the
             // tree.
@@ -514,7 +514,12 @@ private:
             const std::lock_guard<std::mutex> lock(mutex_);
             ++tasks_;
         }
-        executor_->submit(std::move(task));
+        try {
+            executor_->submit(std::move(task));
+        } catch (...) {
+            taskDone();
+            throw;
+        }
         if (!executor_->hasWorkers()) // a thread that waits runs it
             notify();
     }

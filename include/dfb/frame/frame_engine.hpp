@@ -193,11 +193,11 @@ public:
             mailbox_->sendWithCredit(owner, message.empty() ? encode(tile, owner) : std::move(message));
             waitForRoom();
         } else if (open_.enter(tile.frame)) {
+            const OpenFrame::Inside inside(open_);
             if (isInPlace)
                 arrive([&](auto& where, auto& arrival) { pipeline_->arrive(tile, rank(), where, arrival); }, true);
             else
                 arrive(encode(tile, owner), rank());
-            open_.leave();
         }
         pollNowAndThen();
     }
@@ -353,8 +353,8 @@ public:
     {
         if (!open_.enter(frame))
             return; // it is over
+        const OpenFrame::Inside inside(open_);
         outcome_->fail(errorInfo(ErrorKind::Cancelled, "the frame was cancelled"));
-        open_.leave();
     }
 
     // A frame that is left without end(), mostly while an exception passes.
@@ -462,8 +462,8 @@ private:
         failForDamage();
         for (const int tile : withoutSamples)
             if (open_.enter(open_.number())) {
+                const OpenFrame::Inside inside(open_);
                 submitFinish(tile);
-                open_.leave();
             }
         if (!params_.declared && open_.expectNoMore())
             allFinished();
@@ -492,11 +492,11 @@ private:
         }
         case OpenFrame::Entry::Inside: break;
         }
+        const OpenFrame::Inside inside(open_);
         if (hasCredit)
             mailbox_->flow().consumed(source, byteCount);
         mailbox_->countTaken(source, header, message);
         outcome_->guarded([&] { handle(source, header, std::move(message)); }, {}, source);
-        open_.leave();
     }
 
     void sendToDisplay(Buffer&& message)
@@ -537,8 +537,8 @@ private:
         mailbox_->keepDamage(source, error); // first: begin() opens the gate and then looks
         if (!open_.enterAny())
             return;
+        const OpenFrame::Inside inside(open_); // until the end: the next begin() waits for it
         failForDamage();
-        open_.leave(); // not before: the next begin() waits for it
     }
 
     void failForDamage()
@@ -679,8 +679,13 @@ private:
 
     void submitFinish(int tile)
     {
-        open_.enterAgain(); // we are inside
-        mailbox_->submitWork(tile);
+        open_.enterAgain(); // we are inside; work() leaves
+        try {
+            mailbox_->submitWork(tile);
+        } catch (...) {
+            open_.leave();
+            throw;
+        }
     }
 
     // False if an operation has thrown.
@@ -693,6 +698,7 @@ private:
     // A tile that is complete.
     void work(int tile) override
     {
+        const OpenFrame::Inside inside(open_);
         ErrorInfo where;
         where.tile = tile;
         if (open_.beginReading()) {
@@ -701,7 +707,6 @@ private:
                 outcome_->guarded([&] { allFinished(); }, where);
             endReading();
         }
-        open_.leave();
     }
 
     // The last of this rank's tiles has been finished.
@@ -721,8 +726,8 @@ private:
             [this, frame = open_.number()](const Bytes&) {
                 if (!open_.enter(frame))
                     return;
+                const OpenFrame::Inside inside(open_);
                 applyDeclarations();
-                open_.leave();
             });
     }
 

@@ -245,6 +245,18 @@ public:
             empty_.notify_all();
     }
 
+    // Leaves at the end of a scope that has entered, also while an exception passes.
+    class Inside {
+    public:
+        explicit Inside(OpenFrame& frame) : frame_(frame) {}
+        Inside(const Inside&) = delete;
+        Inside& operator=(const Inside&) = delete;
+        ~Inside() { frame_.leave(); }
+
+    private:
+        OpenFrame& frame_;
+    };
+
     // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So this rank
     // does not vote while a task reads inputs, once the frame has one that `isInPlace`. False if the frame has failed:
     // then inputs must not be read. Else endReading() must follow.

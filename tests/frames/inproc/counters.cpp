@@ -530,6 +530,32 @@ std::vector<std::string> outcomes(std::size_t largest, const Make& make)
 
 } // namespace
 
+TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and the next is right", "[counters]")
+{
+    dfb::runRanks(1, [](dfb::InprocCommunicator communicator) {
+        using Fb = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
+        dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        Fb fb(communicator, config);
+        const auto tile = std::make_unique<Fb::Tile>();
+        for (const bool hasMemory : {false, true}) {
+            auto frame = fb.begin();
+            frame.start(*tile, 0, 0);
+            std::fill_n(tile->color, 4 * 64 * 64, 0.5f);
+            largestAllocation = hasMemory ? std::numeric_limits<std::size_t>::max() : 20000;
+            frame.guard([&] { frame.setTile(*tile); });
+            largestAllocation = std::numeric_limits<std::size_t>::max();
+            std::string outcome = "fine";
+            try {
+                CHECK(frame.end().tilesTouched == 1);
+            } catch (const dfb::FrameError& e) {
+                outcome = e.what();
+            }
+            CHECK(outcome.find(hasMemory ? "fine" : "no memory for ") != std::string::npos);
+        }
+    });
+}
+
 TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
 {
     using dfb::OutputFormat;
