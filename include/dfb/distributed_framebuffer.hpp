@@ -36,6 +36,7 @@ public:
     using Communicator = typename Transport::Communicator;
     using Tile = dfb::Tile<TileOp::channels, detail::tile_size_v<TileOp>>;
     using TileView = dfb::TileView<TileOp::channels, detail::tile_size_v<TileOp>>;
+    static constexpr bool takesOrder = detail::takes_order_v<TileOp>; // whether FrameConfig::order has an effect
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 

@@ -6,6 +6,7 @@
 #include <dfb/comm/transport.hpp>
 #include <dfb/error.hpp>
 #include <dfb/exec.hpp>
+#include <dfb/tile.hpp>
 #include <dfb/tile_layout.hpp>
 #include <dfb/trace.hpp>
 #include <dfb/wire/wire_format.hpp>
@@ -114,6 +115,11 @@ struct FrameConfig {
     // within twice the time either, end() throws TransportError. 0: no limit. An input that is never sent needs no
     // time-out: the frame fails with ErrorKind::MissingInput some seconds after all ranks are in end().
     std::chrono::milliseconds timeout{0};
+    // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
+    // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same
+    // as without it. An input of a source that is not in the order makes the frame fail. Loops with a SharedWorld set
+    // it themselves where there is such an order.
+    std::shared_ptr<const SourceOrder> order{};
     // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
     // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
     // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile that misses an input

@@ -11,6 +11,7 @@
 #include <cstring>
 #include <limits>
 #include <type_traits>
+#include <vector>
 
 DFB_NAMESPACE_BEGIN
 
@@ -25,6 +26,39 @@ struct TileHeader {
     std::uint32_t source = 0; // brick id; the rank where there are no bricks
     std::uint16_t part = 0;   // to tell apart several inputs of one source
     int sample = 0;           // of the pixel, over all frames that accumulate: the index to seed with; set by start
+};
+
+// An order of the sources of inputs, from front to back.
+class SourceOrder {
+public:
+    // Throws InvalidArgument if a source comes twice.
+    explicit SourceOrder(const std::vector<std::uint32_t>& frontToBack)
+    {
+        for (const std::uint32_t source : frontToBack)
+            places_.push_back({source, static_cast<int>(places_.size())});
+        std::sort(places_.begin(), places_.end(), [](const Place& a, const Place& b) { return a.source < b.source; });
+        for (std::size_t i = 1; i < places_.size(); ++i)
+            if (places_[i].source == places_[i - 1].source)
+                detail::failArgument("source %u comes twice in an order", places_[i].source);
+    }
+
+    struct Place {
+        std::uint32_t source = 0;
+        int place = 0; // 0: in front
+    };
+    // By ascending source.
+    const std::vector<Place>& places() const noexcept { return places_; }
+
+    // Returns -1 if the source is not in the order.
+    int placeOf(std::uint32_t source) const noexcept
+    {
+        const auto at = std::lower_bound(places_.begin(), places_.end(), source,
+                                         [](const Place& p, std::uint32_t s) { return p.source < s; });
+        return at != places_.end() && at->source == source ? at->place : -1;
+    }
+
+private:
+    std::vector<Place> places_;
 };
 
 namespace detail {

@@ -31,6 +31,7 @@
 //                                                (FragmentEncoding::InPlace) or as bytes: they are read with
 //                                                forEachPixel() or a FragmentCursor, in finish(), and not through
 //                                                Fragment::color()
+//   static constexpr bool takesOrder = true;     the operation follows TileInfo::order, and does without depth then
 //   static bool opaqueHides(const TileInfo&);    whether in this frame an opaque input hides all inputs of a higher
 //                                                generation: nobody need render them, and isComplete() does not wait
 //                                                for them
@@ -72,6 +73,7 @@ struct TileInfo {
     float minTransmittance = 0;                  // a pixel that lets less through counts as opaque
     ChannelMask wanted = 0;                      // channels of the image beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
+    const SourceOrder* order = nullptr;          // FrameConfig::order; null without, and without takesOrder
 };
 
 // One row of the auxiliary channels of a finished tile; see channels.hpp for what they hold. Null: nothing anywhere.
@@ -381,6 +383,11 @@ template <class T, class = void>
 inline constexpr bool reads_in_place_v = false;
 template <class T>
 inline constexpr bool reads_in_place_v<T, std::void_t<decltype(T::readsInPlace)>> = T::readsInPlace;
+
+template <class T, class = void>
+inline constexpr bool takes_order_v = false;
+template <class T>
+inline constexpr bool takes_order_v<T, std::void_t<decltype(T::takesOrder)>> = T::takesOrder;
 
 template <class T, class = void>
 inline constexpr bool opaque_hides_v = false;

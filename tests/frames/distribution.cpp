@@ -209,10 +209,19 @@ struct Ordered {
         return first < last ? first : -1;
     }
 
-    template <class Op, class Transport>
+    // A camera of which loops do not know where its rays begin.
+    struct AnyCamera {
+        dfb::PerspectiveCamera camera;
+        auto project(const dfb::Box3& box, int width, int height) const { return camera.project(box, width, height); }
+    };
+
+    enum class Way { Sorted, Told, ToldByData, InOrder };
+
+    template <Way way, class Transport>
     static void render(const typename Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
                        std::int64_t& bytes)
     {
+        using Op = std::conditional_t<way == Way::InOrder, dfb::BasicOrderedBlend<16>, Blend>;
         const dfb::Vec3 eye{0.7f, 0.8f, 6.5f}, target{1.1f, 1.0f, 0};
         const dfb::PerspectiveCamera camera(eye, target, {0, 1, 0}, 50);
         dfb::FrameBufferConfig config;
@@ -221,7 +230,8 @@ struct Ordered {
         config.image.format = dfb::OutputFormat::RGBA32F;
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
         dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
-        const dfb::SharedWorld world(fb, replicated(boxes(), fb.rank(), fb.size(), copies));
+        const dfb::World mine = replicated(boxes(), fb.rank(), fb.size(), copies);
+        const dfb::SharedWorld world(fb, mine);
         const auto shade = [&](const dfb::Brick& b, int x, int y, float* rgba, float& depth) {
             const float t = enter(b.bounds, eye, camera.direction(x + 0.5, y + 0.5, 97, 61));
             if (t < 0 || (x + y) % 11 == static_cast<int>(b.id) % 11)
@@ -257,11 +267,15 @@ struct Ordered {
         params.background = {0.1f, 0.2f, 0.3f, 1};
         dfb::RoundRobinBricks owner{copies > 1};
         const auto frame = [&](const auto& brickSource) {
-            if constexpr (std::is_same_v<Op, dfb::BasicOrderedBlend<16>>)
+            if constexpr (way == Way::InOrder)
                 return dfb::OrderedLoop(fb, world, owner)
                     .render(camera, dfb::visibilityOrder(world, eye), brickSource, params);
-            else
+            else if constexpr (way == Way::ToldByData)
+                return dfb::DataParallelLoop(fb, mine, world).render(camera, brickSource, params);
+            else if constexpr (way == Way::Told)
                 return dfb::MixedParallelLoop(fb, world, owner).render(camera, brickSource, params);
+            else
+                return dfb::MixedParallelLoop(fb, world, owner).render(AnyCamera{camera}, brickSource, params);
         };
         const dfb::FrameReport report = inPlace ? frame(findBrick) : frame(renderBrick);
         bytes = report.bytesSent;
@@ -277,14 +291,54 @@ struct Ordered {
     {
         Result result;
         for (const int copies : {1, 2}) {
-            std::int64_t sorted = 0, ordered = 0;
+            std::int64_t sorted = 0, told = 0, toldByData = 0, ordered = 0;
             for (const bool inPlace : {true, false}) {
-                render<Blend, Transport>(communicator, result, copies, inPlace, sorted);
-                render<dfb::BasicOrderedBlend<16>, Transport>(communicator, result, copies, inPlace, ordered);
+                render<Way::Sorted, Transport>(communicator, result, copies, inPlace, sorted);
+                render<Way::Told, Transport>(communicator, result, copies, inPlace, told);
+                if (copies == 1)
+                    render<Way::ToldByData, Transport>(communicator, result, copies, inPlace, toldByData);
+                render<Way::InOrder, Transport>(communicator, result, copies, inPlace, ordered);
             }
-            result.expect(sorted == 0 || ordered < sorted, "no depth to send, and yet " + std::to_string(ordered)
-                                                               + " bytes beside " + std::to_string(sorted));
+            for (const std::int64_t without : {told, toldByData, ordered})
+                result.expect(sorted == 0 || without < sorted, "no depth to send, and yet " + std::to_string(without)
+                                                                   + " bytes beside " + std::to_string(sorted));
         }
+        return result;
+    }
+};
+
+// An order without one of the sources, or that is not the same on all ranks, fails the frame on all of them; the next
+// is right. An image with depth has it with an order, too.
+struct WrongOrder {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        scene::Scene s = scene::makeScene(3, 6);
+        s.timeout = std::chrono::milliseconds(5000); // nothing waits for it
+        BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
+        const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
+        dfb::DataParallelLoop loop(fb, world);
+        const auto frame = [&](const std::vector<std::uint32_t>& sources) {
+            dfb::FrameConfig params = paramsOf(s);
+            params.order = std::make_shared<const dfb::SourceOrder>(sources);
+            return scene::outcomeOf([&] {
+                loop.render(
+                    scene::FlatCamera(), [&](const dfb::Brick& b, auto& tile) { renderBrick(s, b, tile); }, params);
+            });
+        };
+        std::vector<std::uint32_t> all;
+        for (const scene::SceneBrick& brick : s.bricks)
+            all.push_back(brick.id);
+        std::vector<std::uint32_t> few(all.begin() + 1, all.end()), other(all.rbegin(), all.rend());
+        const auto expect = [&](const std::string& outcome, const std::string& text) {
+            result.expect(scene::has(outcome, text), outcome);
+        };
+        expect(frame(few), "which is not in the order of the frame");
+        expect(frame(all), "fine");
+        expect(frame(fb.rank() == 0 ? all : other), fb.size() == 1 ? "fine" : "FrameConfig::order is an order with");
+        expect(frame(all), "fine");
+        expect(scene::outcomeOf([] { dfb::SourceOrder({1, 2, 1}); }), "source 1 comes twice");
         return result;
     }
 };
@@ -364,6 +418,11 @@ TEST_CASE("Two ranks per brick take a third and more of the slowest rank's work,
 TEST_CASE("Bricks in a known order blend to the image of sorted ones, without depth", "[distribution]")
 {
     everywhere<frame_cases::Ordered>();
+}
+
+TEST_CASE("An order without a source, or another on each rank, fails the frame on all of them", "[distribution]")
+{
+    everywhere<frame_cases::WrongOrder>();
 }
 
 TEST_CASE("An owner that has not got the brick, or a wrong order, is an error on all ranks", "[distribution]")

@@ -141,6 +141,7 @@ public:
         info.accumulationId = params.accumulationId;
         info.wanted = TilePipeline::imageChannels(config_);
         info.background = params.background;
+        info.order = params_.order.get();
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
             pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.image.displayRank) != nullptr);

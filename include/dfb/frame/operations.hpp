@@ -19,7 +19,7 @@ struct OperationTraits {
     int tileWidth = 64, tileHeight = 64;
     ChannelMask channels = 0, neededChannels = 0;
     bool activeByDepth = false, emptyIsBackground = false, keepsState = false, endsEarly = false;
-    bool opaqueHides = false, reports = false, readsInPlace = false;
+    bool opaqueHides = false, reports = false, readsInPlace = false, takesOrder = false;
     bool hasPixelOp = false, pixelOpIsPointwise = true;
     std::string tileOp, pixelOp; // names of the types, as the compiler has them
 
@@ -36,6 +36,7 @@ struct OperationTraits {
         t.endsEarly = has_is_complete_v<TileOp>;
         t.opaqueHides = opaque_hides_v<TileOp>;
         t.readsInPlace = reads_in_place_v<TileOp>;
+        t.takesOrder = takes_order_v<TileOp>;
         t.reports = has_report_v<TileOp>;
         t.hasPixelOp = !std::is_same_v<PixelOp, NoPixelOp>;
         t.pixelOpIsPointwise = is_pointwise_v<PixelOp>;

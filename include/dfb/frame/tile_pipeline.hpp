@@ -52,14 +52,15 @@ public:
         return static_cast<ChannelMask>(config.image.aux | (config.image.depth ? depthChannel : 0));
     }
     // Returns the channels of a tile that somebody reads: the operation, the image, or the search for the nearest of
-    // several passes, which gives position and ids.
+    // several passes, which gives position and ids. `isOrdered`: the operation does without depth.
     static ChannelMask travelling(const OperationTraits& traits, const FrameBufferConfig& config,
-                                  bool comparesPasses = true)
+                                  bool comparesPasses = true, bool isOrdered = false)
     {
         const bool comparesDepths =
             comparesPasses && (config.image.aux & (positionChannel | primitiveIdChannel | instanceIdChannel)) != 0;
-        return static_cast<ChannelMask>(
-            traits.channels & (traits.neededChannels | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
+        const int needed = traits.neededChannels & ~(isOrdered ? depthChannel : 0);
+        return static_cast<ChannelMask>(traits.channels
+                                        & (needed | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
     }
 
     // The most that one message with pixels can have.
@@ -86,7 +87,9 @@ public:
         reports_ = {};
         const bool hasPasses =
             plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
-        sent_ = travelling(traits(), config_, traits().keepsState || hasPasses);
+        if (!traits().takesOrder)
+            info.order = nullptr;
+        sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
         gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
         background_ = info.background;

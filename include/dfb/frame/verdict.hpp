@@ -62,6 +62,7 @@ struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan
     std::uint64_t accumulationId = 0;
+    std::uint64_t orderHash = 0;               // 0: there is no order
     std::array<std::uint32_t, 4> background{}; // bits: so that a NaN equals itself
     std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
     std::int32_t declared = 0, allowPartial = 0;
@@ -79,6 +80,12 @@ struct FrameTerms {
             t.samplesHash = f.value();
         }
         t.accumulationId = p.accumulationId;
+        if (p.order) {
+            Fingerprint f;
+            for (const SourceOrder::Place& place : p.order->places())
+                f.add(static_cast<std::uint64_t>(place.source) << 32 | static_cast<std::uint32_t>(place.place));
+            t.orderHash = f.value();
+        }
         std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
         t.passes = p.passes;
         t.maxLayers = p.maxLayers;
@@ -121,6 +128,10 @@ struct FrameTerms {
         compare("samples", samplesHash != o.samplesHash, planText(*this), planText(o));
         number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
         number("accumulationId", accumulationId, o.accumulationId);
+        const auto orderText = [](const FrameTerms& t) {
+            return t.orderHash == 0 ? std::string("null") : "an order with hash " + numberText(t.orderHash);
+        };
+        compare("order", orderHash != o.orderHash, orderText(*this), orderText(o));
         flag("declared", declared, o.declared);
         number("timeout", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
         flag("allowPartial", allowPartial, o.allowPartial);

@@ -129,8 +129,11 @@ public:
 
     void add(Fragment&& fragment)
     {
-        if (!fragment.empty())
-            fragments_.push_back(std::move(fragment));
+        if (fragment.empty())
+            return;
+        if (info_.order && info_.order->placeOf(fragment.header().source) < 0)
+            failArgument("an input of source %u, which is not in the order of the frame", fragment.header().source);
+        fragments_.push_back(std::move(fragment));
     }
 
     // Forgets the inputs behind a generation.
@@ -170,7 +173,7 @@ private:
     Which& scratch() const
     {
         static thread_local std::array<Which, 3> ofRules;
-        return ofRules.at(static_cast<std::size_t>(rule_));
+        return ofRules.at(static_cast<std::size_t>(rule()));
     }
 
     Scratch& start();
@@ -181,7 +184,9 @@ private:
     void roundExactly(FinishedTile& out, int y, double farthest);
     const std::vector<DoubleDouble>& exactRow(int y);
 
-    BlendRule rule_;
+    BlendRule rule() const noexcept { return info_.order ? BlendRule::InOrder : rule_; }
+
+    BlendRule rule_; // without an order
     TileInfo info_;
     ChannelMask tracked_ = 0;
     // All of them, in their order.
@@ -219,13 +224,15 @@ protected:
 // Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
 // announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
 // n passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
-// order is undefined. Of `Channels` beside colour, depth and farChannel only those travel that the image has.
+// order is undefined. Of `Channels` beside colour, depth and farChannel only those travel that the image has. With
+// FrameConfig::order it blends in that order, without a sort; not with farChannel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: AlphaBlend sorts by depth");
 
 public:
     static constexpr ChannelMask neededChannels = Channels & (colorChannel | depthChannel | farChannel);
+    static constexpr bool takesOrder = (Channels & farChannel) == 0;
 };
 
 // Blends inputs in the order of their generation, front to back. Use it if one order of the bricks is right for all
@@ -343,7 +350,7 @@ DFB_COMPILED_ONCE void FragmentStore::finish(FinishedTile& out)
     static thread_local PixelSums sums;
     const int last = info_.passes - 1;
     if (last == 0 && tracked_ == 0 && !out.isDithered()) {
-        const bool isNearest = rule_ == BlendRule::Nearest;
+        const bool isNearest = rule() == BlendRule::Nearest;
         const auto isOfBytes = [&](const Fragment& f) { return f.keepsBytes() && (f.hasDepth() || !isNearest); };
         const bool areOfBytes = std::all_of(fragments_.begin(), fragments_.end(), isOfBytes);
         if (areOfBytes && isNearest)
@@ -376,6 +383,9 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
         pointers.push_back(&fragment);
     std::sort(pointers.begin(), pointers.end(), [this](const Fragment* a, const Fragment* b) {
         const TileHeader &x = a->header(), &y = b->header();
+        if (const SourceOrder* order = info_.order)
+            return std::make_tuple(x.pass, order->placeOf(x.source), x.part, x.generation)
+                   < std::make_tuple(y.pass, order->placeOf(y.source), y.part, y.generation);
         if (rule_ == BlendRule::InOrder)
             return std::tie(x.pass, x.generation, x.source) < std::tie(y.pass, y.generation, y.source);
         return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
@@ -389,7 +399,7 @@ DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
     sort(scratch.pointers);
     const std::size_t passes = static_cast<std::size_t>(info_.passes);
     while (scratch.compositors.size() < passes)
-        scratch.compositors.push_back(FragmentCompositor(rule_));
+        scratch.compositors.push_back(FragmentCompositor(rule()));
     auto next = scratch.pointers.begin();
     for (std::size_t pass = 0; pass < passes; ++pass) {
         const auto first = next;
@@ -487,7 +497,7 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
 // Whether integers are enough to blend inputs of 8 bits a channel.
 DFB_COMPILED_ONCE bool FragmentStore::hasExactLevels(OutputFormat format) const
 {
-    return rule_ == BlendRule::InOrder && fragments_.size() <= 2 && (info_.wanted & depthChannel) == 0
+    return rule() == BlendRule::InOrder && fragments_.size() <= 2 && (info_.wanted & depthChannel) == 0
            && format == OutputFormat::RGBA8 && info_.background == std::array<float, 4>{}
            && info_.minTransmittance == 0.0f;
 }
@@ -537,7 +547,7 @@ DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y
     const int width = info_.region.width();
     auto& [mean, row, pointers, compositors] = scratch<Exact>();
     if (compositors.empty())
-        compositors.push_back(FragmentCompositor(rule_));
+        compositors.push_back(FragmentCompositor(rule()));
     FragmentCompositor& compositor = compositors.front();
     mean.assign(4 * static_cast<std::size_t>(width), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);

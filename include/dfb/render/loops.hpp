@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/frame.hpp>
+#include <dfb/render/shared_world.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/render/world.hpp>
 
@@ -244,6 +245,12 @@ class DataParallelLoop {
 public:
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
+    // With the bricks of all ranks, which must outlive it, and of which `world` must have those of this rank. Where
+    // they have an order for a camera, AlphaBlend is told, sends no depth, and sorts nothing: see FrameConfig::order.
+    DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
+    {
+    }
+
     // Begins a frame, renders all bricks of the world into the tiles that they may project to, and returns the frame:
     // call end(). renderBrick(brick, tile) writes colour and depth of the pixels of tile.region into the cleared tile,
     // as far as their rays are within brick.bounds; depth grows away from the camera. Several threads call it at once,
@@ -257,6 +264,8 @@ public:
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
+        if (all_)
+            order_.template set<FrameBuffer>(params, *all_, camera);
         auto frame = fb_.begin(params, tileData, pixelData);
         bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
             renderBrick(brick, tile);
@@ -277,7 +286,9 @@ public:
 private:
     FrameBuffer& fb_;
     const World& world_;
+    const SharedWorld* all_ = nullptr;
     detail::OwnBricks bricks_;
+    detail::BrickOrder order_;
 };
 
 DFB_NAMESPACE_END

@@ -325,7 +325,7 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
 
 // A DataParallelLoop for bricks that several ranks may hold. For each tile and pass `owner` picks the rank that renders
 // the brick. The image is that of data-parallel rendering, bit for bit, whichever ranks it picks. Framebuffer, world
-// and owner must outlive it.
+// and owner must outlive it. AlphaBlend sorts no pixels where the bricks have an order: see FrameConfig::order.
 template <class FrameBuffer, class TileBrickOwner>
 class MixedParallelLoop {
 public:
@@ -342,6 +342,7 @@ public:
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
+        order_.template set<FrameBuffer>(params, world_, camera);
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
             detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
@@ -384,6 +385,7 @@ private:
     const SharedWorld& world_;
     TileBrickOwner& owner_;
     detail::MixedWork work_;
+    detail::BrickOrder order_;
     std::vector<TileInput> inputs_; // that this rank declares
 };
 

@@ -4,6 +4,7 @@
 
 #include <dfb/render/cameras.hpp>
 #include <dfb/render/visibility.hpp>
+#include <dfb/tile.hpp>
 
 #include <algorithm>
 #include <cmath>
@@ -11,6 +12,8 @@
 #include <cstdint>
 #include <cstring>
 #include <limits>
+#include <memory>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -87,56 +90,125 @@ private:
 
 namespace detail {
 
-// `isParallel`: axes along which no ray goes, so that no ray crosses a plane between two boxes there.
-inline std::vector<int> frontToBack(const SharedWorld& world, const Vec3& eye, const bool (&isParallel)[3])
+// Where all rays of a camera begin: in its eye. Or, with parallel rays, infinitely far away, along the axes along which
+// they go.
+struct RayOrigin {
+    Vec3 eye;
+    bool isAcross[3] = {false, false, false}; // axes along which no ray goes: none crosses a plane between boxes there
+};
+inline RayOrigin rayOrigin(const PerspectiveCamera& camera) { return {camera.eye()}; }
+inline RayOrigin rayOrigin(const MatrixCamera& camera)
 {
-    const auto& bricks = world.bricks();
-    const std::size_t n = bricks.size();
+    if (!camera.isOrthographic())
+        return {camera.eye()};
+    const Vec3 d = camera.ray(0, 0, 1, 1).direction;
+    const auto from = [](float direction) { return std::copysign(std::numeric_limits<float>::infinity(), -direction); };
+    return {{from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0}};
+}
+
+// Finds the order of bricks. Keeps its memory.
+class FrontToBack {
+public:
+    // Returns null, or why there is no order.
+    const char* find(const SharedWorld& world, const RayOrigin& origin)
+    {
+        const auto& bricks = world.bricks();
+        const auto compare = [&](std::size_t a, std::size_t b) {
+            return before(bricks[a].brick.bounds, bricks[b].brick.bounds, origin);
+        };
+        order_.clear();
+        inFront_.assign(bricks.size(), 0);
+        for (std::size_t a = 0; a < bricks.size(); ++a)
+            for (std::size_t b = a + 1; b < bricks.size(); ++b) {
+                const Before which = compare(a, b);
+                if (which == Before::Overlaps)
+                    return "two bricks overlap: there is no order in which they could be blended";
+                if (which != Before::Either)
+                    ++inFront_[which == Before::First ? b : a];
+            }
+        for (std::size_t i = 0; i < bricks.size(); ++i)
+            if (inFront_[i] == 0)
+                order_.push_back(static_cast<int>(i));
+        for (std::size_t i = 0; i < order_.size(); ++i)
+            for (std::size_t b = 0; b < bricks.size(); ++b)
+                if (inFront_[b] > 0 && compare(static_cast<std::size_t>(order_[i]), b) == Before::First
+                    && --inFront_[b] == 0)
+                    order_.push_back(static_cast<int>(b));
+        return order_.size() == bricks.size()
+                   ? nullptr
+                   : "the bricks are in front of each other in a circle: no order is right for all pixels";
+    }
+
+    // By their place in SharedWorld::bricks().
+    const std::vector<int>& order() const noexcept { return order_; }
+
+private:
+    enum class Before { Either, First, Second, Overlaps };
+
     // A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
-    enum class Before { Either, First, Second };
-    const auto compare = [&](const Box3& a, const Box3& b) {
+    static Before before(const Box3& a, const Box3& b, const RayOrigin& origin)
+    {
         bool apart = false, first = false, second = false;
-        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e, bool parallel) {
+        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e, bool isAcross) {
             if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
                 apart = true;
-                first = first || parallel || e <= bLower;
-                second = second || parallel || e >= aUpper;
+                first = first || isAcross || e <= bLower;
+                second = second || isAcross || e >= aUpper;
             } else if (bUpper <= aLower) {
                 apart = true;
-                first = first || parallel || e >= bUpper;
-                second = second || parallel || e <= aLower;
+                first = first || isAcross || e >= bUpper;
+                second = second || isAcross || e <= aLower;
             }
         };
-        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x, isParallel[0]);
-        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y, isParallel[1]);
-        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z, isParallel[2]);
+        const Vec3& eye = origin.eye;
+        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x, origin.isAcross[0]);
+        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y, origin.isAcross[1]);
+        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z, origin.isAcross[2]);
         if (!apart)
-            failArgument("two bricks overlap: there is no order in which they could be blended");
+            return Before::Overlaps;
         return first == second ? Before::Either : first ? Before::First : Before::Second;
-    };
-    std::vector<std::vector<int>> behind(n);
-    std::vector<int> inFront(n, 0);
-    for (std::size_t a = 0; a < n; ++a)
-        for (std::size_t b = a + 1; b < n; ++b) {
-            const Before before = compare(bricks[a].brick.bounds, bricks[b].brick.bounds);
-            if (before == Before::Either)
-                continue;
-            const std::size_t front = before == Before::First ? a : b, back = before == Before::First ? b : a;
-            behind[front].push_back(static_cast<int>(back));
-            ++inFront[back];
-        }
-    std::vector<int> order;
-    for (std::size_t i = 0; i < n; ++i)
-        if (inFront[i] == 0)
-            order.push_back(static_cast<int>(i));
-    for (std::size_t i = 0; i < order.size(); ++i)
-        for (const int next : behind[static_cast<std::size_t>(order[i])])
-            if (--inFront[static_cast<std::size_t>(next)] == 0)
-                order.push_back(next);
-    if (order.size() != n)
-        failArgument("the bricks are in front of each other in a circle: no order is right for all pixels");
-    return order;
+    }
+
+    std::vector<int> order_, inFront_;
+};
+
+inline std::vector<int> visibilityOrder(const SharedWorld& world, const RayOrigin& origin)
+{
+    FrontToBack bricks;
+    if (const char* why = bricks.find(world, origin))
+        failArgument("%s", why);
+    return bricks.order();
 }
+
+// Gives FrameConfig::order to the frames of a loop.
+class BrickOrder {
+public:
+    // Sets config.order if it is not set, the operation takes an order, the camera is one whose rays all begin in one
+    // point or are parallel, and the bricks have an order. Takes time with the square of their number: not for more
+    // than 1024.
+    template <class FrameBuffer, class Camera>
+    void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
+    {
+        if constexpr (FrameBuffer::takesOrder
+                      && (std::is_same_v<Camera, PerspectiveCamera> || std::is_same_v<Camera, MatrixCamera>)) {
+            if (config.order || world.bricks().size() > 1024 || bricks_.find(world, rayOrigin(camera)))
+                return;
+            sources_.clear();
+            for (const int brick : bricks_.order())
+                sources_.push_back(world.bricks()[static_cast<std::size_t>(brick)].brick.id);
+            if (!order_ || sources_ != last_) {
+                order_ = std::make_shared<const SourceOrder>(sources_);
+                last_ = sources_;
+            }
+            config.order = order_;
+        }
+    }
+
+private:
+    FrontToBack bricks_;
+    std::vector<std::uint32_t> sources_, last_;
+    std::shared_ptr<const SourceOrder> order_; // of last_
+};
 
 } // namespace detail
 
@@ -145,17 +217,13 @@ inline std::vector<int> frontToBack(const SharedWorld& world, const Vec3& eye, c
 // or if there is no such order: three boxes can each be in front of the next.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
 {
-    return detail::frontToBack(world, eye, {false, false, false});
+    return detail::visibilityOrder(world, detail::RayOrigin{eye});
 }
 
 // Returns this order for all rays of a camera, also of an orthographic one. Throws likewise.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const MatrixCamera& camera)
 {
-    if (!camera.isOrthographic())
-        return visibilityOrder(world, camera.eye());
-    const Vec3 d = camera.ray(0, 0, 1, 1).direction;
-    const auto from = [](float direction) { return std::copysign(std::numeric_limits<float>::infinity(), -direction); };
-    return detail::frontToBack(world, {from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0});
+    return detail::visibilityOrder(world, detail::rayOrigin(camera));
 }
 
 DFB_NAMESPACE_END
