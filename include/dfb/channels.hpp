@@ -90,13 +90,4 @@ inline std::uint32_t* idsOf(std::byte* plane) noexcept { return reinterpret_cast
 
 } // namespace detail
 
-// Words of 4 bytes that the channels of a mask take per pixel.
-constexpr int wordsPerPixel(ChannelMask channels) noexcept
-{
-    int words = 0;
-    for (std::size_t c = 0; c < detail::channelCount; ++c)
-        words += detail::hasChannel(channels, c) ? detail::channelWords[c] : 0;
-    return words;
-}
-
 DFB_NAMESPACE_END

@@ -344,14 +344,9 @@ private:
         const Region region = table_.layout().region(tile);
         const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
         const auto channels = static_cast<ChannelMask>(colorChannel | imageChannels(config_));
-        Buffer floats = pool_->acquire(width * height * 4 * static_cast<std::size_t>(wordsPerPixel(channels)));
-        Planes planes;
-        std::byte* plane = floats.data();
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (hasChannel(channels, c)) {
-                planes.at[c] = plane;
-                plane += 4 * width * height * static_cast<std::size_t>(channelWords[c]);
-            }
+        const PlaneFormat format(channels, sizeof(float));
+        Buffer floats = pool_->acquire(width * height * format.pixelBytes());
+        const Planes planes = format.planesAt(floats.data(), width * height);
         FinishedTile out(region, OutputFormat::RGBA32F, planes, width);
         table_.finish(tile, out);
         PixelTile pixels;

@@ -5,7 +5,6 @@
 #include <dfb/ops/sort_last.hpp>
 
 #include <algorithm>
-#include <array>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -13,52 +12,27 @@
 #include <type_traits>
 #include <vector>
 
-// Moments: mean and variance of pixels, in a form whose partial results merge in any tree.
-
 DFB_NAMESPACE_BEGIN
 
-// Of samples of 4 channels: their number, their sum, and the sum over the channels of squared deviations from the mean
-// (M2), merged by the pairwise formula of Chan, Golub and LeVeque (1979). For n samples that are floats the mean is
-// within n * 2^-53 of exact, relative to the mean of |x|: for 10^7 of them far below the last bit of a float. M2 is
-// free of cancellation, however large the mean is beside the spread.
-struct Moments {
-    std::int64_t count = 0;
-    std::array<double, 4> sum{};
-    double m2 = 0;
+namespace detail {
 
-    // By how much M2 of `n` samples of this sum grows by `k` more that have a sum and no spread of their own.
-    static double growth(std::int64_t n, const double* sum, std::int64_t k, const double* other) noexcept
-    {
-        if (n == 0 || k == 0)
-            return 0;
-        const double a = static_cast<double>(n), b = static_cast<double>(k);
-        double squares = 0;
-        for (std::size_t c = 0; c < 4; ++c) {
-            const double difference = other[c] / b - sum[c] / a;
-            squares += difference * difference;
-        }
-        return squares * (a * b / (a + b));
+// By how much M2, the sum over 4 channels of squared deviations from the mean, grows when `sample` joins `n` samples
+// that have this sum: the pairwise formula of Chan, Golub and LeVeque (1979), which is free of cancellation, however
+// large the mean is beside the spread.
+inline double growthOfM2(std::int64_t n, const double* sum, const double* sample) noexcept
+{
+    if (n == 0)
+        return 0;
+    const auto count = static_cast<double>(n);
+    double squares = 0;
+    for (std::size_t c = 0; c < 4; ++c) {
+        const double difference = sample[c] - sum[c] / count;
+        squares += difference * difference;
     }
+    return squares * (count / (count + 1));
+}
 
-    void add(const std::array<double, 4>& sample) noexcept { merge({1, sample, 0}); }
-
-    void merge(const Moments& other) noexcept
-    {
-        m2 += other.m2 + growth(count, sum.data(), other.count, other.sum.data());
-        for (std::size_t c = 0; c < 4; ++c)
-            sum[c] += other.sum[c];
-        count += other.count;
-    }
-
-    double mean(std::size_t channel) const noexcept
-    {
-        return count > 0 ? sum[channel] / static_cast<double>(count) : 0;
-    }
-    // Mean over the channels of the variance of the samples, unbiased; 0 for fewer than 2.
-    double variance() const noexcept { return count > 1 ? m2 / (4 * static_cast<double>(count - 1)) : 0; }
-    // The variance of the mean: the square of its standard error.
-    double varianceOfMean() const noexcept { return count > 1 ? variance() / static_cast<double>(count) : 0; }
-};
+} // namespace detail
 
 // `Base`: AlphaBlend, OrderedBlend, DepthComposite or ImageParallel, also those with other sizes and channels. The
 // image is the mean of all samples since FrameConfig::accumulationId changed, a frame failed, or a tile began with
@@ -110,7 +84,7 @@ public:
         const auto passDone = [&](int y, int pass, const CompositeRow& row) {
             const std::size_t first = static_cast<std::size_t>(y) * width;
             for (std::size_t x = 0; x < width; ++x)
-                m2_[first + x] += Moments::growth(samples_ + pass, sums_.rgba(first + x), 1, row.rgba.data() + 4 * x);
+                m2_[first + x] += detail::growthOfM2(samples_ + pass, sums_.rgba(first + x), row.rgba.data() + 4 * x);
             sums_.add(first, row);
         };
         base_.compositePasses(passDone);
@@ -162,7 +136,7 @@ private:
     std::uint64_t accumulationId_ = 0;
     std::int64_t samples_ = 0;
     detail::PixelSums sums_;
-    std::vector<double> m2_; // per pixel, see Moments
+    std::vector<double> m2_; // per pixel, see growthOfM2()
 };
 
 static_assert(is_tile_op_v<Progressive<AlphaBlend>>);
