@@ -11,7 +11,7 @@ copy=$source/build/icet-faults
 adapter=$copy/examples/adapters/icet
 cases=200
 [ "${1:-}" != --cases ] || cases=$2
-if [ ! -d "$source/build/peers/icet" ]; then
+if [ ! -d "$source/build/peers/icet/lib" ]; then
     echo "faults.sh: SKIPPED: there is no IceT; sh bench/get_icet.sh gets it" >&2
     exit 77
 fi
@@ -26,10 +26,12 @@ build() {
     cmake --build "$copy/build" --target dfb_icet test_icet_differential >"$copy/build.log" 2>&1
 }
 
+icet=$(find "$source/build/peers/icet/lib" -name '*IceTCore*.so' | head -n 1)
+
 # differential: the test's output in $copy/test.log
 differential() {
-    timeout 300 mpiexec -n 3 "$copy/build/tests/icet/test_icet_differential" "$(find "$source/build/peers/icet/lib" -name '*IceTCore*.so' | head -n 1)" \
-        "$copy/build/examples/adapters/icet/libdfb_icet.so" --cases "$cases" >"$copy/test.log" 2>&1
+    timeout 300 mpiexec -n 3 "$copy/build/tests/icet/test_icet_differential" "$icet" \
+        "$copy/build/examples/adapters/icet/libdfb_icet.so" --cases "$cases" </dev/null >"$copy/test.log" 2>&1
 }
 
 build
