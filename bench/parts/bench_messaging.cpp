@@ -291,7 +291,7 @@ public:
             header.number = 1;
             Buffer message = connection_->pool()->acquire(sizeof header + stream_.byteCount);
             std::memcpy(message.data(), &header, sizeof header);
-            mailbox_.sendWithCredit(1, std::move(message));
+            mailbox_.send(1, std::move(message));
             mailbox_.waitForRoom([] { return false; }, std::chrono::milliseconds(0));
         }
     }

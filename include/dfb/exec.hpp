@@ -142,8 +142,8 @@ public:
     int concurrency() const noexcept override { return static_cast<int>(threads_.size()); }
     bool hasWorkers() const noexcept override { return resting_ == 0; }
 
-    // The workers rest from now on, or no more; as often false as true. Meanwhile loops and tasks run on threads that
-    // call, as with a CallerExecutor. Any thread.
+    // Suspends (true) or resumes (false) the workers. Calls nest and must balance. Meanwhile loops and tasks run on
+    // threads that call, as with a CallerExecutor. Any thread.
     void rest(bool more)
     {
         {

@@ -1,5 +1,5 @@
-// Levels: rows of linear values become 8-bit levels, linear or sRGB, rounded as if each were looked at alone and
-// exactly; and how far the farthest value was from where its level ends, so that more digits can be asked for.
+// Levels: rows of linear values become 8-bit levels, linear or sRGB, correctly rounded; and how near any value came to
+// a tie, so that the caller can decide it with more digits.
 #pragma once
 
 #include <dfb/base/cpu.hpp>

@@ -152,14 +152,13 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         detail::takeNearestPlain(row.depth.data() + x, count, layer.color, layer.depth); // often one pixel
 }
 
-// Makes those of `count` pixels from x on opaque that count as opaque. True if no layer behind any of them can be seen.
-inline bool closeOpaque(CompositeRow& row, int x, int count)
+// Makes those of `count` pixels from x on opaque that count as opaque.
+inline void closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
     if (row.minTransmittance > 0)
         for (int i = 0; i < count; ++i)
             t[i] = t[i] < row.minTransmittance ? 0.0 : t[i];
-    return t[0] == 0.0 && std::all_of(t, t + count, [](double value) { return value == 0.0; });
 }
 
 // Blends the auxiliary channels that `row` has. Call it before over(), since it needs the alpha from before. `aux`: of

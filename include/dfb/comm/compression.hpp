@@ -12,12 +12,10 @@
 #include <utility>
 #include <vector>
 
-// Codec: the contract of a lossless compressor for message payloads. A flag in each message tells whether it
-// was used: a payload that does not get smaller travels as it is.
-
 DFB_NAMESPACE_BEGIN
 
-// Stateless: all members are called from several threads at once.
+// A lossless compressor for message payloads. A payload that does not get smaller travels as it is. Stateless: all
+// members are called from several threads at once.
 class Codec {
 public:
     virtual ~Codec() = default;

@@ -288,7 +288,7 @@ public:
     bool helpProgress() { return progress_.tryPoll(); }
     bool hasProgressThread() const noexcept { return progress_.running(); }
 
-    // Whether a thread that waits must call poll() itself; and whether a progress thread does.
+    // Whether a thread that waits must call poll() itself.
     bool needsCaller() const noexcept { return link_->needsPolling() && progress_.needsCaller(); }
     bool mayPoll() const noexcept { return link_->mayPoll(); }
     bool quiet() const { return link_->quiet(); }
@@ -316,8 +316,7 @@ public:
             return false;
         detail::ByteWriter body;
         put(body, error);
-        detail::MessageHeader header;
-        header.kind = detail::MessageKind::Failure;
+        const auto header = detail::MessageHeader::of(detail::MessageKind::Failure);
         for (int other = 0; other < size(); ++other)
             if (other != rank())
                 send(other, detail::makeMessage(*pool_, header, body.bytes().data(), body.bytes().size()));
@@ -478,9 +477,7 @@ private:
 
     void sendSign(int other, detail::MessageKind kind)
     {
-        detail::MessageHeader header;
-        header.kind = kind;
-        send(other, detail::makeMessage(*pool_, header, nullptr, 0));
+        send(other, detail::makeMessage(*pool_, detail::MessageHeader::of(kind), nullptr, 0));
     }
 
     // Between two polls, by the thread that polls.

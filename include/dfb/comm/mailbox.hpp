@@ -114,23 +114,25 @@ public:
     }
     FlowControl& flow() noexcept { return flow_; }
 
-    // Sends a small message at once, without credit; also to this rank itself. Any thread.
+    // Sends a message, also to this rank itself. Any thread; never blocks. One with pixels needs credit of its
+    // receiver, and is kept here until it has it.
     void send(int destination, Buffer&& message)
     {
+        const auto header = loadAs<MessageHeader>(message.data());
         if (destination == rank()) {
-            enqueue(destination, loadAs<MessageHeader>(message.data()), std::move(message));
+            enqueue(destination, header, std::move(message));
             return;
         }
-        countSent(message);
-        pass(destination, std::move(message));
+        countSent(message); // now, so that a frame's figures have it
+        if (needsCredit(header.kind))
+            flow_.send(destination, std::move(message));
+        else
+            pass(destination, std::move(message));
     }
 
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
     {
-        MessageHeader header;
-        header.kind = kind;
-        header.receiver = address_;
-        header.number = number;
+        const auto header = MessageHeader::of(kind, address_, number);
         send(destination, makeMessage(*connection_->pool(), header, body.data(), body.size()));
     }
 
@@ -143,16 +145,6 @@ public:
         send(destination, kind, number, Bytes(first, first + sizeof body));
     }
 
-    // Sends a message with pixels. It needs credit of its receiver, and is kept here until it has it. Never blocks.
-    void sendWithCredit(int destination, Buffer&& message)
-    {
-        if (destination == rank()) {
-            send(destination, std::move(message));
-            return;
-        }
-        countSent(message); // now, so that a frame's figures have it
-        flow_.send(destination, std::move(message));
-    }
     static bool needsCredit(MessageKind kind)
     {
         return kind == MessageKind::Fragment || kind == MessageKind::FinishedTiles;

@@ -132,6 +132,15 @@ struct MessageHeader {
     std::int64_t number = 0;    // of the frame; of the reduction
     std::uint32_t sequence = 0; // running, per sender and destination; set by the connection, as is the next
     std::uint32_t checksum = 0; // CRC-32C of the message with 0 in this place; 0: there is none
+
+    static MessageHeader of(MessageKind kind, std::uint32_t receiver = 0, std::int64_t number = 0)
+    {
+        MessageHeader header;
+        header.kind = kind;
+        header.receiver = receiver;
+        header.number = number;
+        return header;
+    }
 };
 static_assert(sizeof(MessageHeader) == 24 && std::is_trivially_copyable_v<MessageHeader>);
 

@@ -153,17 +153,17 @@ public:
 
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
-    // Of this node, by the CPU masks of the threads that made their transports.
+    // How many ranks of this node may run on this rank's processors (CPU affinity when the transports were made).
     int sharingRanks() const noexcept { return sharingRanks_; }
     // Whether messages to that rank stay where they are, in memory that it sees.
     bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
-    // Where a block of the pool lies for those ranks, -1: nowhere; and the block of another rank that lies there, null:
-    // this rank does not see it. It does as long as this lives.
+    // Where a block of the pool lies for ranks that see it; -1: nowhere.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         static_assert(detail::NodeMemory::alignment == bytesOfPlace);
         return memory_ && memory_->holds(block) ? memory_->placeOf(block) : -1;
     }
+    // The block of another rank that lies there, as long as this lives; null: this rank does not see it.
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
     {
         const auto& memory = peers_[static_cast<std::size_t>(other)].itsMemory;

@@ -1,6 +1,6 @@
-// Packets: several small messages to one rank as one message of the network. Each stands behind a record; a large
-// message leaves its record alone: as an announcement, if it travels by itself, or with the place where it lies, if the
-// receiver sees that.
+// Packets: several small messages to one rank as one message of the network. Each stands behind a record. A large
+// message is only announced: its record says that it follows as a message of its own, or where it lies in memory that
+// the receiver sees.
 #pragma once
 
 #include <dfb/buffer.hpp>

@@ -1,6 +1,6 @@
 // ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a
 // few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
-// In between it calls objects that look at the clock.
+// Between polls it calls a function for work by the clock, such as the heartbeat.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -71,8 +71,8 @@ public:
     }
     bool expectsMessages() const noexcept { return expecting_; }
 
-    // A thread that calls tryPoll() all the time stands in for this one from now on, or no more; as often false as
-    // true. Meanwhile this one polls every 2 ms. From any thread.
+    // Begins (true) or ends (false) that a thread which calls tryPoll() all the time stands in for this one, which
+    // polls every 2 ms meanwhile. Calls nest and must balance. From any thread.
     void standIn(bool more)
     {
         if (more) {

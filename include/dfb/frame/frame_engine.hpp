@@ -130,7 +130,6 @@ public:
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         params_ = params;
-        terms_ = FrameTerms::of(params, rank());
         declarations_.newFrame(!lastFailed); // after one that failed, owners may know of different ones
 
         TileInfo info;
@@ -151,7 +150,7 @@ public:
         jobs_->newFrame();
         if (traits().opaqueHides)
             hidden_.newFrame(layout().tileCount());
-        outcome_->newFrame({terms_, params.declared, params.allowPartial, params.timeout, config_.quiet});
+        outcome_->newFrame(FrameTerms::of(params, rank()), config_.quiet);
         inputsSent_ = 0;
         bytesBefore_ = mailbox_->bytesSent();
         messagesBefore_ = mailbox_->messagesSent();
@@ -191,7 +190,7 @@ public:
         ++inputsSent_;
         if (owner != rank()) {
             Buffer message = isInPlace ? encodePlace(tile, owner) : Buffer();
-            mailbox_->sendWithCredit(owner, message.empty() ? encode(tile, owner) : std::move(message));
+            mailbox_->send(owner, message.empty() ? encode(tile, owner) : std::move(message));
             waitForRoom();
         } else if (open_.enter(tile.frame)) {
             const OpenFrame::Inside inside(open_);
@@ -449,8 +448,8 @@ private:
         add(TraceEvent::Kind::Verdict, *votedAt_, outcome_->decidedAt().value_or(end));
     }
 
-    // Lets messages of the frame in. `tiles`: that this rank expects to finish, beside those of `withoutSamples`, of
-    // which the pixel operation sees the pixels that are there.
+    // Lets messages of the frame in. `tiles`: how many this rank expects to finish. `withoutSamples`: tiles without
+    // samples in this frame that the pixel operation still has to see.
     void open(const std::exception_ptr& userError, std::int64_t tiles, const std::vector<int>& withoutSamples)
     {
         auto& early = open_.open();
@@ -502,12 +501,9 @@ private:
 
     void sendToDisplay(Buffer&& message)
     {
-        if (mailbox_->needsCredit(loadAs<MessageHeader>(message.data()).kind)) {
-            if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
-                compression_->sent(config_.image.displayRank, raw, message.size());
-            mailbox_->sendWithCredit(config_.image.displayRank, std::move(message));
-        } else
-            mailbox_->send(config_.image.displayRank, std::move(message));
+        if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
+            compression_->sent(config_.image.displayRank, raw, message.size());
+        mailbox_->send(config_.image.displayRank, std::move(message));
     }
 
     // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
@@ -822,7 +818,6 @@ private:
     std::unique_ptr<FrameOutcome> outcome_;
     std::optional<JobExchange> jobs_;
     FrameConfig params_;
-    FrameTerms terms_; // of params_
     Accumulation accumulation_;
     FrameFigures figures_;
     std::optional<Compression> compression_;

@@ -35,21 +35,14 @@ public:
     {
     }
 
-    struct Terms {
-        FrameTerms terms; // equal on all ranks
-        bool declared = false, allowPartial = false;
-        std::chrono::milliseconds timeout{0}; // 0: none
-        std::chrono::milliseconds quiet{1};   // until the first look whether anything is under way
-    };
-
-    // Before the frame is opened.
-    void newFrame(const Terms& terms)
+    // Before the frame is opened. `quiet`: until the first look whether anything is under way.
+    void newFrame(const FrameTerms& terms, std::chrono::milliseconds quiet)
     {
         terms_ = terms;
         verdict_.reset();
         decidedAt_.reset();
         isEnding_ = false;
-        quiescence_.newFrame(terms.quiet);
+        quiescence_.newFrame(quiet);
     }
 
     // The frame has failed on some rank, or the transport has.
@@ -136,7 +129,7 @@ public:
         if (mailbox_.failed() || !frame_.vote([this] { return isDone(); }, [this] { return mayVote(); }))
             return;
         Verdict mine;
-        mine.terms = terms_.terms;
+        mine.terms = terms_;
         mine.error = frame_.reason();
         addFigures_(mine);
         if (terms_.allowPartial)
@@ -170,10 +163,10 @@ public:
         const bool isDecided = frame_.state() == FrameState::Decided || mailbox_.failed();
         if (!isDecided)
             lookInTime(now);
-        const bool isLate = terms_.timeout.count() > 0 && now >= endedAt_ + terms_.timeout;
+        const bool isLate = terms_.timeoutMs > 0 && now >= endedAt_ + terms_.timeout();
         if (!isDecided && isLate && !failed())
             fail(missing(ErrorKind::TimedOut));
-        return isDecided || (isLate && now >= endedAt_ + 2 * terms_.timeout);
+        return isDecided || (isLate && now >= endedAt_ + 2 * terms_.timeout());
     }
 
     // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
@@ -183,7 +176,7 @@ public:
         Verdict verdict;
         try {
             beginEnd();
-            verdict = terms_.timeout.count() > 0 ? waitInTime() : waitWithoutLimit();
+            verdict = terms_.timeoutMs > 0 ? waitInTime() : waitWithoutLimit();
             if (!verdict.error)
                 verdict.error = verdict.strayInputs();
             if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
@@ -235,7 +228,7 @@ private:
     {
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
                && kind != ErrorKind::Disagreement
-               && (kind != ErrorKind::MalformedMessage || terms_.timeout.count() > 0); // its content is waited for
+               && (kind != ErrorKind::MalformedMessage || terms_.timeoutMs > 0); // its content is waited for
     }
 
     void tellOthers(const ErrorInfo& info)
@@ -276,13 +269,13 @@ private:
                 const int tileCount = tiles_.table().layout().tileCount();
                 if (!verdict.fits(tileCount))
                     failMalformed("a verdict on tiles that there are not", tileCount - 1);
-                differs = isUp && !verdict.terms.difference(terms_.terms).empty();
+                differs = isUp && !verdict.terms.difference(terms_).empty();
             } else if (scope == AllDeclared) {
                 if (!mailbox_.bytesOf(message).empty())
                     failMalformed("a declaration's reduction that carries something");
                 differs = isUp && !terms_.declared;
             } else if (scope == Quiet) {
-                differs = !Round::from(mailbox_.bytesOf(message)).terms.difference(terms_.terms).empty();
+                differs = !Round::from(mailbox_.bytesOf(message)).terms.difference(terms_).empty();
             } else {
                 failMalformed("a reduction of a kind that there is not", FrameVerdict, scope);
             }
@@ -319,13 +312,13 @@ private:
     // agree on that.
     Verdict waitInTime()
     {
-        if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout))
+        if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout()))
             return *verdict;
         if (!failed())
             fail(missing(ErrorKind::TimedOut));
-        if (const Verdict* verdict = wait(endedAt_ + 2 * terms_.timeout))
+        if (const Verdict* verdict = wait(endedAt_ + 2 * terms_.timeout()))
             return *verdict;
-        giveUpVerdict(2 * terms_.timeout);
+        giveUpVerdict(2 * terms_.timeout());
     }
 
     // The verdict, however long others render. Only where a damaged message was noticed, which may have been part of
@@ -370,10 +363,10 @@ private:
     void waitForFinishedTiles()
     {
         const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
-        const bool hasLimit = terms_.timeout.count() > 0;
+        const bool hasLimit = terms_.timeoutMs > 0;
         if (!hasLimit) // a message that could not be read does not come again
             mailbox_.wait([&] { return areThere() || frame_.isDamaged(); });
-        mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout : untilAsked));
+        mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout() : untilAsked));
     }
 
     // The message of one round of quiescence_. Ranks that were given different parameters could wait for each other for
@@ -414,7 +407,7 @@ private:
         if (!counts || !quiescence_.mayEnter())
             return;
         const auto isWaiting = [this] { return !isDone() && !failed(); };
-        const Round mine{terms_.terms, {*counts, isWaiting() ? 1u : 0u}};
+        const Round mine{terms_, {*counts, isWaiting() ? 1u : 0u}};
         quiescence_.enter();
         mailbox_.reductions().enter({Quiet, frame_.number()}, mine.bytes(), Round::combine,
                                     [this, isWaiting](const Bytes& all) {
@@ -439,10 +432,7 @@ private:
             else
                 info.message = "tiles that have all their inputs are still being finished";
         } else if (!tiles_.gather().complete()) {
-            info.message = tiles_.gather().missing();
-            info.from = tiles_.gather().firstMissing();
-            info.expected = tiles_.gather().senderCount();
-            info.got = tiles_.gather().ranksComplete();
+            info = tiles_.gather().missing();
         } else {
             info.message = "not all ranks have ended this frame";
             addWaitedFor(info, verdictKey());
@@ -488,7 +478,7 @@ private:
     OpenFrame& frame_;
     TilePipeline& tiles_;
     std::function<void(Verdict&)> addFigures_;
-    Terms terms_;
+    FrameTerms terms_;
     bool lastFailed_ = false;
     std::optional<Verdict> verdict_; // set once, before the frame is Decided
     std::optional<Clock::time_point> decidedAt_;

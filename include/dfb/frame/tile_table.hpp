@@ -106,7 +106,7 @@ public:
                 series.next = s.first + s.count;
             }
     }
-    // Why the tile of an arrival is spoilt is known. Whether it is of all: before that the frame must not end.
+    // Call it once the error of a spoilt tile has been reported. A frame may end only when isSaid(): all have been.
     void saidWhy() { --unsaid_; }
     bool isSaid() const noexcept { return unsaid_ == 0; }
 

@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <array>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -95,6 +96,8 @@ struct FrameTerms {
         t.rank = rank;
         return t;
     }
+
+    std::chrono::milliseconds timeout() const { return std::chrono::milliseconds(timeoutMs); } // 0: none
 
     // The first field that is not the same in both, with its values and ranks; "" if they are alike.
     std::string difference(const FrameTerms& o) const
@@ -290,7 +293,7 @@ struct Verdict {
         return all;
     }
 
-    // `what`: which parameters differ, or "" if only the hashes are known to differ.
+    // `what`: which parameters differ, or "" if that is not known.
     static ErrorInfo disagreement(const std::string& what = "")
     {
         return errorInfo(ErrorKind::Disagreement, what.empty() ? "the frame was begun with different parameters"
@@ -404,7 +407,8 @@ public:
     }
 
 private:
-    // One per key. Of values of one key, too, the order must not be that of the threads: they are added.
+    // Sorts by key, then value, and adds up equal keys: so sums do not depend on the order in which threads added
+    // values.
     static std::vector<Figure> sums(std::vector<Figure> figures)
     {
         std::sort(figures.begin(), figures.end(),

@@ -74,7 +74,7 @@ public:
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
 
-    // Its pixels are those of a frame only as imageFrame() says: -1: of none.
+    // Valid only while imageFrame() >= 0, which is the frame that it shows.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
     bool enabled() const noexcept { return config_.format != OutputFormat::None; }
@@ -134,6 +134,8 @@ public:
     // The bytes that a message with finished tiles had before a codec was to make it smaller; else 0.
     static std::size_t rawBytesOf(const Buffer& message)
     {
+        if (loadAs<MessageHeader>(message.data()).kind != MessageKind::FinishedTiles)
+            return 0;
         const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
         return h.isTried ? prefix + h.rawBytes : 0;
     }
@@ -301,7 +303,7 @@ public:
                     last = batch_;
                 batch_.reset();
             }
-            const MessageHeader header = messageHeader(MessageKind::TilesDone);
+            const auto header = MessageHeader::of(MessageKind::TilesDone, config_.receiver, frame_);
             done = pool_->acquire(sizeof header + sizeof sent_ + sizeof(std::int32_t) * placed_.size());
             std::memcpy(done.data(), &header, sizeof header);
             std::memcpy(done.data() + sizeof header, &sent_, sizeof sent_);
@@ -396,32 +398,24 @@ public:
     // All tiles of the other ranks are in the image.
     bool complete() const { return !displays() || ranksComplete_ == senderCount(); }
 
-    // How many ranks have tiles for this one, of how many all are here, and in words whose have not come.
-    int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
-    int ranksComplete() const noexcept { return ranksComplete_; }
-    std::string missing() const
+    // Names the ranks whose tiles have not come; `expected` and `got` count ranks.
+    ErrorInfo missing() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        std::string text;
+        ErrorInfo info;
         for (std::size_t r = 0; r < tilesOf_.size(); ++r) {
             if (!isMissing(r))
                 continue;
             const TilesOf& its = tilesOf_[r];
-            text += text.empty() ? "finished tiles have not come from rank " : ", rank ";
-            text += its.announced ? printed("%zu (%d of %d)", r, its.received.tiles, its.announced->tiles)
-                                  : printed("%zu (%d of all)", r, its.received.tiles);
+            info.message += info.message.empty() ? "finished tiles have not come from rank " : ", rank ";
+            info.message += its.announced ? printed("%zu (%d of %d)", r, its.received.tiles, its.announced->tiles)
+                                          : printed("%zu (%d of all)", r, its.received.tiles);
+            if (info.from < 0)
+                info.from = static_cast<int>(r);
         }
-        return text;
-    }
-
-    // The first of those ranks, or -1.
-    int firstMissing() const
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        for (std::size_t r = 0; r < tilesOf_.size(); ++r)
-            if (isMissing(r))
-                return static_cast<int>(r);
-        return -1;
+        info.expected = senderCount();
+        info.got = ranksComplete_;
+        return info;
     }
 
     // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. Pixels that were
@@ -627,20 +621,13 @@ private:
                 h.codec = config_.codec->id();
             }
         }
-        const MessageHeader m = messageHeader(MessageKind::FinishedTiles);
+        const auto m = MessageHeader::of(MessageKind::FinishedTiles, config_.receiver, frame_);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
         send_(std::move(message));
     }
 
-    MessageHeader messageHeader(MessageKind kind) const
-    {
-        MessageHeader header;
-        header.kind = kind;
-        header.receiver = config_.receiver;
-        header.number = frame_;
-        return header;
-    }
+    int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
 
     void requireDisplay() const
     {

@@ -60,7 +60,6 @@ public:
     Wall& operator=(const Wall&) = delete;
     ~Wall() { mailbox_->stop(); }
 
-    const WallLayout& layout() const noexcept { return layout_; }
 
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
@@ -125,10 +124,7 @@ public:
             const Region display = layout_.region(d), part = intersection(display, tile.region);
             if (part.empty())
                 continue;
-            MessageHeader header;
-            header.kind = MessageKind::FinishedTiles;
-            header.receiver = mailbox_->address();
-            header.number = tile.frame;
+            const auto header = MessageHeader::of(MessageKind::FinishedTiles, mailbox_->address(), tile.frame);
             const PartHeader where{
                 d, {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0, part.y1 - display.y0}};
             const auto width = static_cast<std::size_t>(part.width());
@@ -141,7 +137,7 @@ public:
                                           + static_cast<std::size_t>(part.x0 - tile.region.x0);
                 convertPixels(tile.color + 4 * first, part.width(), format_, out);
             }
-            mailbox_->sendWithCredit(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
+            mailbox_->send(layout_.ranks[static_cast<std::size_t>(d)], std::move(message));
             countSent(tile.frame, d, static_cast<std::int64_t>(part.width()) * part.height());
         }
     }

@@ -183,15 +183,14 @@ private:
     void finishLevels(FinishedTile& out);
     void roundExactly(FinishedTile& out, int y, double farthest);
     const std::vector<DoubleDouble>& exactRow(int y);
+    // All fragments, in the order of blending.
+    void sort(std::vector<const Fragment*>& pointers) const;
 
     BlendRule rule() const noexcept { return info_.order ? BlendRule::InOrder : rule_; }
 
     BlendRule rule_; // without an order
     TileInfo info_;
     ChannelMask tracked_ = 0;
-    // All of them, in their order.
-    void sort(std::vector<const Fragment*>& pointers) const;
-
     std::vector<Fragment> fragments_;
     std::int64_t undefinedPixels_ = 0;
 };

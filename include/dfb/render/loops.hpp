@@ -14,9 +14,6 @@
 #include <utility>
 #include <vector>
 
-// Common parts of the rendering loops: tiles to render into, a job per tile and pass on all workers, and a frame in
-// which a renderer may throw. inPlace() is for renderers that have their pixels already.
-
 DFB_NAMESPACE_BEGIN
 
 // See inPlace().
@@ -201,8 +198,6 @@ private:
     detail::PassJobs jobs_;
 };
 
-// DataParallelLoop (Listing 3 of the paper): each rank renders its bricks wherever they project.
-
 namespace detail {
 
 // The jobs of a rank that renders its own bricks, and its declaration.
@@ -237,8 +232,9 @@ private:
 
 } // namespace detail
 
-// One object per rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it.
-// Framebuffer and world must outlive it. The world may change between frames. Each brick must be in the world of one
+// Data-parallel rendering (Listing 3 of the paper): each rank renders its bricks wherever they project. One object per
+// rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it. Framebuffer and
+// world must outlive it. The world may change between frames. Each brick must be in the world of one
 // rank only.
 template <class FrameBuffer>
 class DataParallelLoop {

@@ -20,8 +20,6 @@
 #include <utility>
 #include <vector>
 
-// Footprint: the convex part of an image that a convex thing may cover.
-
 DFB_NAMESPACE_BEGIN
 
 // In pixels; pixel (x, y) is the square from there to (x + 1, y + 1).
@@ -29,6 +27,7 @@ struct PixelPoint {
     double x = 0, y = 0;
 };
 
+// The convex part of an image that a convex thing may cover.
 class Footprint {
 public:
     Footprint() = default; // nothing

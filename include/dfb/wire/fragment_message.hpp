@@ -184,10 +184,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     });
     if (codec && payload > 0)
         compress(pool, *codec, h, message);
-    MessageHeader m;
-    m.kind = MessageKind::Fragment;
-    m.receiver = receiver;
-    m.number = tile.frame;
+    const auto m = MessageHeader::of(MessageKind::Fragment, receiver, tile.frame);
     std::memcpy(message.data(), &m, sizeof m);
     std::memcpy(message.data() + sizeof m, &h, sizeof h);
     return message;
@@ -269,10 +266,7 @@ Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPl
     h.shape.encoding = FragmentEncoding::InPlace;
     h.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
     h.rawPayloadBytes = sizeof place;
-    MessageHeader m;
-    m.kind = MessageKind::Fragment;
-    m.receiver = receiver;
-    m.number = tile.frame;
+    const auto m = MessageHeader::of(MessageKind::Fragment, receiver, tile.frame);
     Buffer message = pool.acquire(fragmentPrefix + sizeof place);
     std::memcpy(message.data(), &m, sizeof m);
     std::memcpy(message.data() + sizeof m, &h, sizeof h);

@@ -12,7 +12,7 @@
 #include <limits>
 #include <type_traits>
 
-// WireCodes: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
+// Below: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
 // Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
 
 DFB_NAMESPACE_BEGIN
