@@ -1,4 +1,4 @@
-// Meshes in STL and glTF files, which Assimp reads. PLY and OBJ have readers of our own: docs/recipes.md says why.
+// Meshes in STL and glTF files, which Assimp reads. PLY and OBJ have readers of our own: docs/rendering.md says why.
 #pragma once
 
 #include "mesh.hpp"

@@ -35,7 +35,7 @@ public:
             names += ", " + name;
         add("--transfer", transfer_, "NAME|FILE.json",
             "Colours and opacity of volumes: " + names
-                + ", or a file (docs/recipes.md has the format). auto and the colour maps are as dense as shows the "
+                + ", or a file (docs/rendering.md has the format). auto and the colour maps are as dense as shows the "
                   "whole; bone and soft-tissue are for Hounsfield units, and auto is soft-tissue where values look "
                   "like "
                   "these; default auto",

@@ -84,7 +84,7 @@ alpha kept in an image of three channels|image.cpp|std::copy_n(rgba + 4 * i, 3, 
 bounds a pixel too narrow|bounds.cpp|pixel(std::ceil(right), wall.x, wall.width)|pixel(std::floor(right), wall.x, wall.width)
 near plane ignored|bounds.cpp|if (before(v) >= 0) {|if (true) {
 same data of two ranks counted twice|bounds.cpp|if (context.replicas.size() > 1)|if (false)
-floating window used for a tile of its own|draw.cpp|fits && !tile.contains(all))|fits)
+what a floating window showed used too late|draw.cpp|hasFloated_ = floats;|hasFloated_ = true;
 projection half a pixel off|draw.cpp|double(wall.width + 2 * (wall.x - window.x) - window.width)|double(wall.width + 2 * (wall.x - window.x) + 1 - window.width)
 END
 echo "faults.sh: $count faults, $([ $verdict = 0 ] && echo "each was found" || echo "NOT ALL were found")"
