@@ -328,7 +328,7 @@ struct WrongOrder {
             });
         };
         std::vector<std::uint32_t> all;
-        for (const scene::SceneBrick& brick : s.bricks)
+        for (const dfb::Brick& brick : s.bricks)
             all.push_back(brick.id);
         std::vector<std::uint32_t> few(all.begin() + 1, all.end()), other(all.rbegin(), all.rend());
         const auto expect = [&](const std::string& outcome, const std::string& text) {

@@ -25,8 +25,12 @@
 #define DFB_AVX2_F16C __attribute__((target("avx2,f16c"), optimize("O3")))
 #endif
 #define DFB_INLINE inline __attribute__((always_inline))
+// Calls one of two functions with the same arguments: the second one where the processor has AVX2. It need not be there
+// for other processors.
+#define DFB_FASTEST(plain, avx2, ...) (::dfb::detail::cpuHasAvx2() ? avx2(__VA_ARGS__) : plain(__VA_ARGS__))
 #include <cpuid.h>
 #else
+#define DFB_FASTEST(plain, avx2, ...) plain(__VA_ARGS__)
 #define DFB_AVX2
 #define DFB_AVX2_F16C
 #define DFB_INLINE inline

@@ -343,61 +343,35 @@ DFB_AVX2 inline void blendLevelsAvx2(std::uint8_t* levels, int count, const std:
 
 inline void takeLayer(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        takeLayerAvx2(rgba, transmittance, count, color, minTransmittance);
-        return;
-    }
-#endif
-    takeLayerPlain(rgba, transmittance, count, color, minTransmittance);
+    DFB_FASTEST(takeLayerPlain, takeLayerAvx2, rgba, transmittance, count, color, minTransmittance);
 }
 
 inline bool blendGroup(double* rgba, double* transmittance, int count, const BlendGroup& group)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return group.minTransmittance > 0 ? blendGroupAvx2<true>(rgba, transmittance, count, group)
-                                          : blendGroupAvx2<false>(rgba, transmittance, count, group);
-#endif
-    return group.minTransmittance > 0 ? blendGroupPlain<true>(rgba, transmittance, count, group)
-                                      : blendGroupPlain<false>(rgba, transmittance, count, group);
+    if (group.minTransmittance > 0)
+        return DFB_FASTEST(blendGroupPlain<true>, blendGroupAvx2<true>, rgba, transmittance, count, group);
+    return DFB_FASTEST(blendGroupPlain<false>, blendGroupAvx2<false>, rgba, transmittance, count, group);
 }
 
 inline void blendFour(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
                       int layers, double minTransmittance)
 {
-    const bool hasLeast = minTransmittance > 0;
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        (hasLeast ? blendFourAvx2<true> : blendFourAvx2<false>)(rgba, transmittance, colors, orders, layers,
-                                                                minTransmittance);
-        return;
-    }
-#endif
-    (hasLeast ? blendFourPlain<true> : blendFourPlain<false>)(rgba, transmittance, colors, orders, layers,
-                                                              minTransmittance);
+    if (minTransmittance > 0)
+        DFB_FASTEST(blendFourPlain<true>, blendFourAvx2<true>, rgba, transmittance, colors, orders, layers,
+                    minTransmittance);
+    else
+        DFB_FASTEST(blendFourPlain<false>, blendFourAvx2<false>, rgba, transmittance, colors, orders, layers,
+                    minTransmittance);
 }
 
 inline void blendConstant(double* rgba, const double* transmittance, int count, const float* color)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        blendConstantAvx2(rgba, transmittance, count, color);
-        return;
-    }
-#endif
-    blendConstantPlain(rgba, transmittance, count, color);
+    DFB_FASTEST(blendConstantPlain, blendConstantAvx2, rgba, transmittance, count, color);
 }
 
 inline void takeNearest(float* nearest, int count, const float* color, const float* depth)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        takeNearestAvx2(nearest, count, color, depth);
-        return;
-    }
-#endif
-    takeNearestPlain(nearest, count, color, depth);
+    DFB_FASTEST(takeNearestPlain, takeNearestAvx2, nearest, count, color, depth);
 }
 
 inline void blendLevels(std::uint8_t* levels, int count, const std::uint8_t* layer)

@@ -24,13 +24,12 @@ enum class BlendRule {
 // sort them by (source, part) first.
 class FragmentCompositor {
 public:
-    explicit FragmentCompositor(BlendRule rule = BlendRule::SortByDepth) : rule_(rule) {}
-
     // `begin` to `end` are iterators of pointers to fragments, which must outlive this. `isFirst`: nobody else has
     // walked them, so faults of pixels are counted.
     template <class Iterator>
-    void start(Iterator begin, Iterator end, bool isFirst = true)
+    void start(BlendRule rule, Iterator begin, Iterator end, bool isFirst = true)
     {
+        rule_ = rule;
         cursors_.clear();
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         std::size_t made = 0;
@@ -314,7 +313,7 @@ private:
         }
     }
 
-    BlendRule rule_;
+    BlendRule rule_ = BlendRule::SortByDepth;
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;

@@ -85,11 +85,7 @@ DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, i
 
 inline int firstOutOfOrder(const OrderedDepths& order, int begin, int end)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return firstOutOfOrderAvx2(order, begin, end);
-#endif
-    return firstOutOfOrderPlain(order, begin, end);
+    return DFB_FASTEST(firstOutOfOrderPlain, firstOutOfOrderAvx2, order, begin, end);
 }
 
 // ---- sorting four pixels at once
@@ -214,13 +210,7 @@ DFB_AVX2 inline void sortFourAvx2(const float* const* depths, const SortNetwork&
 
 inline void sortFour(const float* const* depths, const SortNetwork& network, FourOrders& orders)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        sortFourAvx2(depths, network, orders);
-        return;
-    }
-#endif
-    sortFourPlain(depths, network, orders);
+    DFB_FASTEST(sortFourPlain, sortFourAvx2, depths, network, orders);
 }
 
 // ---- the nearest

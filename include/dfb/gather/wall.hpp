@@ -60,7 +60,6 @@ public:
     Wall& operator=(const Wall&) = delete;
     ~Wall() { mailbox_->stop(); }
 
-
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
         mailbox_->requireProgress();

@@ -165,15 +165,15 @@ private:
         std::vector<DoubleDouble> mean;
         CompositeRow row;
         std::vector<const Fragment*> pointers;
-        std::vector<FragmentCompositor> compositors; // one
+        FragmentCompositor compositor;
     };
 
-    // One of each thread and rule, so that a frame after the first allocates nothing.
+    // One of each thread, so that a frame after the first allocates nothing.
     template <class Which>
-    Which& scratch() const
+    static Which& scratch()
     {
-        static thread_local std::array<Which, 3> ofRules;
-        return ofRules.at(static_cast<std::size_t>(rule()));
+        static thread_local Which ofThread;
+        return ofThread;
     }
 
     Scratch& start();
@@ -394,17 +394,16 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
 // Brings a compositor for each pass to the first row of its fragments.
 DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
 {
-    auto& scratch = this->scratch<Scratch>();
+    auto& scratch = FragmentStore::scratch<Scratch>();
     sort(scratch.pointers);
     const std::size_t passes = static_cast<std::size_t>(info_.passes);
-    while (scratch.compositors.size() < passes)
-        scratch.compositors.push_back(FragmentCompositor(rule()));
+    scratch.compositors.resize(std::max(scratch.compositors.size(), passes));
     auto next = scratch.pointers.begin();
     for (std::size_t pass = 0; pass < passes; ++pass) {
         const auto first = next;
         while (next != scratch.pointers.end() && static_cast<std::size_t>((*next)->header().pass) == pass)
             ++next;
-        scratch.compositors[pass].start(first, next);
+        scratch.compositors[pass].start(rule(), first, next);
     }
     scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
     scratch.row.wantsGaps = scratch.row.wantsSingles = true;
@@ -544,10 +543,7 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
 DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
 {
     const int width = info_.region.width();
-    auto& [mean, row, pointers, compositors] = scratch<Exact>();
-    if (compositors.empty())
-        compositors.push_back(FragmentCompositor(rule()));
-    FragmentCompositor& compositor = compositors.front();
+    auto& [mean, row, pointers, compositor] = scratch<Exact>();
     mean.assign(4 * static_cast<std::size_t>(width), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);
     sort(pointers);
@@ -556,7 +552,7 @@ DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y
         const auto first = next;
         while (next != pointers.end() && (*next)->header().pass == pass)
             ++next;
-        compositor.start(first, next, false);
+        compositor.start(rule(), first, next, false);
         compositor.skipRows(y);
         row.resize(width, 0, true);
         compositor.nextRow(row);

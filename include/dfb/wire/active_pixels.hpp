@@ -181,11 +181,7 @@ DFB_AVX2 inline std::uint64_t findActiveBytesAvx2(const std::byte* rgba, int cou
 
 inline std::uint64_t activeByteBits(const std::byte* rgba, int count)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return findActiveBytesAvx2(rgba, count);
-#endif
-    return findActiveBytes(rgba, count);
+    return DFB_FASTEST(findActiveBytes, findActiveBytesAvx2, rgba, count);
 }
 
 // Of up to 64 pixels, bit by bit.
@@ -225,11 +221,7 @@ DFB_AVX2 inline DepthBits findDepthsAvx2(const float* depth, int count, float li
 
 inline DepthBits depthBits(const float* depth, int count, float limit)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return findDepthsAvx2(depth, count, limit);
-#endif
-    return findDepths(depth, count, limit);
+    return DFB_FASTEST(findDepths, findDepthsAvx2, depth, count, limit);
 }
 
 inline bool hasNan(const float* depth, std::size_t count)

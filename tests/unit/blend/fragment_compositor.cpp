@@ -97,8 +97,8 @@ TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in sho
             fragments.push_back(input.fragment(hasDepth));
         for (const dfb::Fragment& fragment : fragments)
             pointers.push_back(&fragment);
-        dfb::FragmentCompositor compositor(dfb::BlendRule::InOrder);
-        compositor.start(pointers.begin(), pointers.end());
+        dfb::FragmentCompositor compositor;
+        compositor.start(dfb::BlendRule::InOrder, pointers.begin(), pointers.end());
         dfb::CompositeRow row;
         row.wantsDepth = hasDepth;
         row.wantsGaps = wantsGaps;
