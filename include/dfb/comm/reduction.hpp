@@ -65,7 +65,7 @@ public:
         detail::ByteWriter out;
         if (as.left() != bs.left()) {
             const auto text = [](const detail::ByteReader& in, std::int32_t rank) {
-                return std::to_string(in.left() / sizeof(std::int64_t)) + " on rank " + std::to_string(rank);
+                return detail::printed("%zu on rank %d", in.left() / sizeof(std::int64_t), rank);
             };
             out.put(std::int32_t{-1});
             out.putText(text(as, rankA) + " and " + text(bs, rankB));

@@ -157,7 +157,7 @@ private:
     static constexpr std::string_view malformed = "malformed: ";
     static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
     // Ends the text on the parts that a display misses.
-    static constexpr std::string_view unsent = " that no rank has sent";
+    static constexpr const char* unsent = " that no rank has sent";
 
     enum Scope : std::uint32_t { SentPixels = Mailbox::ownScope + 1 }; // of reductions
 
@@ -171,15 +171,14 @@ private:
 
     std::string describe() const
     {
-        const auto text = [](auto value) { return std::to_string(value); };
         Agreement::Settings settings;
-        settings.add("the wall's columns x rows", text(layout_.columns) + 'x' + text(layout_.rows));
-        settings.add("the size of its displays", text(layout_.displayWidth) + 'x' + text(layout_.displayHeight));
-        settings.add("the size of its bezels", text(layout_.bezelX) + 'x' + text(layout_.bezelY));
+        settings.add("the wall's columns x rows", printed("%dx%d", layout_.columns, layout_.rows));
+        settings.add("the size of its displays", printed("%dx%d", layout_.displayWidth, layout_.displayHeight));
+        settings.add("the size of its bezels", printed("%dx%d", layout_.bezelX, layout_.bezelY));
         settings.add("its format", nameOf(format_));
         std::string ranks;
         for (const int rank : layout_.ranks)
-            ranks += (ranks.empty() ? "" : ", ") + text(rank);
+            ranks += printed(ranks.empty() ? "%d" : ", %d", rank);
         settings.add("the list of its displays' ranks", '{' + ranks + '}');
         settings.add("checksums", mailbox_->connection().config().checksums);
         return settings.text();
@@ -189,17 +188,14 @@ private:
     {
         if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
             || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
-            return "a wall of " + std::to_string(layout_.columns) + 'x' + std::to_string(layout_.rows) + " displays of "
-                   + std::to_string(layout_.displayWidth) + 'x' + std::to_string(layout_.displayHeight) + ", bezels of "
-                   + std::to_string(layout_.bezelX) + 'x' + std::to_string(layout_.bezelY) + ", format "
-                   + nameOf(format_) + ": cannot be";
+            return printed("a wall of %dx%d displays of %dx%d, bezels of %dx%d, format %s: cannot be", layout_.columns,
+                           layout_.rows, layout_.displayWidth, layout_.displayHeight, layout_.bezelX, layout_.bezelY,
+                           nameOf(format_));
         if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
-            return "a wall of " + std::to_string(layout_.displayCount()) + " displays names "
-                   + std::to_string(layout_.ranks.size()) + " ranks";
+            return printed("a wall of %d displays names %zu ranks", layout_.displayCount(), layout_.ranks.size());
         for (const int rank : layout_.ranks)
             if (rank < 0 || rank >= mailbox_->size())
-                return "a display of the wall is driven by rank " + std::to_string(rank) + " of "
-                       + std::to_string(mailbox_->size());
+                return printed("a display of the wall is driven by rank %d of %d", rank, mailbox_->size());
         return "";
     }
 
@@ -258,7 +254,7 @@ private:
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            error_ = error.message + ", in a message from rank " + std::to_string(source) + " to the wall";
+            error_ = error.message + printed(", in a message from rank %d to the wall", source);
             errorFrame_ = std::max({errorFrame_, newest_, coming_.empty() ? 0 : coming_.rbegin()->first,
                                     frame <= lastPossible() ? frame : 0});
         }
@@ -437,9 +433,9 @@ private:
         for (const auto& [display, image] : shown_) {
             const std::int64_t left = pixelsLeft(frame, display);
             if (left > 0)
-                text += (text.empty() ? "display " : ", display ") + std::to_string(display) + " of rank "
-                        + std::to_string(mailbox_->rank()) + " misses " + std::to_string(left) + " pixels"
-                        + std::string(hasAllSent(frame, display) ? unsent : "");
+                text +=
+                    printed("%sdisplay %d of rank %d misses %lld pixels%s", text.empty() ? "" : ", ", display,
+                            mailbox_->rank(), static_cast<long long>(left), hasAllSent(frame, display) ? unsent : "");
         }
         return text;
     }
