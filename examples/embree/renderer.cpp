@@ -327,14 +327,15 @@ Renderer::Accumulator Renderer::trace(const Vec3& origin, const Vec3& direction,
     auto hit = hits.begin();
     const double least = static_cast<double>(settings_.earlyTermination);
     const auto isDone = [&] { return sum.through <= 0 || sum.through < least; };
+    const bool isAlone = surfaces_.empty(); // isosurfaces neither cast shadows nor hide the sky
     const auto addHit = [&](const Hit& surface) {
         const float opacity = surface.opacity.value_or(settings_.opacity);
         const Vec3 point = pointAt(origin, direction, surface.t);
-        const bool inShadow = settings_.shadows && opacity > 0 && isInShadow(point, light);
+        const bool inShadow = settings_.shadows && !isAlone && opacity > 0 && isInShadow(point, light);
         Vec3 c = (inShadow ? surface.color * light.ambient : light.shade(surface.color, surface.normal, direction))
                  * opacity;
-        sum.cost += settings_.shadows;
-        if (settings_.aoRays > 0 && opacity > 0) {
+        sum.cost += settings_.shadows && !isAlone;
+        if (settings_.aoRays > 0 && !isAlone && opacity > 0) {
             c = c * (0.3f + 0.7f * openness(surface, point, direction, key)); // some comes by many bounces
             sum.cost += settings_.aoRays;
         }
