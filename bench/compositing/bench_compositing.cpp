@@ -52,11 +52,12 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     const auto addOrdered = [&](const std::string& config, const bench::DfbSettings& settings) {
         add("in order, " + config, ImageBlend::InOrder, settings);
     };
-    bench::DfbSettings shared, bytes, sharedBytes, threads, defaults;
+    bench::DfbSettings shared, bytes, sharedBytes, threads, defaults, told;
     shared.isShared = sharedBytes.isShared = true;
     bytes.hasBytes = sharedBytes.hasBytes = true;
     threads.hasThreads = true;
     defaults.hasDefaultThreads = true;
+    told.isToldOrder = true;
     addOrdered("float32", {});
     addOrdered("float32, all in place", shared);
     addOrdered("bytes", bytes);
@@ -77,6 +78,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
 #endif
     bench::addDfb<dfb::OrderedBlend>(systems, own, inputs, "tiles of 64, in order, float32", {});
     bench::addDfb<dfb::AlphaBlend>(systems, own, inputs, "tiles of 64, float32", {});
+    bench::addDfb<dfb::AlphaBlend>(systems, own, inputs, "tiles of 64, float32, order told", told);
     bench::addDfb<dfb::AlphaBlend>(systems, withDefaults, inputs, "tiles of 64, float32, default threads", defaults);
 }
 

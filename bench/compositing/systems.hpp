@@ -145,6 +145,7 @@ struct DfbSettings {
     bool hasDefaultThreads = false; // those that a framebuffer makes by itself
     bool isShared = false;          // the images lie in memory that the node shares, and are read there
     bool hasBytes = false;          // images of 8 bits a channel, which are ready
+    bool isToldOrder = false;       // AlphaBlend gets FrameConfig::order, as loops with a SharedWorld give it
 };
 
 // The pixels of one view as a framebuffer gets them.
@@ -309,7 +310,7 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
         const auto r = std::make_shared<Renderer>(connection, c);
         for (const View& view : inputs.views)
             r->images.emplace_back(r->dfb, view.image, settings);
-        return compositorOf(r, toBytes, trace, [&inputs](Renderer& by) {
+        return compositorOf(r, toBytes, trace, [&inputs, isToldOrder = settings.isToldOrder](Renderer& by) {
             const PartialImage& image = inputs.image();
             const DfbImage& pixels = by.images[inputs.frame % by.images.size()];
             const auto renderBrick = dfb::inPlace([&image, &pixels](const dfb::Brick&, auto& view) {
@@ -329,6 +330,9 @@ void addDfb(std::vector<System>& systems, const std::shared_ptr<Connection>& con
             } else {
                 dfb::FrameConfig params;
                 params.maxLayers = by.dfb.size();
+                if (isToldOrder)
+                    params.order = std::make_shared<const dfb::SourceOrder>(
+                        std::vector<std::uint32_t>(inputs.order().begin(), inputs.order().end()));
                 return by.loop.render(camera, renderBrick, params);
             }
         });
