@@ -547,10 +547,11 @@ TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and t
             largestAllocation = std::numeric_limits<std::size_t>::max();
             std::string outcome = "fine";
             try {
-                CHECK(frame.end().tilesTouched == 1);
+                frame.end();
             } catch (const dfb::FrameError& e) {
                 outcome = e.what();
             }
+            INFO(outcome);
             CHECK(outcome.find(hasMemory ? "fine" : "no memory for ") != std::string::npos);
         }
     });
