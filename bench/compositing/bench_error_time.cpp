@@ -37,7 +37,7 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     bench::addImages(systems, dfb::connect<dfb::MpiTransport>(inputs.comm), inputs, bench::defaultConfig,
                      ImageBlend::ByDepth, defaults);
     add("float32", {});
-    addOrdered("float32", {WireFormat::Float32, {}, 0, true});
+    addOrdered("float32", {});
     for (const WireFormat format : {WireFormat::Float16, WireFormat::Unorm16, WireFormat::Unorm8}) {
         add(nameOf(format), {format});
         addOrdered(nameOf(format), {format});
