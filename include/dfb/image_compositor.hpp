@@ -22,6 +22,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <limits>
 #include <memory>
 #include <optional>
@@ -448,7 +449,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         for (int column = tiles.x0; column < tiles.x1; ++column)
             inputs_.push_back({layout.tileAt(column, row), source, 0});
     engine_->declare(inputs_);
-    config().executor->parallelFor(inputs_.size(), [&](std::size_t i) {
+    const auto sendTile = [&](std::size_t i) {
         if (engine_->failed())
             return;
         detail::InputTile::View view;
@@ -457,7 +458,8 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         view.source = source;
         static thread_local detail::InputTile::Converted converted; // with its memory, from tile to tile
         engine_->setTile(part.find(view, converted));
-    });
+    };
+    config().executor->parallelFor(inputs_.size(), std::cref(sendTile)); // a std::function of it would take memory
 }
 
 DFB_NAMESPACE_END

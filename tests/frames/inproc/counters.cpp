@@ -477,7 +477,24 @@ TEST_CASE("From the third frame on the library allocates nothing", "[counters]")
         }
 }
 
-// With one worker and one rank nothing depends on time: any two frames will do.
+namespace {
+
+// Of each of some frames. With one worker and one rank nothing depends on time: any two frames will do.
+template <class Frame>
+std::vector<std::int64_t> allocationsOf(const Frame& frame)
+{
+    std::vector<std::int64_t> counts(10);
+    for (std::int64_t& count : counts) {
+        const std::int64_t before = allocations;
+        frame();
+        count = allocations - before;
+    }
+    CHECK(counts[0] > 0);
+    return {counts.begin() + 2, counts.end()};
+}
+
+} // namespace
+
 TEST_CASE("On one rank it allocates nothing after two frames, into whatever is rendered", "[counters]")
 {
     using Fb = dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::NoPixelOp, dfb::InprocTransport>;
@@ -487,6 +504,7 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         Fb fb(communicator, config);
         const dfb::World world({{7, {{0, 0, 0}, {1, 1, 1}}}, {8, {{1, 0, 0}, {2, 1, 1}}}});
+        const dfb::SharedWorld all(fb, world);
         const auto render = [](const dfb::Brick& brick, auto& tile) {
             tile.forEachPixel([&](int x, int y, float* rgba, float& depth) {
                 if ((x + y) % 3 > 0)
@@ -494,15 +512,36 @@ TEST_CASE("On one rank it allocates nothing after two frames, into whatever is r
                 depth = static_cast<float>(brick.id);
             });
         };
-        dfb::DataParallelLoop loop(fb, world);
-        std::vector<std::int64_t> counts(10);
-        for (std::int64_t& count : counts) {
-            const std::int64_t before = allocations;
-            loop.render(WholeImage(), render);
-            count = allocations - before;
-        }
-        CHECK(counts[0] > 0);
-        CHECK(std::vector<std::int64_t>(counts.begin() + 2, counts.end()) == std::vector<std::int64_t>(8));
+        dfb::DataParallelLoop loop(fb, world), told(fb, world, all);
+        CHECK(allocationsOf([&] { loop.render(WholeImage(), render); }) == std::vector<std::int64_t>(8));
+        // The camera moves, and the order of the bricks stays: that takes no memory. To project a brick does.
+        float x = 0;
+        const auto next = [&x] {
+            return dfb::PerspectiveCamera({-4 + (x += 0.01f), 0.5f, 6}, {1, 0.5f, 0.5f}, {0, 1, 0}, 40);
+        };
+        const auto sorted = allocationsOf([&] { loop.render(next(), render); });
+        CHECK(allocationsOf([&] { told.render(next(), render); }) == sorted);
+    });
+}
+
+TEST_CASE("On one rank an image compositor allocates nothing after two frames", "[counters]")
+{
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
+        for (const auto blend : {dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder, dfb::ImageBlend::Nearest})
+            for (const bool hasBytes : {false, true}) {
+                INFO("blend " << static_cast<int>(blend) << (hasBytes ? ", bytes" : ", floats"));
+                dfb::FrameBufferConfig config(side, side);
+                config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+                dfb::ImageCompositor compositor(dfb::connect<dfb::InprocTransport>(communicator), blend, config);
+                constexpr std::size_t pixels = std::size_t{side} * side;
+                std::vector<float> rgba(4 * pixels, 0.5f), depths(pixels, 1);
+                std::vector<std::uint8_t> bytes(4 * pixels, 100);
+                dfb::InputImage image;
+                image.rgba8 = hasBytes ? bytes.data() : nullptr;
+                image.rgba32f = hasBytes ? nullptr : rgba.data();
+                image.depth = blend == dfb::ImageBlend::InOrder ? nullptr : depths.data();
+                CHECK(allocationsOf([&] { compositor.composite(image, 0); }) == std::vector<std::int64_t>(8));
+            }
     });
 }
 
