@@ -219,7 +219,7 @@ struct Ordered {
 
     template <Way way, class Transport>
     static void render(const typename Transport::Communicator& communicator, Result& result, int copies, bool inPlace,
-                       std::int64_t& bytes)
+                       std::int64_t& bytes, std::uint64_t* depthHash = nullptr)
     {
         using Op = std::conditional_t<way == Way::InOrder, dfb::BasicOrderedBlend<16>, Blend>;
         const dfb::Vec3 eye{0.7f, 0.8f, 6.5f}, target{1.1f, 1.0f, 0};
@@ -228,6 +228,7 @@ struct Ordered {
         config.image.width = 97;
         config.image.height = 61;
         config.image.format = dfb::OutputFormat::RGBA32F;
+        config.image.depth = depthHash != nullptr;
         config.executor = std::make_shared<dfb::ThreadExecutor>(2);
         dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, Transport> fb(communicator, config);
         const dfb::World mine = replicated(boxes(), fb.rank(), fb.size(), copies);
@@ -284,12 +285,21 @@ struct Ordered {
         const std::uint64_t hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
         result.expect(result.hash == 0 || result.hash == hash, "another image, " + std::to_string(copies) + " copies");
         result.hash = hash;
+        if (!depthHash)
+            return;
+        const std::uint64_t depths = dfb::testing::hashOf(fb.image().depth(), 4 * fb.image().pixelCount());
+        result.expect(*depthHash == 0 || *depthHash == depths, "another depth");
+        *depthHash = depths;
     }
 
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
+        std::int64_t bytes = 0;
+        std::uint64_t depthHash = 0;
+        render<Way::Sorted, Transport>(communicator, result, 1, true, bytes, &depthHash);
+        render<Way::Told, Transport>(communicator, result, 1, true, bytes, &depthHash);
         for (const int copies : {1, 2}) {
             std::int64_t sorted = 0, told = 0, toldByData = 0, ordered = 0;
             for (const bool inPlace : {true, false}) {
@@ -307,15 +317,22 @@ struct Ordered {
     }
 };
 
+// Nothing waits for its time-out.
+scene::Scene threeBricks()
+{
+    scene::Scene s = scene::makeScene(3, 6);
+    s.timeout = std::chrono::milliseconds(5000);
+    return s;
+}
+
 // An order without one of the sources, or that is not the same on all ranks, fails the frame on all of them; the next
-// is right. An image with depth has it with an order, too.
+// is right.
 struct WrongOrder {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        scene::Scene s = scene::makeScene(3, 6);
-        s.timeout = std::chrono::milliseconds(5000); // nothing waits for it
+        const scene::Scene s = threeBricks();
         BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
         const dfb::World world(bricksOf(s, fb.rank(), fb.size()));
         dfb::DataParallelLoop loop(fb, world);
@@ -359,8 +376,7 @@ struct WrongOwner {
     static Result run(const typename Transport::Communicator& communicator)
     {
         Result result;
-        scene::Scene s = scene::makeScene(3, 6);
-        s.timeout = std::chrono::milliseconds(5000); // nothing waits for it
+        const scene::Scene s = threeBricks();
         BlendFrameBuffer<Transport> fb(communicator, configOf(s, 1));
         dfb::DistributedFrameBuffer<dfb::BasicOrderedBlend<16>, dfb::NoPixelOp, Transport> inOrder(communicator,
                                                                                                    configOf(s, 1));

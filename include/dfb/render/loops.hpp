@@ -234,8 +234,7 @@ private:
 
 // Data-parallel rendering (Listing 3 of the paper): each rank renders its bricks wherever they project. One object per
 // rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it. Framebuffer and
-// world must outlive it. The world may change between frames. Each brick must be in the world of one
-// rank only.
+// world must outlive it. The world may change between frames. Each brick must be in the world of one rank only.
 template <class FrameBuffer>
 class DataParallelLoop {
 public:
