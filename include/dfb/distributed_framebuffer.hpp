@@ -37,6 +37,7 @@ public:
     using Tile = dfb::Tile<TileOp::channels, detail::tile_size_v<TileOp>>;
     using TileView = dfb::TileView<TileOp::channels, detail::tile_size_v<TileOp>>;
     static constexpr bool takesOrder = detail::takes_order_v<TileOp>; // whether FrameConfig::order has an effect
+    static constexpr bool keepsState = detail::keeps_state_v<TileOp>; // FrameConfig::owners cannot be set then
     using TileFrameData = typename Operations::TileFrameData;
     using PixelFrameData = typename Operations::PixelFrameData;
 
@@ -57,6 +58,10 @@ public:
         }
 
         std::int64_t number() const noexcept { return number_; }
+
+        // In this frame. Any thread. They wait for nothing and throw nothing.
+        int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
+        const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
         // Prepares `tile` for a tile and a pass of this frame: clears all pixels, and sets generation 0, no children,
         // this rank as source, and part 0. Any thread. Waits for nothing. Throws InvalidArgument for an index or a pass
@@ -317,8 +322,12 @@ public:
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
     const Config& config() const noexcept { return engine().config(); }
     const TileLayout& layout() const noexcept { return engine().layout(); }
+    // By config().image.ownerMap. A frame can have other owners: see Frame.
     int tileOwner(int tile) const noexcept { return engine().tileOwner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
+    // Of each rank, the lowest rank that shares memory with it: ranks with the same one are on one node. A transport
+    // that knows of no shared memory has one node.
+    const std::vector<int>& nodeOf() const noexcept { return engine().nodeOf(); }
     Executor& executor() const noexcept { return *config().executor; }
 
     // On the display rank: the image of the last frame that ended well or partial. With config.framesInFlight = 1 it is

@@ -29,7 +29,9 @@ struct ImageConfig {
     ChannelMask aux = 0;                       // its auxiliary channels, which the tile operation must have
     bool dither = false;                       // dithers 8-bit colour instead of rounding it: see ditherPixels()
     int displayRank = 0;                       // the rank that gets the image
-    OwnerMap ownerMap = latticeOwner;          // which rank owns which tile; null: latticeOwner
+    // Which rank owns which tile. Null: latticeOwner; and where ranks are on several nodes, loops with a SharedWorld,
+    // and ImageCompositor, give each frame owners near the pixels.
+    OwnerMap ownerMap{};
 };
 
 // The messages of one framebuffer. All ranks must give the same; the constructor checks it.
@@ -120,6 +122,9 @@ struct FrameConfig {
     // as without it. An input of a source that is not in the order makes the frame fail. Loops with a SharedWorld set
     // it themselves where there is such an order.
     std::shared_ptr<const SourceOrder> order{};
+    // Not null: which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does not depend
+    // on it. Not for operations that keep state. Loops set it themselves: see ImageConfig::ownerMap.
+    TileOwners owners{};
     // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
     // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
     // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile that misses an input

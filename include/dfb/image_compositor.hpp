@@ -12,6 +12,7 @@
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/engine.hpp>
+#include <dfb/render/link_owners.hpp>
 #include <dfb/ops/sort_last.hpp>
 
 #if defined(DFB_HAS_MPI)
@@ -164,6 +165,7 @@ public:
 private:
     std::unique_ptr<detail::Operations> makeOperations(const ImageConfig& image) const;
     void makeEngine(const FrameBufferConfig& config);
+    TileOwners findOwners();
     void begin(const FrameConfig& frame);
     void send(const InputImage& image, int place, bool usesDepth);
 
@@ -174,6 +176,10 @@ private:
     std::unique_ptr<detail::Operations> operations_;
     std::unique_ptr<detail::Engine> engine_;
     std::vector<TileInput> inputs_;
+    // On several nodes:
+    std::optional<detail::LinkOwners> owners_;
+    std::vector<int> ranks_;      // all, ascending
+    std::vector<Figure> regions_; // of the ranks' images in the last picture: see packed()
 };
 
 DFB_NAMESPACE_END
@@ -191,22 +197,53 @@ public:
     static constexpr ChannelMask neededChannels = colorChannel;
 };
 
-// The tiles are strips, as wide as the picture (at most 4096 pixels). A strip is one piece of memory in each image.
-// Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times as long. 4
-// strips a rank share the work well enough. A strip of under 4096 pixels costs more to send than to blend.
+// On one node the tiles are strips, as wide as the picture (at most 4096 pixels). A strip is one piece of memory in
+// each image. Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times
+// as long. 4 strips a rank share the work well enough. A strip of under 4096 pixels costs more to send than to blend.
+//
+// Between nodes bytes cost more than pages. Squares are smaller than most images: many have pixels of one rank alone,
+// which owns them and sends them once.
 template <class TileOp>
-std::unique_ptr<Operations> stripOperations(const ImageConfig& image, int ranks)
+std::unique_ptr<Operations> imageOperations(const ImageConfig& image, int ranks, bool isOneNode)
 {
     auto traits = OperationTraits::of<TileOp, NoPixelOp>();
-    traits.tileWidth = std::clamp(image.width, 1, 4096);
-    const std::int64_t share = std::int64_t{image.width} * image.height / (4 * ranks);
-    const std::int64_t rows = std::clamp<std::int64_t>(share, 4096, 32768) / traits.tileWidth;
-    traits.tileHeight = static_cast<int>(std::clamp<std::int64_t>(rows, 1, 256));
+    traits.tileWidth = traits.tileHeight = 64;
+    if (isOneNode) {
+        traits.tileWidth = std::clamp(image.width, 1, 4096);
+        const std::int64_t share = std::int64_t{image.width} * image.height / (4 * ranks);
+        const std::int64_t rows = std::clamp<std::int64_t>(share, 4096, 32768) / traits.tileWidth;
+        traits.tileHeight = static_cast<int>(std::clamp<std::int64_t>(rows, 1, 256));
+    }
     static const NoFrameData none;
     auto operations = std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
     operations->offer(none, none);
     return operations;
 }
+
+// A region of a picture in a number that a double holds: 13 bits for each side.
+class PackedRegion {
+public:
+    explicit PackedRegion(const TileLayout& layout) : step_((std::max(layout.width(), layout.height()) - 1) / 8191 + 1)
+    {
+    }
+
+    double pack(const Region& r) const
+    {
+        std::uint64_t bits = 0;
+        for (const int side : {r.x0 / step_, r.y0 / step_, (r.x1 - 1) / step_ + 1, (r.y1 - 1) / step_ + 1})
+            bits = bits << 13 | static_cast<std::uint64_t>(side);
+        return static_cast<double>(bits);
+    }
+    Region unpack(double number) const
+    {
+        const auto bits = static_cast<std::uint64_t>(number);
+        const auto side = [&](int shift) { return step_ * static_cast<int>(bits >> shift & 8191); };
+        return {side(39), side(26), side(13), side(0)};
+    }
+
+private:
+    int step_; // pixels
+};
 
 // Lets the calling thread do the work of `threads` and of the connection's progress thread. Nothing without `threads`.
 class OneThread {
@@ -341,12 +378,13 @@ DFB_COMPILED_ONCE ImageCompositor::ImageCompositor(std::shared_ptr<Connection> c
 DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOperations(const ImageConfig& image) const
 {
     const int ranks = connection_->size();
+    const bool isOneNode = !owners_ || owners_->isOneNode();
     switch (blend_) {
-    case ImageBlend::ByDepth: return detail::stripOperations<AlphaBlend>(image, ranks);
-    case ImageBlend::InOrder: return detail::stripOperations<detail::BlendBySource>(image, ranks);
+    case ImageBlend::ByDepth: return detail::imageOperations<AlphaBlend>(image, ranks, isOneNode);
+    case ImageBlend::InOrder: return detail::imageOperations<detail::BlendBySource>(image, ranks, isOneNode);
     case ImageBlend::Nearest: break;
     }
-    return detail::stripOperations<DepthComposite>(image, ranks);
+    return detail::imageOperations<DepthComposite>(image, ranks, isOneNode);
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
@@ -354,6 +392,34 @@ DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& conf
     auto operations = makeOperations(config.image);
     engine_ = detail::makeEngine(connection_, config, *operations, 0);
     operations_ = std::move(operations);
+    regions_.clear();
+    if (owners_)
+        return;
+    owners_.emplace(engine_->nodeOf());
+    for (int rank = 0; rank < size(); ++rank)
+        ranks_.push_back(rank);
+    if (!owners_->isOneNode())
+        makeEngine(config); // with other tiles
+}
+
+// By the regions of the last picture, as nobody knows those of this one. Null: none are known, or need not be.
+DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
+{
+    if (regions_.empty() || config().image.ownerMap)
+        return nullptr;
+    const TileLayout& layout = engine_->layout();
+    const detail::PackedRegion packed(layout);
+    owners_->start(layout);
+    for (const Figure& figure : regions_) {
+        const Region region = packed.unpack(figure.value), tiles = layout.tilesIn(region);
+        for (int row = tiles.y0; row < tiles.y1; ++row)
+            for (int column = tiles.x0; column < tiles.x1; ++column) {
+                const int tile = layout.tileAt(column, row);
+                owners_->add(tile, intersection(region, layout.region(tile)), &ranks_[figure.key], 1);
+            }
+    }
+    return owners_->find(config(), blend_ != ImageBlend::InOrder,
+                         [this](int tile) { return engine_->tileOwner(tile); });
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
@@ -374,6 +440,8 @@ DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
     declared.passes = 1;
     declared.samples = nullptr;
     declared.declared = true;
+    if (!declared.owners)
+        declared.owners = findOwners();
     if (declared.maxLayers == 0)
         declared.maxLayers = size();
     engine_->begin(declared);
@@ -414,7 +482,9 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
         detail::failArgument("end() without start()");
     engine_->requireProgress();
     isOpen_ = false;
-    return engine_->end();
+    FrameReport report = engine_->end();
+    regions_ = std::exchange(report.figures, {});
+    return report;
 }
 
 // Declares and sends the tiles that the image has a part of.
@@ -448,6 +518,8 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     for (int row = tiles.y0; row < tiles.y1; ++row)
         for (int column = tiles.x0; column < tiles.x1; ++column)
             inputs_.push_back({layout.tileAt(column, row), source, 0});
+    if (!tiles.empty() && !owners_->isOneNode())
+        engine_->addFigure(static_cast<std::uint64_t>(rank()), detail::PackedRegion(layout).pack(part.valid()));
     engine_->declare(inputs_);
     const auto sendTile = [&](std::size_t i) {
         if (engine_->failed())

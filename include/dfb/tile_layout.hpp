@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cstdint>
 #include <functional>
+#include <memory>
 #include <numeric>
 #include <vector>
 
@@ -69,6 +70,9 @@ private:
 // Names the rank in [0, rankCount) that owns a tile. A pure function, the same on all ranks; it is asked once per
 // tile when the framebuffer is made.
 using OwnerMap = std::function<int(int tile, const TileLayout& layout, int rankCount)>;
+
+// The rank that owns each tile, by the tile's index.
+using TileOwners = std::shared_ptr<const std::vector<int>>;
 
 // See FrameBufferConfig::onTile.
 using TileCallback = std::function<void(int tile, const Region& pixels, const Image& image)>;

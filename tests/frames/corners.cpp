@@ -756,6 +756,7 @@ private:
         for (const corners::Loop loop : loops) {
             dfb::FrameBufferConfig config = configOf(corners::sceneFor(loop, rule, 0), count.loops % 3);
             config.image.displayRank = (count.loops + count.ranks) % 2 == 0 ? 0 : count.ranks - 1;
+            config.image.ownerMap = dfb::latticeOwner; // some ranks begin frames without a loop
             corners::Corner<TileOp, PixelOp, Transport> corner(connection, config, loop, rule, result);
             count.faults += corner.run();
             ++count.loops;

@@ -353,7 +353,7 @@ struct WrongOrder {
         };
         expect(frame(few), "which is not in the order of the frame");
         expect(frame(all), "fine");
-        expect(frame(fb.rank() == 0 ? all : other), fb.size() == 1 ? "fine" : "FrameConfig::order is an order with");
+        expect(frame(fb.rank() == 0 ? all : other), fb.size() == 1 ? "fine" : "FrameConfig::order is one with hash");
         expect(frame(all), "fine");
         expect(scene::outcomeOf([] { dfb::SourceOrder({1, 2, 1}); }), "source 1 comes twice");
         return result;

@@ -272,6 +272,7 @@ struct BytesAndFloats {
             for (const auto blend : {dfb::ImageBlend::Nearest, dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
                 dfb::FrameBufferConfig config(imageWidth, imageHeight, format);
                 config.executor = executor;
+                config.image.ownerMap = dfb::latticeOwner; // both pictures go the same ways
                 dfb::ImageCompositor compositor(connection, blend, config);
                 const int place = blend == dfb::ImageBlend::InOrder ? compositor.rank() : -1;
                 std::vector<std::vector<std::byte>> pictures;

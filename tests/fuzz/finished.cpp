@@ -124,7 +124,7 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     gatherConfig.format = format;
     gatherConfig.channels = channels;
     gatherConfig.codec = flags & HasCodec ? codec() : nullptr;
-    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, {false, true}, ownerOf, [](dfb::Buffer&&) {});
+    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, 2, ownerOf, [](dfb::Buffer&&) {});
     if (flags & Shared) // other ranks put tiles into it
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});

@@ -332,7 +332,7 @@ private:
         options.checksums = way_.has(Checksums);
         const auto traits = d::OperationTraits::of<TileOp, PixelOp>();
         const auto agreement =
-            d::Agreement::of(traits, config, options.checksums, 1, d::TilePipeline::travelling(traits, config),
+            d::Agreement::of(traits, config, options.checksums, {1, 0}, d::TilePipeline::travelling(traits, config),
                              tileCount, [](int tile) { return ownerOf(tile); });
         const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
             peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
@@ -520,7 +520,7 @@ std::pair<std::string, std::string> finished(Way way)
     gatherConfig.channels = config.image.depth ? dfb::depthChannel : 0;
     gatherConfig.codec = config.messages.codec;
     const dfb::TileLayout layout(width, height, side);
-    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, {false, true}, ownerOf, [&](dfb::Buffer&& message) {
+    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });

@@ -18,15 +18,15 @@ set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp de
             tile_layout.hpp)
 set(level_7 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
             wire/sparse_planes.hpp wire/wire_losses.hpp)
-set(level_8 frame/declarations.hpp ops/sort_last.hpp pixel_op.hpp render/sampling.hpp
-            render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
+set(level_8 frame/declarations.hpp ops/sort_last.hpp pixel_op.hpp render/link_owners.hpp
+            render/sampling.hpp render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
 set(level_9 frame/operations.hpp gather/final_gather.hpp ops/image_parallel.hpp ops/progressive.hpp render/cameras.hpp
             testing/tile_op_test.hpp testing/verified.hpp)
 set(level_10 frame/accumulation.hpp frame/agreement.hpp frame/engine.hpp frame/tile_table.hpp
             render/shared_world.hpp testing/adversarial.hpp)
-set(level_11 frame/tile_pipeline.hpp frame/verdict.hpp gather/wall.hpp render/loops.hpp)
-set(level_12 display_wall.hpp frame/outcome.hpp render/deep_parallel.hpp render/mixed_parallel.hpp)
-set(level_13 frame/job_share.hpp)
+set(level_11 frame/tile_pipeline.hpp frame/verdict.hpp gather/wall.hpp)
+set(level_12 display_wall.hpp frame/outcome.hpp render/loops.hpp)
+set(level_13 frame/job_share.hpp render/deep_parallel.hpp render/mixed_parallel.hpp)
 set(level_14 frame/frame_engine.hpp)
 set(level_15 distributed_framebuffer.hpp image_compositor.hpp)
 set(level_16 dfb.hpp)

@@ -181,7 +181,10 @@ std::vector<FaultEnding> faultFrames(const typename Base::Communicator& communic
         FaultEnding ending;
         std::string why;
         ending.text = outcomeOf([&] {
-            const auto report = faultFrame<TileOp>(fb, group, frame + 1);
+            FaultGroup its = group;
+            if (!FrameBuffer::keepsState && frame % 3 == 1)
+                its.scene.owners = anyOwners(fb.layout(), fb.size(), group.seed + static_cast<std::uint64_t>(frame));
+            const auto report = faultFrame<TileOp>(fb, its, frame + 1);
             if (report.failure)
                 why = "partial: " + report.failure->message;
             if (fb.isDisplayRank())

@@ -8,8 +8,8 @@
 
 #include <algorithm>
 #include <array>
-#include <cmath>
 #include <chrono>
+#include <cmath>
 #include <cstdint>
 #include <cstring>
 #include <limits>
@@ -40,6 +40,7 @@ struct Scene {
     std::array<float, 4> background{0.125f, 0.25f, 0.0f, 0.5f};
     std::uint64_t seed = 1;
     std::vector<dfb::Brick> bricks;
+    dfb::TileOwners owners; // null: those of the owner map
 };
 
 inline std::uint64_t mix(std::uint64_t h)
@@ -109,7 +110,17 @@ inline dfb::FrameConfig paramsOf(const Scene& s)
     params.passes = s.passes;
     params.timeout = s.timeout;
     params.allowPartial = s.allowPartial;
+    params.owners = s.owners;
     return params;
+}
+
+inline dfb::TileOwners anyOwners(const dfb::TileLayout& layout, int rankCount, std::uint64_t seed)
+{
+    std::vector<int> owners;
+    for (int tile = 0; tile < layout.tileCount(); ++tile)
+        owners.push_back(static_cast<int>(mix(seed * 977 + static_cast<std::uint64_t>(tile))
+                                          % static_cast<std::uint64_t>(rankCount)));
+    return std::make_shared<const std::vector<int>>(std::move(owners));
 }
 
 // The bricks of one rank. Different values of `deal` deal them out differently; -1 gives all to the last rank.
@@ -147,7 +158,7 @@ dfb::FrameReport listing3(FrameBuffer& fb, const Scene& s, const std::vector<dfb
                     .empty();
     };
     for (int pass = 0; pass < s.passes; ++pass) {
-        for (int index : fb.ownedTiles()) {
+        for (int index : frame.ownedTiles()) {
             frame.start(*tile, index, pass);
             tile->children = static_cast<int>(
                 std::count_if(s.bricks.begin(), s.bricks.end(), [&](const dfb::Brick& b) { return meets(b, index); }));

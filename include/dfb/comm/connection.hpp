@@ -210,6 +210,16 @@ public:
     // Whether each sees memory of the other.
     bool sharesMemoryWith(int other) const { return isSeenBy(other) && blockAt(other, 2, 0); }
 
+    // The lowest rank on this one's node: of those that share memory with it. 0 with a transport that knows of no
+    // shared memory: all are taken to be on one node.
+    int firstOnNode() const
+    {
+        int first = 0;
+        while (link_->knowsSharedMemory() && first != rank() && !sharesMemoryWith(first))
+            ++first;
+        return first;
+    }
+
     // Any byte of such a block: its offset in the memory of this rank that others see, or -1; and bytes at an offset in
     // that of another rank, or null.
     std::int64_t offsetOf(const std::byte* address) const

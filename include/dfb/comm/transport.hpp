@@ -254,6 +254,7 @@ public:
     virtual void stop(bool orderly) = 0;
 
     // The optional members. A transport without them lends no memory, shares no processors, and cannot end the job.
+    virtual bool knowsSharedMemory() const = 0; // whether it has the next three
     virtual bool lendsTo(int other) const = 0;
     virtual std::int32_t placeOf(const std::byte* block) const = 0;
     virtual std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const = 0;
@@ -287,6 +288,7 @@ public:
     void interrupt() override { transport_.interrupt(); }
     void stop(bool orderly) override { transport_.stop(orderly); }
 
+    bool knowsSharedMemory() const override { return shares_memory_v<Transport>; }
     bool lendsTo([[maybe_unused]] int other) const override
     {
         if constexpr (shares_memory_v<Transport>)

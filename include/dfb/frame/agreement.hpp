@@ -33,11 +33,16 @@ private:
     std::uint64_t value_ = 1469598103934665603u;
 };
 
-// The configuration of one rank, or its error. Combined: whether all are right and equal.
+// The configuration of one rank, or its error. Combined: whether all are right and equal, and which share a node.
 struct Agreement {
+    struct OnNode {
+        std::int32_t rank = 0, first = 0; // the lowest rank of its node
+    };
+
     bool fine = true;
     std::string text; // of Settings; or the error
     int rank = 0;     // the lowest rank that has it; -1 if two ranks differ
+    std::vector<OnNode> nodes{};
 
     // Names and values, a line each.
     class Settings {
@@ -65,7 +70,7 @@ struct Agreement {
     // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
     // the owner map's answers.
     template <class OwnerOf>
-    static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, int rank,
+    static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, OnNode here,
                         ChannelMask sent, int tileCount, const OwnerOf& ownerOf)
     {
         Fingerprint owners;
@@ -96,7 +101,7 @@ struct Agreement {
         s.add("minTransmittance", c.minTransmittance);
         s.add("messages.poolBytes", c.messages.poolBytes);
         s.add("checksums", checksums);
-        return {true, s.text(), rank};
+        return {true, s.text(), here.rank, {here}};
     }
 
     // Throws the exception for a result that is not fine, as all ranks do.
@@ -111,6 +116,8 @@ struct Agreement {
         out.put(static_cast<std::uint8_t>(fine));
         out.put(static_cast<std::int32_t>(rank));
         out.putText(text);
+        for (const OnNode& its : nodes)
+            out.put(its);
         return out.bytes();
     }
 
@@ -123,18 +130,26 @@ struct Agreement {
         a.fine = fine != 0;
         a.rank = in.get<std::int32_t>();
         a.text = in.getText();
-        in.end();
+        while (in.left() > 0) {
+            const auto its = in.get<OnNode>();
+            in.require(its.first >= 0 && its.first <= its.rank);
+            a.nodes.push_back(its);
+        }
         return a;
     }
 
     static SmallBytes combine(const SmallBytes& first, const SmallBytes& second)
     {
-        const Agreement a = from(first), b = from(second);
-        if (!a.fine || (b.fine && a.text == b.text))
+        Agreement a = from(first);
+        const Agreement b = from(second);
+        if (!a.fine)
             return first;
         if (!b.fine)
             return second;
-        return Agreement{false, difference(a, b), -1}.bytes();
+        if (a.text != b.text)
+            return Agreement{false, difference(a, b), -1}.bytes();
+        a.nodes.insert(a.nodes.end(), b.nodes.begin(), b.nodes.end());
+        return a.bytes();
     }
 
 private:

@@ -74,8 +74,8 @@ private:
 class Declarations {
 public:
     // `lastHolds`: the declarations up to the last frame have arrived at all owners. It must be the same on all ranks.
-    // False: all of it is forgotten.
-    void newFrame(bool lastHolds)
+    // False: all of it is forgotten. `haveMoved`: tiles have other owners than in the last frame.
+    void newFrame(bool lastHolds, bool haveMoved)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         if (!lastHolds) {
@@ -87,6 +87,7 @@ public:
         changedInputs_.clear();
         acksMissing_.clear();
         declared_ = isComplete_ = false;
+        haveMoved_ = haveMoved_ || haveMoved;
     }
 
     // Takes note of the inputs that this rank will send: calls send(owner, bytes) for each other owner whose inputs
@@ -94,7 +95,8 @@ public:
     template <class OwnerOf, class Send>
     bool declare(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
     {
-        if (inputs == mine_) {
+        const bool haveMoved = std::exchange(haveMoved_, false);
+        if (inputs == mine_ && !haveMoved) {
             const std::lock_guard<std::mutex> lock(mutex_);
             declared_ = true;
             return false;
@@ -237,6 +239,7 @@ private:
 
     // Only declare() and newFrame() use them.
     std::vector<TileInput> mine_;          // as it was declared last
+    bool haveMoved_ = false;               // tiles, since then
     std::vector<Addressed> told_, toTell_; // by owner: told in the last frame; its successor
     std::vector<Part> news_;               // the parts of toTell_ that are not as in told_
     ByteWriter manifest_;                  // for one owner

@@ -32,6 +32,9 @@ public:
     virtual const TileLayout& layout() const noexcept = 0;
     virtual int tileOwner(int tile) const noexcept = 0;
     virtual const std::vector<int>& ownedTiles() const noexcept = 0;
+    virtual int ownerNow(int tile) const noexcept = 0; // in the frame that is open
+    virtual const std::vector<int>& ownedNow() const noexcept = 0;
+    virtual const std::vector<int>& nodeOf() const noexcept = 0; // of each rank: the lowest rank of its node
     virtual const Image& image() const noexcept = 0;
     virtual std::int64_t imageFrame() const noexcept = 0;
     virtual Image imageOnAllRanks() = 0;

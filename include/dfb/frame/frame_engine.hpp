@@ -75,7 +75,8 @@ public:
                                                       [this](Verdict& verdict) { addFigures(verdict); });
             // The rank after the display rank hands out jobs, as that one has enough to do.
             jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
-            mine = Agreement::of(traits(), config_, mailbox_->connection().config().checksums, rank(),
+            const Connection& network = mailbox_->connection();
+            mine = Agreement::of(traits(), config_, network.config().checksums, {rank(), network.firstOnNode()},
                                  TilePipeline::travelling(traits(), config_), layout().tileCount(),
                                  [this](int tile) { return tileOwner(tile); });
         } catch (const InvalidArgument& e) {
@@ -95,6 +96,10 @@ public:
         if (!all.fine)
             all.refuse(mailbox_->connection());
         mailbox_->connection().setAlike();
+        nodeOf_.resize(static_cast<std::size_t>(size()));
+        for (const Agreement::OnNode& its : all.nodes)
+            if (its.rank < size())
+                nodeOf_[static_cast<std::size_t>(its.rank)] = its.first;
         tellImagePlace();
     }
 
@@ -106,8 +111,11 @@ public:
     int size() const noexcept override { return mailbox_->size(); }
     const FrameBufferConfig& config() const noexcept override { return config_; }
     const TileLayout& layout() const noexcept override { return pipeline_->table().layout(); }
-    int tileOwner(int tile) const noexcept override { return pipeline_->table().owner(tile); }
-    const std::vector<int>& ownedTiles() const noexcept override { return pipeline_->table().owned(); }
+    int tileOwner(int tile) const noexcept override { return pipeline_->table().ownerByMap(tile); }
+    const std::vector<int>& ownedTiles() const noexcept override { return pipeline_->table().ownedByMap(); }
+    int ownerNow(int tile) const noexcept override { return pipeline_->table().owner(tile); }
+    const std::vector<int>& ownedNow() const noexcept override { return pipeline_->table().owned(); }
+    const std::vector<int>& nodeOf() const noexcept override { return nodeOf_; }
     const Image& image() const noexcept override { return imageFrame() < 0 ? noImage_ : pipeline_->gather().image(); }
     std::int64_t imageFrame() const noexcept override { return pipeline_->gather().imageFrame(); }
     bool isComplete(int tile) const override { return pipeline_->gather().isComplete(tile); }
@@ -125,12 +133,15 @@ public:
             failArgument("at most %d layers", params.maxLayers);
         const bool lastFailed = outcome_->lastFailed();
         accumulation_.check(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
+        if (params.owners && traits().keepsState)
+            failArgument("owners of a frame's own, with a tile operation that keeps state");
         if (const long long ms = params.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
             failArgument("a time-out of %lld ms", ms);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
+        const bool haveMoved = pipeline_->table().prepare(params.owners);
         params_ = params;
-        declarations_.newFrame(!lastFailed); // after one that failed, owners may know of different ones
+        declarations_.newFrame(!lastFailed, haveMoved); // after one that failed, owners may know of different ones
 
         TileInfo info;
         info.rank = rank();
@@ -143,7 +154,8 @@ public:
         info.order = params_.order.get();
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, params.maxLayers, codecFor(config_.image.displayRank) != nullptr);
+            pipeline_->newFrame(info, params.samples, params.owners, haveMoved, params.maxLayers,
+                                codecFor(config_.image.displayRank) != nullptr);
         } catch (...) {
             userError = std::current_exception();
         }
@@ -160,7 +172,7 @@ public:
         figures_.newFrame();
         std::int64_t rendered = 0;
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
-        for (const int tile : ownedTiles()) {
+        for (const int tile : ownedNow()) {
             if (pipeline_->table().samples(tile).count > 0)
                 ++rendered;
             else if (!traits().pixelOpIsPointwise)
@@ -183,7 +195,7 @@ public:
         pipeline_->checkPlanes(tile);
         if (outcome_->failed() || isHidden(tile.tile, tile.generation))
             return;
-        const int owner = tileOwner(tile.tile);
+        const int owner = ownerNow(tile.tile);
         const bool isInPlace = pipeline_->mayReadInPlace(tile);
         if (isInPlace && mailbox_->connection().config().checksums)
             pipeline_->notePromise(tile);
@@ -248,7 +260,7 @@ public:
         if (outcome_->failed())
             return;
         const bool isWaiting = declarations_.declare(
-            inputs, rank(), [this](int tile) { return tileOwner(tile); },
+            inputs, rank(), [this](int tile) { return ownerNow(tile); },
             [this](int owner, const Bytes& manifest) {
                 mailbox_->send(owner, MessageKind::Manifest, open_.number(), manifest);
             });
@@ -810,6 +822,7 @@ private:
     Operations& operations_;
     std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
+    std::vector<int> nodeOf_;
     Declarations declarations_;
     HiddenTiles hidden_;
 

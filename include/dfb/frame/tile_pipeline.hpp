@@ -40,8 +40,8 @@ public:
               pool_, table_.layout(),
               {config.image.format, imageChannels(config), address, config.messages.codec, config.image.dither,
                config.onTile},
-              config.image.displayRank, rank, sendersTo(config.image.displayRank, rankCount),
-              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
+              config.image.displayRank, rank, rankCount, [this](int tile) { return table_.owner(tile); },
+              std::move(sendToDisplay)),
           coder_(config.precision, traits().activeByDepth, traits().readsInPlace && !isLossy())
     {
     }
@@ -77,10 +77,10 @@ public:
     FinalGather& gather() noexcept { return gather_; }
     const FinalGather& gather() const noexcept { return gather_; }
 
-    // No other member may be running.
-    // `compresses`: whether finished tiles are compressed. Throws the exceptions of user code: then all is ready but
-    // its data.
-    void newFrame(TileInfo info, const SamplePlan& plan, int maxLayers, bool compresses)
+    // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `compresses`: whether
+    // finished tiles are compressed. Throws the exceptions of user code: then all is ready but its data.
+    void newFrame(TileInfo info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved, int maxLayers,
+                  bool compresses)
     {
         faults_.reset();
         promises_.clear();
@@ -90,11 +90,13 @@ public:
         if (!traits().takesOrder)
             info.order = nullptr;
         sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
-        gather_.newFrame(info.frame, compresses, info.background);
         info.minTransmittance = config_.minTransmittance;
         background_ = info.background;
         backgroundIsFine_ = true;
-        table_.newFrame(info, plan);
+        table_.newFrame(info, plan, owners);
+        if (haveMoved)
+            gather_.findSenders();
+        gather_.newFrame(info.frame, compresses, info.background);
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(maxLayers);
@@ -382,15 +384,6 @@ private:
                                 width * bytes);
             }
         }
-    }
-
-    // For each rank, whether it has finished tiles to send to that one.
-    std::vector<bool> sendersTo(int displayRank, int rankCount) const
-    {
-        std::vector<bool> senders(static_cast<std::size_t>(rankCount));
-        for (int r = 0; r < rankCount; ++r)
-            senders[static_cast<std::size_t>(r)] = r != displayRank && table_.ownsTiles(r);
-        return senders;
     }
 
     PixelsInPlace inPlace(const InputPixels& tile) const { return pixelsInPlace(tile, sent_, traits().activeByDepth); }

@@ -63,44 +63,62 @@ class TileTable {
 public:
     // `operations` must live as long as this. Throws InvalidArgument for owners that there are not, and OutOfMemory.
     TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount, const Operations& operations)
-    try : operations_(operations), layout_(layout), rank_(rank), owners_(static_cast<std::size_t>(layout.tileCount())),
-        slotOf_(static_cast<std::size_t>(layout.tileCount()), -1) {
-        for (int tile = 0; tile < layout.tileCount(); ++tile) {
-            const int owner = ownerMap(tile, layout, rankCount);
-            if (owner < 0 || owner >= rankCount)
-                failArgument("the owner map gives tile %d to rank %d of %d", tile, owner, rankCount);
-            owners_[static_cast<std::size_t>(tile)] = owner;
-            if (owner == rank) {
-                slotOf_[static_cast<std::size_t>(tile)] = static_cast<int>(owned_.size());
-                owned_.push_back(tile);
-            }
-        }
-        slots_.resize(owned_.size());
-        series_.resize(traits().keepsState ? owned_.size() : 0);
+    try : operations_(operations), layout_(layout), rank_(rank), rankCount_(rankCount),
+        slots_(static_cast<std::size_t>(layout.tileCount())),
+        series_(traits().keepsState ? static_cast<std::size_t>(layout.tileCount()) : 0) {
+        std::vector<int> owners;
+        owners.reserve(slots_.size());
+        for (int tile = 0; tile < layout.tileCount(); ++tile)
+            owners.push_back(ownerMap(tile, layout, rankCount));
+        byMap_ = std::make_shared<const std::vector<int>>(std::move(owners));
+        prepare(byMap_, "the owner map");
+        setOwners(byMap_);
+        ownedByMap_ = owned_;
     } catch (const std::bad_alloc&) {
-        constexpr std::size_t mostBytes = 2 * sizeof(std::int32_t) + sizeof(int) + sizeof(std::unique_ptr<Slot>);
+        constexpr std::size_t mostBytes = 3 * sizeof(int) + sizeof(std::unique_ptr<Slot>);
         const auto tiles = static_cast<std::size_t>(layout.tileCount());
         throw OutOfMemory(mostBytes * tiles, ("tables of " + std::to_string(tiles) + " tiles").c_str());
     }
 
     const TileLayout& layout() const noexcept { return layout_; }
-    int owner(int tile) const noexcept { return owners_[static_cast<std::size_t>(tile)]; }
-    bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
+
+    // Of this frame, and by the owner map alone.
+    int owner(int tile) const noexcept { return (*owners_)[static_cast<std::size_t>(tile)]; }
     const std::vector<int>& owned() const noexcept { return owned_; }
-    // Whether a rank owns any tile.
-    bool ownsTiles(int rank) const { return std::find(owners_.begin(), owners_.end(), rank) != owners_.end(); }
+    int ownerByMap(int tile) const noexcept { return (*byMap_)[static_cast<std::size_t>(tile)]; }
+    const std::vector<int>& ownedByMap() const noexcept { return ownedByMap_; }
+
+    bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
+    // Makes room for the owners that newFrame() will get. Returns whether they are others than before. Throws
+    // InvalidArgument if they cannot be: `who` gives them.
+    bool prepare(const TileOwners& owners, const char* who = "FrameConfig::owners")
+    {
+        const std::vector<int>& next = *(owners ? owners : byMap_);
+        if (owners_ && (&next == owners_.get() || next == *owners_))
+            return false;
+        if (next.size() != slots_.size())
+            failArgument("%s has %zu tiles, the image %zu", who, next.size(), slots_.size());
+        for (std::size_t tile = 0; tile < next.size(); ++tile)
+            if (next[tile] < 0 || next[tile] >= rankCount_)
+                failArgument("%s gives tile %zu to rank %d of %d", who, tile, next[tile], rankCount_);
+        spare_.reserve(spare_.size() + owned_.size());
+        owned_.reserve(static_cast<std::size_t>(std::count(next.begin(), next.end(), rank_)));
+        return true;
+    }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
-    // `info` is common to all tiles. No other member may be running.
-    void newFrame(const TileInfo& info, const SamplePlan& plan)
+    // `info` is common to all tiles; `owners`: see prepare(), which was called with them. No other member may be
+    // running.
+    void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners)
     {
+        setOwners(owners ? owners : byMap_);
         expected_ = nullptr;
         info_ = info;
         plan_ = plan;
         arrived_ = endedEarly_ = 0;
-        for (std::size_t i = 0; i < series_.size(); ++i)
-            if (const TileSamples s = samples(owned_[i]); s.count > 0) {
-                Series& series = series_[i];
+        for (std::size_t tile = 0; tile < series_.size(); ++tile)
+            if (const TileSamples s = samples(static_cast<int>(tile)); s.count > 0) {
+                Series& series = series_[tile];
                 series.goesOn = s.first > 0 && s.first == series.next;
                 series.begin = s.first == 0 ? info.frame : series.begin;
                 series.next = s.first + s.count;
@@ -170,33 +188,32 @@ public:
     {
         expected_ = &expected; // from now on slotFor() knows
         std::exception_ptr failure;
-        for (std::size_t i = 0; i < owned_.size(); ++i) {
-            const ExpectedInputs::Range inputs = expected.of(owned_[i]);
+        for (const int tile : owned_) {
+            const ExpectedInputs::Range inputs = expected.of(tile);
             const bool named = !inputs.empty();
             bool complete = false;
             {
-                const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
-                const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-                if ((!named && !all && !touched && !hasSamples(owned_[i])) || samples(owned_[i]).count == 0)
+                const std::lock_guard<std::mutex> lock(mutexOf(tile));
+                const auto& slot = slotOf(tile);
+                if ((!named && !all && !isTouched(tile) && !hasSamples(tile)) || samples(tile).count == 0)
                     continue;
                 try {
-                    Slot& slot = slotFor(owned_[i]);
-                    if (!slot.declared)
-                        declareSlot(slot, inputs);
+                    if (Slot& its = slotFor(tile); !its.declared)
+                        declareSlot(its, inputs);
                 } catch (...) {
-                    if (!slots_[i])
+                    if (!slot)
                         throw;
-                    slots_[i]->spoilt = true;
+                    slot->spoilt = true;
                     if (!failure)
-                        where.tile = owned_[i];
+                        where.tile = tile;
                     failure = failure ? failure : std::current_exception();
                 }
-                slots_[i]->counted = true;
-                complete = becomesReady(*slots_[i], slots_[i]->spoilt || allComplete(*slots_[i]));
+                slot->counted = true;
+                complete = becomesReady(*slot, slot->spoilt || allComplete(*slot));
             }
-            counted(owned_[i]);
+            counted(tile);
             if (complete)
-                ready(owned_[i]);
+                ready(tile);
         }
         if (failure)
             std::rethrow_exception(failure);
@@ -231,13 +248,12 @@ public:
     {
         std::vector<std::int32_t> tiles;
         const ExpectedInputs* expected = expected_;
-        for (std::size_t i = 0; i < owned_.size(); ++i) {
-            const int tile = owned_[i];
+        for (const int tile : owned_) {
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
-            const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
+            const auto& slot = slotOf(tile);
             const bool isBackground = declared && expected && expected->of(tile).empty();
-            if (touched ? slots_[i]->spoilt || (!slots_[i]->finished && (!isBackground || slots_[i]->counted))
-                        : !isBackground && samples(tile).count > 0)
+            if (isTouched(tile) ? slot->spoilt || (!slot->finished && (!isBackground || slot->counted))
+                                : !isBackground && samples(tile).count > 0)
                 tiles.push_back(tile);
         }
         return tiles;
@@ -255,16 +271,16 @@ public:
         std::optional<ErrorInfo> first;
         int tiles = 0;
         std::string text;
-        for (std::size_t i = 0; i < owned_.size(); ++i) {
-            const int tile = owned_[i];
+        for (const int tile : owned_) {
             const ExpectedInputs::Range inputs = expected ? expected->of(tile) : ExpectedInputs::Range{};
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
-            const bool touched = slots_[i] && slots_[i]->frame == info_.frame;
-            if (touched ? slots_[i]->ready : (declared && inputs.empty()) || samples(tile).count == 0)
+            const auto& slot = slotOf(tile);
+            const bool touched = isTouched(tile);
+            if (touched ? slot->ready : (declared && inputs.empty()) || samples(tile).count == 0)
                 continue;
             const DependencyTracker untouched;
             for (int pass = 0; pass < samples(tile).count; ++pass) {
-                const DependencyTracker& tree = touched ? slots_[i]->trees[static_cast<std::size_t>(pass)] : untouched;
+                const DependencyTracker& tree = touched ? slot->trees[static_cast<std::size_t>(pass)] : untouched;
                 const auto m = tree.missing();
                 if (!m)
                     continue;
@@ -300,9 +316,9 @@ public:
     int touchedCount()
     {
         int count = 0;
-        for (std::size_t i = 0; i < slots_.size(); ++i) {
-            const std::lock_guard<std::mutex> lock(mutexOf(owned_[i]));
-            count += slots_[i] && slots_[i]->frame == info_.frame && slots_[i]->touched;
+        for (const int tile : owned_) {
+            const std::lock_guard<std::mutex> lock(mutexOf(tile));
+            count += isTouched(tile) && slotOf(tile)->touched;
         }
         return count;
     }
@@ -328,15 +344,46 @@ private:
 
     std::mutex& mutexOf(int tile) { return mutexes_[static_cast<std::size_t>(tile) % mutexes_.size()]; }
 
-    std::unique_ptr<Slot>& slotOf(int tile)
+    std::unique_ptr<Slot>& slotOf(int tile) { return slots_[static_cast<std::size_t>(tile)]; }
+    // Whether the slot is there, and of this frame.
+    bool isTouched(int tile)
     {
-        return slots_[static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)])];
+        const auto& slot = slotOf(tile);
+        return slot && slot->frame == info_.frame;
+    }
+
+    // After prepare(). Slots of tiles that this rank has no more are kept for others.
+    void setOwners(const TileOwners& owners)
+    {
+        if (owners_ && *owners_ == *owners)
+            return;
+        owners_ = owners;
+        for (const int tile : owned_)
+            if (auto& slot = slotOf(tile); slot && !isMine(tile)) {
+                slot->background = BackgroundPixels(); // others write to this tile's place from now on
+                spare_.push_back(std::move(slot));
+            }
+        owned_.clear();
+        for (int tile = 0; tile < layout_.tileCount(); ++tile)
+            if (isMine(tile))
+                owned_.push_back(tile);
+    }
+    std::unique_ptr<Slot> takeSpare()
+    {
+        const std::lock_guard<std::mutex> lock(spareMutex_);
+        if (spare_.empty())
+            return nullptr;
+        auto slot = std::move(spare_.back());
+        spare_.pop_back();
+        return slot;
     }
 
     // Of this frame. The first time, throws the exceptions of the op's newFrame(): then the tile is spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
+        if (!slot)
+            slot = takeSpare();
         if (!slot) {
             auto made = std::make_unique<Slot>();
             made->op = operations_.makeTile();
@@ -370,16 +417,12 @@ private:
     }
 
     // Whether the samples of this frame follow those of the tile in earlier ones.
-    bool goesOn(int tile) const
-    {
-        const auto i = static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)]);
-        return traits().keepsState && series_[i].goesOn;
-    }
+    bool goesOn(int tile) const { return traits().keepsState && series_[static_cast<std::size_t>(tile)].goesOn; }
     // Whether the operation has had any of those: then it gets this frame's, too, also if there is nothing in them.
     bool hasSamples(int tile)
     {
-        const auto i = static_cast<std::size_t>(slotOf_[static_cast<std::size_t>(tile)]);
-        return goesOn(tile) && slots_[i] && slots_[i]->frame >= series_[i].begin;
+        const auto& slot = slotOf(tile);
+        return goesOn(tile) && slot && slot->frame >= series_[static_cast<std::size_t>(tile)].begin;
     }
 
     static void declareSlot(Slot& slot, const ExpectedInputs::Range& inputs)
@@ -461,11 +504,13 @@ private:
 
     const Operations& operations_;
     TileLayout layout_;
-    int rank_;
-    std::vector<std::int32_t> owners_, slotOf_;
-    std::vector<int> owned_;
-    std::vector<std::unique_ptr<Slot>> slots_;
-    std::vector<Series> series_; // of each owned tile, with an operation that keeps state
+    int rank_, rankCount_;
+    TileOwners byMap_, owners_; // owners_: of this frame
+    std::vector<int> ownedByMap_, owned_;
+    std::vector<std::unique_ptr<Slot>> slots_; // of each tile; null for those of others
+    std::mutex spareMutex_;
+    std::vector<std::unique_ptr<Slot>> spare_; // under spareMutex_
+    std::vector<Series> series_;               // of each tile, with an operation that keeps state
     std::array<std::mutex, 64> mutexes_;
     std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
     TileInfo info_;

@@ -64,6 +64,7 @@ struct FrameTerms {
     std::int64_t sampleCount = 0;  // of all tiles in the plan
     std::uint64_t accumulationId = 0;
     std::uint64_t orderHash = 0;               // 0: there is no order
+    std::uint64_t ownersHash = 0;              // 0: those of the owner map
     std::array<std::uint32_t, 4> background{}; // bits: so that a NaN equals itself
     std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
     std::int32_t declared = 0, allowPartial = 0;
@@ -86,6 +87,12 @@ struct FrameTerms {
             for (const SourceOrder::Place& place : p.order->places())
                 f.add(static_cast<std::uint64_t>(place.source) << 32 | static_cast<std::uint32_t>(place.place));
             t.orderHash = f.value();
+        }
+        if (p.owners) {
+            Fingerprint f;
+            for (const int owner : *p.owners)
+                f.add(static_cast<std::uint64_t>(owner));
+            t.ownersHash = f.value();
         }
         std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
         t.passes = p.passes;
@@ -131,10 +138,11 @@ struct FrameTerms {
         compare("samples", samplesHash != o.samplesHash, planText(*this), planText(o));
         number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
         number("accumulationId", accumulationId, o.accumulationId);
-        const auto orderText = [](const FrameTerms& t) {
-            return t.orderHash == 0 ? std::string("null") : "an order with hash " + numberText(t.orderHash);
+        const auto hashText = [](std::uint64_t hash) {
+            return hash == 0 ? std::string("null") : "one with hash " + numberText(hash);
         };
-        compare("order", orderHash != o.orderHash, orderText(*this), orderText(o));
+        compare("order", orderHash != o.orderHash, hashText(orderHash), hashText(o.orderHash));
+        compare("owners", ownersHash != o.ownersHash, hashText(ownersHash), hashText(o.ownersHash));
         flag("declared", declared, o.declared);
         number("timeout", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
         flag("allowPartial", allowPartial, o.allowPartial);

@@ -52,18 +52,16 @@ public:
         std::int64_t imageEpoch = 0;
     };
 
-    // `senders`: which ranks have finished tiles for the display rank; `ownerOf(tile)`: which. `send`: to it, batches
-    // and the count of tiles.
+    // `ownerOf(tile)`: the rank that has it when it is finished. `send`: to the display rank, batches and the count of
+    // tiles.
     FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, GatherConfig config, int displayRank,
-                int rank, std::vector<bool> senders, OwnerOf ownerOf, Send send)
+                int rank, int rankCount, OwnerOf ownerOf, Send send)
         : pool_(std::move(pool)), layout_(layout), config_(std::move(config)), displayRank_(displayRank), rank_(rank),
-          senders_(std::move(senders)), ownerOf_(std::move(ownerOf)), send_(std::move(send)),
-          record_(config_.format, config_.channels)
+          ownerOf_(std::move(ownerOf)), send_(std::move(send)), record_(config_.format, config_.channels),
+          tilesOf_(static_cast<std::size_t>(rankCount))
     {
+        findSenders();
         if (displays()) {
-            tilesOf_ = std::vector<TilesOf>(senders_.size());
-            for (int tile = 0; tile < layout_.tileCount(); ++tile)
-                ++tilesOf_[static_cast<std::size_t>(ownerOf_(tile))].owned;
             image_ = Image(*pool_, layout_.width(), layout_.height(), config_.format, config_.channels);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
             for (auto& s : state_)
@@ -79,6 +77,18 @@ public:
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
     bool enabled() const noexcept { return config_.format != OutputFormat::None; }
     bool displays() const noexcept { return isDisplay() && enabled(); }
+
+    // Call it before newFrame() if tiles have other owners than in the last frame.
+    void findSenders()
+    {
+        for (TilesOf& its : tilesOf_)
+            its.owned = 0;
+        for (int tile = 0; tile < layout_.tileCount(); ++tile)
+            ++tilesOf_[static_cast<std::size_t>(ownerOf_(tile))].owned;
+        senderCount_ = 0;
+        for (std::size_t r = 0; r < tilesOf_.size(); ++r)
+            senderCount_ += isSender(r);
+    }
 
     // `compresses`: whether the codec, if there is one, is used. `background`: the image's pixels where no tile is.
     void newFrame(std::int64_t frame, bool compresses, const std::array<float, 4>& background)
@@ -288,7 +298,7 @@ public:
     // the first call does anything.
     void flush()
     {
-        if (!enabled() || !senders_[static_cast<std::size_t>(rank_)])
+        if (!enabled() || !isSender(static_cast<std::size_t>(rank_)))
             return;
         std::shared_ptr<Batch> last;
         Buffer done;
@@ -396,7 +406,7 @@ public:
     }
 
     // All tiles of the other ranks are in the image.
-    bool complete() const { return !displays() || ranksComplete_ == senderCount(); }
+    bool complete() const { return !displays() || ranksComplete_ == senderCount_; }
 
     // Names the ranks whose tiles have not come; `expected` and `got` count ranks.
     ErrorInfo missing() const
@@ -413,7 +423,7 @@ public:
             if (info.from < 0)
                 info.from = static_cast<int>(r);
         }
-        info.expected = senderCount();
+        info.expected = senderCount_;
         info.got = ranksComplete_;
         return info;
     }
@@ -500,8 +510,10 @@ private:
         }
     };
 
+    // Whether a rank has finished tiles for the display rank.
+    bool isSender(std::size_t r) const { return static_cast<int>(r) != displayRank_ && tilesOf_[r].owned > 0; }
     // Under mutex_.
-    bool isMissing(std::size_t r) const { return senders_[r] && !tilesOf_[r].isComplete(); }
+    bool isMissing(std::size_t r) const { return isSender(r) && !tilesOf_[r].isComplete(); }
 
     // Under mutex_. These have come as well. With a rank's last message its tiles must be as many as it has counted:
     // thus a wrong count never ends a frame too early. Throws Error (MalformedMessage).
@@ -627,8 +639,6 @@ private:
         send_(std::move(message));
     }
 
-    int senderCount() const { return static_cast<int>(std::count(senders_.begin(), senders_.end(), true)); }
-
     void requireDisplay() const
     {
         if (!displays())
@@ -639,7 +649,6 @@ private:
     TileLayout layout_;
     GatherConfig config_;
     int displayRank_, rank_;
-    std::vector<bool> senders_; // of finished tiles, rank by rank
     OwnerOf ownerOf_;
     Send send_;
     const FinishedRecord record_;
@@ -661,8 +670,9 @@ private:
     std::array<float, 4> background_{}, lastBackground_{};
     std::vector<std::atomic<TileState>> state_; // on the display rank
     std::vector<std::int32_t> incomplete_;      // of the last frame
-    std::vector<TilesOf> tilesOf_;              // per rank, on the display rank; under mutex_
-    std::atomic<int> ranksComplete_{0};         // of those that send
+    std::vector<TilesOf> tilesOf_;              // per rank; on the display rank under mutex_
+    int senderCount_ = 0;
+    std::atomic<int> ranksComplete_{0}; // of those that send
 };
 
 } // namespace detail

@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/frame.hpp>
+#include <dfb/render/link_owners.hpp>
 #include <dfb/render/shared_world.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/render/world.hpp>
@@ -10,7 +11,9 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <exception>
 #include <numeric>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -129,7 +132,7 @@ class ImageParallelLoop {
 public:
     // The distribution must be the same on all ranks.
     explicit ImageParallelLoop(FrameBuffer& fb, WorkDistribution distribution = WorkDistribution::Owned)
-        : fb_(fb), distribution_(distribution), tiles_(fb.ownedTiles())
+        : fb_(fb), distribution_(distribution)
     {
     }
 
@@ -150,8 +153,9 @@ public:
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
             const bool hasList = distribution_ == WorkDistribution::Owned;
-            const auto tileOf = [&](std::size_t item) { return hasList ? tiles_[item] : static_cast<int>(item); };
-            jobs_.find(hasList ? tiles_.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
+            const std::vector<int>& tiles = tiles_ ? *tiles_ : frame.ownedTiles();
+            const auto tileOf = [&](std::size_t item) { return hasList ? tiles[item] : static_cast<int>(item); };
+            jobs_.find(hasList ? tiles.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
                        [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
             const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
             // `number` jobs: first, first + step and so on, modulo all there are.
@@ -194,11 +198,75 @@ public:
 private:
     FrameBuffer& fb_;
     WorkDistribution distribution_ = WorkDistribution::Owned;
-    std::vector<int> tiles_; // with WorkDistribution::Owned: those that this rank renders
+    std::optional<std::vector<int>> tiles_; // that this rank renders, if it was told
     detail::PassJobs jobs_;
 };
 
 namespace detail {
+
+// What a SharedWorld and a camera say about the frames of a loop. It is needed for begin(); what the camera throws has
+// to come out of the frame, on all ranks.
+class FromWorld {
+public:
+    template <class FrameBuffer, class Camera>
+    void set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera)
+    {
+        guarded([&] {
+            order_.template set<FrameBuffer>(config, world, camera);
+            findOwners(config, fb, world, camera, !config.order);
+        });
+    }
+    // Leaves the order alone: inputs have no depth.
+    template <class FrameBuffer, class Camera>
+    void setOwners(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera)
+    {
+        guarded([&] { findOwners(config, fb, world, camera, false); });
+    }
+
+    // Within the frame: throws what the camera has thrown before.
+    void rethrow() const
+    {
+        if (failure_)
+            std::rethrow_exception(failure_);
+    }
+
+private:
+    template <class F>
+    void guarded(const F& f)
+    {
+        failure_ = nullptr;
+        try {
+            f();
+        } catch (...) {
+            failure_ = std::current_exception();
+        }
+    }
+
+    // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
+    // `hasDepth`: inputs have.
+    template <class FrameBuffer, class Camera>
+    void findOwners(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+                    bool hasDepth)
+    {
+        if (FrameBuffer::keepsState || config.owners || fb.config().image.ownerMap)
+            return;
+        if (!owners_)
+            owners_.emplace(fb.nodeOf());
+        if (owners_->isOneNode())
+            return;
+        const TileLayout& layout = fb.layout();
+        owners_->start(layout);
+        for (const SharedBrick& b : world.bricks())
+            forEachTile(
+                camera.project(b.brick.bounds, layout.width(), layout.height()), layout,
+                [&](int tile, const Region& pixels) { owners_->add(tile, pixels, b.ranks.data(), b.ranks.size()); });
+        config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
+    }
+
+    BrickOrder order_;
+    std::optional<LinkOwners> owners_;
+    std::exception_ptr failure_;
+};
 
 // The jobs of a rank that renders its own bricks, and its declaration.
 class OwnBricks {
@@ -206,9 +274,10 @@ public:
     // Calls job(brick, tile) for each brick, tile and pass, with a tile that has been started for them.
     template <class Render, class FrameBuffer, class Camera, class Job>
     void forEach(FrameBuffer& fb, typename FrameBuffer::Frame& frame, const World& world, const Camera& camera,
-                 const Job& job)
+                 const Job& job, const FromWorld& fromWorld = FromWorld())
     {
         frame.guard([&] {
+            fromWorld.rethrow();
             findVisibleTiles(world, camera, fb.layout(), pairs_);
             findInputs(world, pairs_, inputs_);
             frame.declare(inputs_);
@@ -242,6 +311,7 @@ public:
 
     // With the bricks of all ranks, which must outlive it, and of which `world` must have those of this rank. Where
     // they have an order for a camera, AlphaBlend is told, sends no depth, and sorts nothing: see FrameConfig::order.
+    // On several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }
@@ -260,12 +330,15 @@ public:
     {
         params.declared = true;
         if (all_)
-            order_.template set<FrameBuffer>(params, *all_, camera);
+            fromWorld_.set(params, fb_, *all_, camera);
         auto frame = fb_.begin(params, tileData, pixelData);
-        bricks_.template forEach<RenderBrick>(fb_, frame, world_, camera, [&](const Brick& brick, auto& tile) {
-            renderBrick(brick, tile);
-            frame.setTile(tile);
-        });
+        bricks_.template forEach<RenderBrick>(
+            fb_, frame, world_, camera,
+            [&](const Brick& brick, auto& tile) {
+                renderBrick(brick, tile);
+                frame.setTile(tile);
+            },
+            fromWorld_);
         return frame;
     }
 
@@ -283,7 +356,7 @@ private:
     const World& world_;
     const SharedWorld* all_ = nullptr;
     detail::OwnBricks bricks_;
-    detail::BrickOrder order_;
+    detail::FromWorld fromWorld_;
 };
 
 DFB_NAMESPACE_END

@@ -342,9 +342,10 @@ public:
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
-        order_.template set<FrameBuffer>(params, world_, camera);
+        fromWorld_.set(params, fb_, world_, camera);
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
+            fromWorld_.rethrow();
             detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findJobs(frame, world_, owner_);
@@ -385,7 +386,7 @@ private:
     const SharedWorld& world_;
     TileBrickOwner& owner_;
     detail::MixedWork work_;
-    detail::BrickOrder order_;
+    detail::FromWorld fromWorld_;
     std::vector<TileInput> inputs_; // that this rank declares
 };
 
@@ -411,13 +412,15 @@ public:
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
+        fromWorld_.setOwners(params, fb_, world_, camera);
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
+            fromWorld_.rethrow();
             detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
             work_.sortFrontToBack(world_, order);
             work_.findJobs(frame, world_, owner_);
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
-            work_.findEmpty(fb_.layout().tileCount(), fb_.ownedTiles());
+            work_.findEmpty(fb_.layout().tileCount(), frame.ownedTiles());
             const auto emptyCount = static_cast<std::int64_t>(work_.empty.size());
             frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
                 emptyCount, [&](std::int64_t i, auto& tile) {
@@ -530,6 +533,7 @@ private:
     const SharedWorld& world_;
     TileBrickOwner& owner_;
     detail::OrderedWork work_;
+    detail::FromWorld fromWorld_;
 };
 
 DFB_NAMESPACE_END

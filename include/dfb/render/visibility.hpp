@@ -5,7 +5,9 @@
 // It returns the pixels of a width x height image that the box may cover, for any sample position within a pixel. It
 // must not leave out a pixel; a tile too many only costs a header of 64 bytes. In place of a Region it may return a
 // Footprint, a convex polygon that leaves out tiles in the corners of the rectangle, or a std::vector of either: a
-// stereo camera returns two.
+// stereo camera returns two. A camera of your own may also have
+//   std::optional<Vec3> commonEye() const;
+// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order).
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -93,6 +95,7 @@ private:
             return (a.x - o.x) * (b.y - o.y) - (a.y - o.y) * (b.x - o.x) <= 0;
         };
         std::vector<PixelPoint> hull;
+        hull.reserve(points.size() + 1);
         for (int pass = 0; pass < 2; ++pass) {
             const std::size_t first = hull.size();
             for (const PixelPoint& p : points) {
@@ -285,21 +288,24 @@ struct BrickInTile {
 
 namespace detail {
 
-// Calls found(tile) for each tile that the projection may cover; a tile may come up twice.
+// Calls found(tile, pixels) for each tile that the projection may cover, with a rectangle around its pixels there. A
+// tile may come up twice.
 template <class Found>
 void forEachTile(const Region& projection, const TileLayout& layout, const Found& found)
 {
     const Region tiles = layout.tilesIn(projection);
     for (int row = tiles.y0; row < tiles.y1; ++row)
-        for (int column = tiles.x0; column < tiles.x1; ++column)
-            found(layout.tileAt(column, row));
+        for (int column = tiles.x0; column < tiles.x1; ++column) {
+            const int tile = layout.tileAt(column, row);
+            found(tile, intersection(projection, layout.region(tile)));
+        }
 }
 template <class Found>
 void forEachTile(const Footprint& projection, const TileLayout& layout, const Found& found)
 {
-    forEachTile(projection.region(), layout, [&](int tile) {
+    forEachTile(projection.region(), layout, [&](int tile, const Region& pixels) {
         if (projection.meets(layout.region(tile)))
-            found(tile);
+            found(tile, pixels);
     });
 }
 template <class Projection, class Found>
@@ -327,7 +333,7 @@ void findVisibleTiles(const AnyWorld& world, const Camera& camera, const TileLay
     result.clear();
     for (std::size_t b = 0; b < world.bricks().size(); ++b)
         forEachTile(camera.project(boundsOf(world.bricks()[b]), layout.width(), layout.height()), layout,
-                    [&](int tile) {
+                    [&](int tile, const Region&) {
                         result.push_back({static_cast<int>(b), tile});
                     });
     const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };

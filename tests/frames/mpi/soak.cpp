@@ -101,6 +101,8 @@ std::string live(MPI_Comm communicator, std::uint64_t seed, int frames)
     for (int frame = 0; frame < frames; ++frame) {
         scene::Scene s = first; // with other bricks
         s.bricks = scene::makeScene(1 + frame % 7, seed + static_cast<std::uint64_t>(frame), s.width, s.height).bricks;
+        if (frame % 4 == 1)
+            s.owners = scene::anyOwners(fb.layout(), fb.size(), seed + static_cast<std::uint64_t>(frame));
         if (frame % 9 == 4) {
             auto open = fb.begin(paramsOf(s));
             if (fb.rank() == frame % fb.size())

@@ -20,28 +20,30 @@ using Inputs = std::vector<dfb::TileInput>;
 using Known = std::set<std::tuple<int, std::uint32_t, int, int>>; // tile, source, part, rank
 
 constexpr int ranks = 3;
-int ownerOf(int tile) { return tile % ranks; }
-bool isMine(int rank, int tile) { return ownerOf(tile) == rank; }
+int ownerOf(int tile, int shift = 0) { return (tile + shift) % ranks; }
 
 // All ranks at once; messages arrive as they are sent.
 struct Ranks {
     dfb::detail::Declarations of[ranks];
     std::vector<std::pair<int, int>> sent; // from, to
+    int shift = 0, lastShift = 0;          // of the owners
 
     // Returns what each owner knows in the end. The ranks from `declaring` on declare nothing: the frame fails.
     std::vector<Known> frame(const std::vector<Inputs>& inputs, bool lastHolds = true, int declaring = ranks)
     {
         sent.clear();
         for (auto& exchange : of)
-            exchange.newFrame(lastHolds);
+            exchange.newFrame(lastHolds, shift != lastShift);
+        lastShift = shift;
         for (int rank = 0; rank < declaring; ++rank) {
             std::vector<int> owners;
             const bool isWaiting = of[rank].declare(
-                inputs[static_cast<std::size_t>(rank)], rank, ownerOf, [&](int owner, const auto& bytes) {
+                inputs[static_cast<std::size_t>(rank)], rank, [&](int tile) { return ownerOf(tile, shift); },
+                [&](int owner, const auto& bytes) {
                     sent.emplace_back(rank, owner);
                     owners.push_back(owner);
                     of[owner].receive(rank, dfb::detail::ByteReader(bytes),
-                                      [&](int tile) { return isMine(owner, tile); });
+                                      [&](int tile) { return ownerOf(tile, shift) == owner; });
                 });
             CHECK(isWaiting == !owners.empty());
             CHECK(of[rank].declared());
@@ -62,12 +64,13 @@ struct Ranks {
     }
 };
 
-std::vector<Known> expectedOf(const std::vector<Inputs>& inputs)
+std::vector<Known> expectedOf(const std::vector<Inputs>& inputs, int shift = 0)
 {
     std::vector<Known> known(ranks);
     for (int rank = 0; rank < ranks; ++rank)
         for (const auto& input : inputs[static_cast<std::size_t>(rank)])
-            known[static_cast<std::size_t>(ownerOf(input.tile))].emplace(input.tile, input.source, input.part, rank);
+            known[static_cast<std::size_t>(ownerOf(input.tile, shift))].emplace(input.tile, input.source, input.part,
+                                                                                rank);
     return known;
 }
 
@@ -101,6 +104,25 @@ TEST_CASE("Owners know what was declared, and only what they do not know yet is 
     CHECK(all.sent == Sent{{0, 1}, {2, 0}, {2, 1}});
 }
 
+TEST_CASE("If tiles have moved, their new owners are told, and the old ones that nothing comes", "[declarations]")
+{
+    Ranks all;
+    const std::vector<Inputs> inputs{{{0, 7, 0}, {1, 7, 0}}, {{1, 8, 0}}, {}};
+    all.frame(inputs);
+    all.shift = 1;
+    CHECK(all.frame(inputs) == expectedOf(inputs, 1));
+    CHECK(all.sent == Sent{{0, 1}, {0, 2}, {1, 2}});
+    CHECK(all.frame(inputs) == expectedOf(inputs, 1));
+    CHECK(all.sent.empty());
+    all.shift = 2;
+    all.frame(inputs, true, 0); // nobody declares anything
+    CHECK(all.frame(inputs) == expectedOf(inputs, 2));
+    CHECK(all.sent == Sent{{0, 1}, {0, 2}, {1, 0}, {1, 2}});
+    all.shift = 0;
+    CHECK(all.frame({{}, {}, {}}) == std::vector<Known>(ranks));
+    CHECK(all.sent == Sent{{0, 2}, {1, 0}});
+}
+
 TEST_CASE("After a frame that failed everything is declared anew", "[declarations]")
 {
     Ranks all;
@@ -117,7 +139,7 @@ TEST_CASE("After a frame that failed everything is declared anew", "[declaration
 TEST_CASE("Manifests and answers that cannot be are refused", "[declarations]")
 {
     dfb::detail::Declarations owner;
-    owner.newFrame(true);
+    owner.newFrame(true, false);
     const auto outcome = [](const auto& call) -> std::string {
         try {
             call();
@@ -132,7 +154,7 @@ TEST_CASE("Manifests and answers that cannot be are refused", "[declarations]")
         manifest.put(std::uint32_t{7});
         manifest.put(std::uint16_t{0});
         return outcome(
-            [&] { owner.receive(1, dfb::detail::ByteReader(manifest.bytes()), [](int t) { return isMine(0, t); }); });
+            [&] { owner.receive(1, dfb::detail::ByteReader(manifest.bytes()), [](int t) { return ownerOf(t) == 0; }); });
     };
     CHECK(receive(4).find("tile of another owner") != std::string::npos);
     CHECK(receive(3) == "fine");

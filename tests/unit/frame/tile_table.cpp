@@ -50,12 +50,16 @@ struct Stage final : dfb::detail::TileStage {
 struct Operations final : dfb::detail::Operations {
     explicit Operations(Fault at) : dfb::detail::Operations({}), fault(at) {}
     void newFrame() override {}
-    std::unique_ptr<dfb::detail::TileStage> makeTile() const override { return std::make_unique<Stage>(fault, after); }
+    std::unique_ptr<dfb::detail::TileStage> makeTile() const override
+    {
+        ++made;
+        return std::make_unique<Stage>(fault, after);
+    }
     bool opaqueHides(const dfb::TileInfo&) const override { return false; }
     void process(dfb::PixelTile&) const override {}
 
     Fault fault;
-    mutable int after = 0;
+    mutable int after = 0, made = 0;
 };
 
 // When both inputs of the last tile arrive.
@@ -88,7 +92,7 @@ Seen frame(dfb::detail::TileTable& table, std::int64_t number, Time time)
     };
     dfb::TileInfo info;
     info.frame = number;
-    table.newFrame(info, nullptr);
+    table.newFrame(info, nullptr, nullptr);
     dfb::detail::ExpectedInputs expected;
     expected.replace({0}, {{0, 0, 0, 0}, {1, 0, 0, 0}, {1, 1, 0, 0}});
     if (time == BeforeDeclare || time == Between)
@@ -137,6 +141,40 @@ TEST_CASE("An operation that has thrown gets no more inputs, and its tile ends o
                 CHECK(table.isSaid());
             }
         }
+}
+
+TEST_CASE("The operations of tiles that move away are used for those that come", "[tile_table]")
+{
+    Operations operations(None);
+    const dfb::TileLayout layout(256, 64, 64);
+    dfb::detail::TileTable table(
+        layout, [](int tile, const dfb::TileLayout&, int) { return tile / 2; }, 0, 2, operations);
+    const auto moved = std::make_shared<const std::vector<int>>(std::vector<int>{1, 0, 0, 1});
+    const auto same = std::make_shared<const std::vector<int>>(std::vector<int>{1, 0, 0, 1});
+    std::int64_t number = 0;
+    const auto frame = [&](const dfb::TileOwners& owners, const std::vector<int>& owned) {
+        const bool haveMoved = table.prepare(owners);
+        dfb::TileInfo info;
+        info.frame = number++;
+        table.newFrame(info, nullptr, owners);
+        CHECK(table.owned() == owned);
+        CHECK(table.ownedByMap() == std::vector<int>{0, 1});
+        for (int tile = 0; tile < 4; ++tile)
+            CHECK(table.isMine(tile) == (std::find(owned.begin(), owned.end(), tile) != owned.end()));
+        dfb::detail::ExpectedInputs expected;
+        dfb::ErrorInfo where;
+        int ready = 0;
+        table.declare(
+            expected, true, where, [](int) {}, [&](int) { ++ready; });
+        CHECK(ready == 2);
+        return haveMoved;
+    };
+    CHECK(!frame(nullptr, {0, 1}));
+    CHECK(frame(moved, {1, 2}));
+    CHECK(!frame(moved, {1, 2}));
+    CHECK(!frame(same, {1, 2}));
+    CHECK(frame(nullptr, {0, 1}));
+    CHECK(operations.made == 2);
 }
 
 } // namespace tile_table_cases
