@@ -126,6 +126,13 @@ public:
     // The camera without its lens.
     const dfb::PerspectiveCamera& pinhole() const { return pinhole_; }
 
+    // Where all rays begin, if they do.
+    std::optional<Vec3> commonEye() const
+    {
+        return std::holds_alternative<dfb::PerspectiveCamera>(camera_) ? std::optional<Vec3>(pinhole_.eye())
+                                                                       : std::nullopt;
+    }
+
     // The ray through a point of the image, in pixels; its direction is 0 where the camera sees nothing.
     dfb::Ray ray(double x, double y, const dfb::LensSample& sample) const
     {

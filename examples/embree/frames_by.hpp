@@ -142,8 +142,9 @@ private:
                 const std::vector<int> order = dfb::visibilityOrder(*work.shared, camera.pinhole().eye());
                 return once(orderedLoop_, *fb_, *work.shared, inTurn_)
                     .start(camera, order, renderBrick, params, tileData, pixelData);
-            } else if (!work.shared) {
-                return once(dataLoop_, *fb_, work.world).start(camera, renderBrick, params, tileData, pixelData);
+            } else if (o_.mode == Mode::Data) {
+                return once(dataLoop_, *fb_, work.world, *work.shared)
+                    .start(camera, renderBrick, params, tileData, pixelData);
             } else if (o_.balance == Balance::Cost) {
                 return once(loopByCost_, *fb_, *work.shared, byCost_)
                     .start(camera, renderBrick, params, tileData, pixelData);

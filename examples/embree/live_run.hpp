@@ -90,7 +90,7 @@ private:
 
     void open()
     {
-        if (o_.mode == Mode::Mixed)
+        if (o_.mode != Mode::Image)
             shared_.emplace(fb_, world_);
         if (!fb_.isDisplayRank())
             return;
@@ -223,15 +223,19 @@ private:
                         scene_->renderers.front().front().renderTile(tile, 0);
                     },
                     params_);
-            } else if (shared_) {
+            } else if (o_.mode == Mode::Mixed) {
                 return (mixedLoop_ ? *mixedLoop_ : mixedLoop_.emplace(fb_, *shared_, inTurn_))
                     .start(camera, renderBrick, params_);
             } else {
-                return (dataLoop_ ? *dataLoop_ : dataLoop_.emplace(fb_, world_)).start(camera, renderBrick, params_);
+                return (dataLoop_ ? *dataLoop_ : dataLoop_.emplace(fb_, world_, *shared_))
+                    .start(camera, renderBrick, params_);
             }
         }();
         if (!view_)
             return frame.end();
+        owners_.clear();
+        for (int tile = 0; tile < fb_.layout().tileCount(); ++tile)
+            owners_.push_back(frame.tileOwner(tile));
         std::optional<dfb::FrameReport> report;
         view_->whileWatching(
             look, [&] { frame.cancel(); }, [&] { report = frame.end(); });
@@ -253,7 +257,8 @@ private:
                            / static_cast<double>(focus.box.largestExtent());
         picture.samples = std::max(1, samples_);
         picture.camera = words(picture.samples);
-        tellTiles(fb_, picture);
+        picture.tileSize = fb_.layout().tileSize();
+        picture.owners = owners_;
         view_->show(fb_.image().rgba8(), fb_.image().width(), fb_.image().height(), report, std::move(picture));
     }
 
@@ -294,8 +299,9 @@ private:
 
     LiveWishes wishes_; // that all ranks know of
     bool isBegun_ = false;
-    bool isDrawn_ = false; // a picture of this look
-    int samples_ = 0;      // that have been accumulated for it since
+    bool isDrawn_ = false;    // a picture of this look
+    std::vector<int> owners_; // of the tiles of the last frame
+    int samples_ = 0;         // that have been accumulated for it since
     std::int64_t frames_ = 0;
 };
 

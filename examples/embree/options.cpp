@@ -201,8 +201,8 @@ private:
         flag("--verify", options_.verify,
              "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
              "was made of; slow");
-        words("--owner-map", options_.ownerMap, {"lattice", "linear", "hash"},
-              "Which rank owns which tile; default lattice");
+        words("--owner-map", options_.ownerMap, {"auto", "lattice", "linear", "hash"},
+              "Which rank owns which tile; default auto: lattice on one node, near the pixels on several");
         number("--in-flight", options_.inFlight, 1, 64, "N",
                "Frames under way at once: a rank that has rendered its part of one begins the next while others still "
                "render; default 1");

@@ -24,7 +24,7 @@ enum class CutBy { Auto, Volume, Content };
 enum class Balance { Cost, RoundRobin };
 enum class Distribution { Owned, Linear, RoundRobin, Dynamic };
 enum class Compression { None, Snappy, Auto };
-enum class OwnerMap { Lattice, Linear, Hash };
+enum class OwnerMap { Auto, Lattice, Linear, Hash };
 
 struct OutputFiles {
     // Empty: not written. All but the last three may be patterns.
@@ -66,7 +66,7 @@ struct Options : OutputFiles {
     Compression compression = Compression::None;
     bool sharedMemory = true;
     int peerTimeout = static_cast<int>(dfb::defaultPeerTimeout.count() / 1000); // seconds; 0: off
-    OwnerMap ownerMap = OwnerMap::Lattice;
+    OwnerMap ownerMap = OwnerMap::Auto;
 
     int width = 1024, height = 1024;
     int frames = 1;

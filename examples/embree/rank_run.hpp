@@ -111,7 +111,7 @@ private:
     {
         work_.settings = renderSettings(o_);
         work_.world = worldOf(*work_.scene, work_.settings);
-        if (o_.mode == Mode::Mixed || compositing_ == Compositing::Order)
+        if (o_.mode != Mode::Image)
             work_.shared.emplace(*fb_, work_.world);
         work_.tileDone = [this, &progress](std::int64_t work) {
             ++tiles_;

@@ -76,9 +76,12 @@ inline dfb::FrameBufferConfig configOf(const Options& o, int threads)
     config.framesInFlight = std::min(o.inFlight, o.frames);
     config.image.aux =
         o.aux.empty() ? static_cast<dfb::ChannelMask>(layers & dfb::imageAuxChannels) : dfb::imageAuxChannels;
-    config.image.ownerMap = o.ownerMap == OwnerMap::Linear ? dfb::linearOwner
-                            : o.ownerMap == OwnerMap::Hash ? dfb::hashOwner
-                                                           : dfb::latticeOwner;
+    switch (o.ownerMap) {
+    case OwnerMap::Auto: break;
+    case OwnerMap::Lattice: config.image.ownerMap = dfb::latticeOwner; break;
+    case OwnerMap::Linear: config.image.ownerMap = dfb::linearOwner; break;
+    case OwnerMap::Hash: config.image.ownerMap = dfb::hashOwner; break;
+    }
     if (o.compression == Compression::Auto)
         config.messages.compression = dfb::CompressionMode::Auto;
     if (o.compression != Compression::None) {

@@ -22,7 +22,7 @@ struct RankWork {
     std::unique_ptr<RankScene> scene;
     RenderSettings settings;
     dfb::World world;
-    std::optional<dfb::SharedWorld> shared;          // where a rank must know of the bricks of others
+    std::optional<dfb::SharedWorld> shared;          // but with Mode::Image
     std::function<void(std::int64_t work)> tileDone; // from any thread
 };
 

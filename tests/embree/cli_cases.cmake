@@ -1010,7 +1010,7 @@ elseif(CASE STREQUAL "hash")
 
 elseif(CASE STREQUAL "shared_memory")
   # Where ranks see each other's memory, an owner puts its tiles into the image, without a message.
-  set(scene demo --size 128x128 --frames 4 --output image.png)
+  set(scene demo --size 128x128 --frames 4 --output image.png --owner-map lattice)
   succeed(${START} ${scene} --stats with.json)
   succeed(${START} ${scene} --stats without.json --no-shared-memory)
   field(with with.json messages_sent)

@@ -66,7 +66,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.deep == 0);
     CHECK(o.cut == CutBy::Auto);
     CHECK_FALSE(o.view.distance);
-    CHECK(o.ownerMap == OwnerMap::Lattice);
+    CHECK(o.ownerMap == OwnerMap::Auto);
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
     CHECK(o.frames == 1);

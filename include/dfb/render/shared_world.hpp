@@ -13,6 +13,7 @@
 #include <cstring>
 #include <limits>
 #include <memory>
+#include <optional>
 #include <type_traits>
 #include <utility>
 #include <vector>
@@ -106,6 +107,23 @@ inline RayOrigin rayOrigin(const MatrixCamera& camera)
     return {{from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0}};
 }
 
+template <class Camera, class = void>
+inline constexpr bool has_common_eye_v = false;
+template <class Camera>
+inline constexpr bool has_common_eye_v<Camera, std::void_t<decltype(std::declval<const Camera&>().commonEye())>> = true;
+
+// Of any camera; nullopt if it has no such origin, or does not say.
+template <class Camera>
+std::optional<RayOrigin> originOf(const Camera& camera)
+{
+    if constexpr (std::is_same_v<Camera, PerspectiveCamera> || std::is_same_v<Camera, MatrixCamera>)
+        return rayOrigin(camera);
+    else if constexpr (has_common_eye_v<Camera>)
+        if (const std::optional<Vec3> eye = camera.commonEye())
+            return RayOrigin{*eye};
+    return std::nullopt;
+}
+
 // Finds the order of bricks. Keeps its memory.
 class FrontToBack {
 public:
@@ -183,15 +201,14 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const RayOrigi
 // Gives FrameConfig::order to the frames of a loop.
 class BrickOrder {
 public:
-    // Sets config.order if it is not set, the operation takes an order, the camera is one whose rays all begin in one
-    // point or are parallel, and the bricks have an order. Takes time with the square of their number: not for more
-    // than 1024.
+    // Sets config.order if it is not set, the operation takes an order, the camera has an originOf() its rays, and the
+    // bricks have an order. Takes time with the square of their number: not for more than 1024.
     template <class FrameBuffer, class Camera>
     void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
     {
-        if constexpr (FrameBuffer::takesOrder
-                      && (std::is_same_v<Camera, PerspectiveCamera> || std::is_same_v<Camera, MatrixCamera>)) {
-            if (config.order || world.bricks().size() > 1024 || bricks_.find(world, rayOrigin(camera)))
+        if constexpr (FrameBuffer::takesOrder) {
+            const std::optional<RayOrigin> origin = originOf(camera);
+            if (config.order || !origin || world.bricks().size() > 1024 || bricks_.find(world, *origin))
                 return;
             sources_.clear();
             for (const int brick : bricks_.order())
