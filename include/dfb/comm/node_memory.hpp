@@ -122,7 +122,7 @@ public:
         if (file < 0)
             return nullptr;
         std::byte* base = ftruncate(file, static_cast<off_t>(capacity)) == 0 ? map(file) : nullptr;
-        if (!base || !allocate(file, 0, step)) {
+        if (!base || !allocate(file, base, 0, step)) {
             unmap(base);
             close(file);
             return nullptr;
@@ -191,7 +191,7 @@ public:
         if (used_ + bytes > allocated_) {
             // Asked for beforehand: without, to find none when it is first written to would end the process.
             const std::size_t more = (used_ + bytes - allocated_ + step - 1) / step * step;
-            if (allocated_ + more > capacity || !allocate(file_, allocated_, more))
+            if (allocated_ + more > capacity || !allocate(file_, base_, allocated_, more))
                 return nullptr;
             allocated_ += more;
         }
@@ -244,7 +244,7 @@ private:
     };
     static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(State) == alignment);
     static_assert(capacity / alignment <= std::size_t{1} << 31);
-    static constexpr std::size_t step = std::size_t{1} << 20; // by which it grows
+    static constexpr std::size_t step = std::size_t{1} << 21; // by which it grows: a large page
 
     NodeMemory(std::byte* base, int file) : base_(base), file_(file), allocated_(file < 0 ? 0 : step) {}
 
@@ -257,14 +257,31 @@ private:
     void giveBack(std::byte* block, int) noexcept override { stateOf(block).is.store(mine, std::memory_order_release); }
 
 #if defined(MFD_CLOEXEC)
+    // At a multiple of `step`: a large page must begin at one.
     static std::byte* map(int file)
     {
-        void* base = mmap(nullptr, capacity, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_NORESERVE, file, 0);
-        return base == MAP_FAILED ? nullptr : static_cast<std::byte*>(base);
+        void* room = mmap(nullptr, capacity + step, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
+        if (room == MAP_FAILED)
+            return nullptr;
+        auto* first = static_cast<std::byte*>(room);
+        std::byte* base = first + (step - reinterpret_cast<std::uintptr_t>(first) % step) % step;
+        if (base != first)
+            munmap(first, static_cast<std::size_t>(base - first));
+        if (const auto rest = static_cast<std::size_t>(first + step - base); rest > 0)
+            munmap(base + capacity, rest);
+        if (mmap(base, capacity, PROT_READ | PROT_WRITE, MAP_SHARED | MAP_NORESERVE | MAP_FIXED, file, 0) == base)
+            return base;
+        unmap(base);
+        return nullptr;
     }
-    static bool allocate(int file, std::size_t offset, std::size_t byteCount)
+    // Multiples of `step`.
+    static bool allocate(int file, std::byte* base, std::size_t offset, std::size_t byteCount)
     {
-        return posix_fallocate(file, static_cast<off_t>(offset), static_cast<off_t>(byteCount)) == 0;
+        if (posix_fallocate(file, static_cast<off_t>(offset), static_cast<off_t>(byteCount)) != 0)
+            return false;
+        constexpr int makeLargePages = 25; // MADV_COLLAPSE, since Linux 6.1. Without, the pages stay small
+        madvise(base + offset, byteCount, makeLargePages);
+        return true;
     }
     static void unmap(std::byte* base)
     {
@@ -272,7 +289,7 @@ private:
             munmap(base, capacity);
     }
 #else
-    static bool allocate(int, std::size_t, std::size_t) { return false; }
+    static bool allocate(int, std::byte*, std::size_t, std::size_t) { return false; }
     static void unmap(std::byte*) {}
 #endif
 

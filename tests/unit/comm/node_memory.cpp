@@ -8,13 +8,16 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <fstream>
 #include <memory>
 #include <set>
+#include <string>
 #include <thread>
 #include <utility>
 #include <vector>
 
 #if defined(__linux__)
+#include <sys/mman.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -32,6 +35,31 @@ struct SharedPool {
 };
 
 } // namespace
+
+TEST_CASE("The memory has large pages, if the system makes them", "[memory]")
+{
+    constexpr std::size_t page = std::size_t{1} << 21;
+    const auto memory = NodeMemory::create();
+    std::vector<std::byte*> blocks;
+    for (int i = 0; i < 4; ++i) {
+        blocks.push_back(memory->take(page));
+        std::memset(blocks.back(), 1, page);
+    }
+    CHECK((reinterpret_cast<std::uintptr_t>(&memory->bell()) - NodeMemory::alignment) % page == 0);
+    const auto largePages = [] { // KB of this process
+        std::ifstream map("/proc/self/smaps_rollup");
+        std::string word;
+        long count = 0;
+        while (map >> word)
+            if (word == "ShmemPmdMapped:")
+                map >> count;
+        return count;
+    };
+    // Only Linux 6.1 and later make them when they are asked to, and only where a free one is found.
+    if (madvise(blocks[1], page, 25) != 0)
+        return;
+    CHECK(largePages() >= 4 * 2048);
+}
 
 TEST_CASE("A bell ends a nap, or the next one, and wakes only who wants to be woken", "[memory]")
 {
