@@ -12,8 +12,8 @@
 #include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/engine.hpp>
-#include <dfb/render/link_owners.hpp>
 #include <dfb/ops/sort_last.hpp>
+#include <dfb/render/link_owners.hpp>
 
 #if defined(DFB_HAS_MPI)
 #include <dfb/comm/mpi_transport.hpp>
@@ -179,7 +179,7 @@ private:
     // On several nodes:
     std::optional<detail::LinkOwners> owners_;
     std::vector<int> ranks_;      // all, ascending
-    std::vector<Figure> regions_; // of the ranks' images in the last picture: see packed()
+    std::vector<Figure> regions_; // of the ranks' images in the last picture: see detail::PackedRegion
 };
 
 DFB_NAMESPACE_END
@@ -411,6 +411,8 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
     const detail::PackedRegion packed(layout);
     owners_->start(layout);
     for (const Figure& figure : regions_) {
+        if (figure.key >= ranks_.size()) // a message can be damaged
+            continue;
         const Region region = packed.unpack(figure.value), tiles = layout.tilesIn(region);
         for (int row = tiles.y0; row < tiles.y1; ++row)
             for (int column = tiles.x0; column < tiles.x1; ++column) {

@@ -201,8 +201,8 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const RayOrigi
 // Gives FrameConfig::order to the frames of a loop.
 class BrickOrder {
 public:
-    // Sets config.order if it is not set, the operation takes an order, the camera has an originOf() its rays, and the
-    // bricks have an order. Takes time with the square of their number: not for more than 1024.
+    // Sets config.order if it is not set, the operation takes an order, it is known where the camera's rays begin,
+    // and the bricks have an order. Takes time with the square of their number: not for more than 1024.
     template <class FrameBuffer, class Camera>
     void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
     {
