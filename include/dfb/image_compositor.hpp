@@ -14,6 +14,7 @@
 #include <dfb/frame/engine.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/link_owners.hpp>
+#include <dfb/render/visibility.hpp>
 
 #if defined(DFB_HAS_MPI)
 #include <dfb/comm/mpi_transport.hpp>
@@ -413,12 +414,9 @@ DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
     for (const Figure& figure : regions_) {
         if (figure.key >= ranks_.size()) // a message can be damaged
             continue;
-        const Region region = packed.unpack(figure.value), tiles = layout.tilesIn(region);
-        for (int row = tiles.y0; row < tiles.y1; ++row)
-            for (int column = tiles.x0; column < tiles.x1; ++column) {
-                const int tile = layout.tileAt(column, row);
-                owners_->add(tile, intersection(region, layout.region(tile)), &ranks_[figure.key], 1);
-            }
+        detail::forEachTile(packed.unpack(figure.value), layout, [&](int tile, const Region& pixels) {
+            owners_->add(tile, pixels, &ranks_[figure.key], 1);
+        });
     }
     return owners_->find(config(), blend_ != ImageBlend::InOrder,
                          [this](int tile) { return engine_->tileOwner(tile); });
@@ -516,11 +514,11 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);
     const auto source = static_cast<std::uint32_t>(blend_ == ImageBlend::InOrder ? place : rank());
     inputs_.clear();
-    const Region tiles = isThere ? layout.tilesIn(part.valid()) : Region();
-    for (int row = tiles.y0; row < tiles.y1; ++row)
-        for (int column = tiles.x0; column < tiles.x1; ++column)
-            inputs_.push_back({layout.tileAt(column, row), source, 0});
-    if (!tiles.empty() && !owners_->isOneNode())
+    if (isThere)
+        detail::forEachTile(part.valid(), layout, [&](int tile, const Region&) {
+            inputs_.push_back({tile, source, 0});
+        });
+    if (!inputs_.empty() && !owners_->isOneNode())
         engine_->addFigure(static_cast<std::uint64_t>(rank()), detail::PackedRegion(layout).pack(part.valid()));
     engine_->declare(inputs_);
     const auto sendTile = [&](std::size_t i) {

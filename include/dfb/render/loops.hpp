@@ -204,8 +204,8 @@ private:
 
 namespace detail {
 
-// What a SharedWorld and a camera say about the frames of a loop. It is needed for begin(); what the camera throws has
-// to come out of the frame, on all ranks.
+// Order and owners of a loop's frames, found from a SharedWorld and a camera. begin() needs them; but an exception of
+// the camera has to come out of the frame, on all ranks.
 class FromWorld {
 public:
     template <class FrameBuffer, class Camera>
