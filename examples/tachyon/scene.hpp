@@ -10,7 +10,7 @@
 #include <memory>
 #include <vector>
 
-inline constexpr int width = 480, height = 320;
+inline constexpr int imageWidth = 480, imageHeight = 320;
 
 // Tachyon's scene: a spiral of balls over a floor that mirrors them. Not for two threads at once.
 class Scene {
@@ -38,7 +38,7 @@ public:
     const std::vector<float>& render(const dfb::Region& part, double right = 0, double up = 0)
     {
         // Exact in binary, so that the frustum of a tile has the very rays of the image's.
-        const double pixel = 5.0 / 2048, middleX = width / 2.0 - right, middleY = height / 2.0 + up;
+        const double pixel = 5.0 / 2048, middleX = imageWidth / 2.0 - right, middleY = imageHeight / 2.0 + up;
         pixels_.resize(3 * static_cast<std::size_t>(part.width()) * static_cast<std::size_t>(part.height()));
         rt_resolution(scene_.get(), part.width(), part.height());
         rt_camera_frustum(scene_.get(), (part.x0 - middleX) * pixel, (part.x1 - middleX) * pixel,

@@ -39,16 +39,17 @@ void renderTile(Tile& tile, double right = 0, double up = 0)
 // Whether one sample a pixel, put together from the tiles of all ranks, is Tachyon's own image, bit for bit.
 bool isTachyonsImage(MPI_Comm communicator)
 {
-    dfb::DistributedFrameBuffer<dfb::ImageParallel> fb(communicator, {width, height, dfb::OutputFormat::RGBA32F});
+    dfb::DistributedFrameBuffer<dfb::ImageParallel> fb(communicator,
+                                                       {imageWidth, imageHeight, dfb::OutputFormat::RGBA32F});
     dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
     loop.render([](auto& tile) { renderTile(tile); });
     if (!fb.isDisplayRank())
         return true;
-    const float* whole = myScene().render({0, 0, width, height}).data();
+    const float* whole = myScene().render({0, 0, imageWidth, imageHeight}).data();
     const float* mine = fb.image().rgba32f();
-    for (int y = 0; y < height; ++y)
-        for (int x = 0; x < width; ++x, mine += 4)
-            if (std::memcmp(mine, whole + 3 * ((height - 1 - y) * width + x), 3 * sizeof(float)) != 0)
+    for (int y = 0; y < imageHeight; ++y)
+        for (int x = 0; x < imageWidth; ++x, mine += 4)
+            if (std::memcmp(mine, whole + 3 * ((imageHeight - 1 - y) * imageWidth + x), 3 * sizeof(float)) != 0)
                 return false;
     return true;
 }
@@ -62,8 +63,8 @@ try {
     if (argc > 1 && std::strcmp(argv[1], "--check") == 0 && !isTachyonsImage(mpi.communicator()))
         throw std::runtime_error("the image is not Tachyon's");
 
-    dfb::DistributedFrameBuffer<dfb::Progressive<dfb::ImageParallel>> fb(mpi.communicator(),
-                                                                         {width, height, dfb::OutputFormat::SRGBA8});
+    dfb::DistributedFrameBuffer<dfb::Progressive<dfb::ImageParallel>> fb(
+        mpi.communicator(), {imageWidth, imageHeight, dfb::OutputFormat::SRGBA8});
     dfb::ImageParallelLoop loop(fb, dfb::WorkDistribution::Dynamic);
     dfb::SamplingConfig sampling;
     sampling.maxError = 0.01;
