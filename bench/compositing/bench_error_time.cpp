@@ -265,8 +265,7 @@ public:
             }
             for (const Row& r : *rows)
                 if (r.isDefault && !isOnFront(r.result, these))
-                    all << "\nNot on the front, though a default: " << r.result.config << ".\n",
-                        chosen << "\nNot on the front, though a default: " << r.result.config << ".\n";
+                    all << "\nThe defaults are not on the front.\n", chosen << "\nThe defaults are not on the front.\n";
         }
         for (std::ostringstream* table : {&all, &chosen}) {
             if (kernels_.empty())
