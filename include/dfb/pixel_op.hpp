@@ -14,6 +14,7 @@
 //   void newFrame(const FrameData&);             called once a frame on every rank, if there is a FrameData
 #pragma once
 
+#include <dfb/base/detect.hpp>
 #include <dfb/tile_op.hpp>
 
 #include <cstddef>
@@ -40,22 +41,9 @@ struct PixelTile {
 
 namespace detail {
 
-template <class T, class = void>
-inline constexpr bool has_process_v = false;
-template <class T>
-inline constexpr bool
-    has_process_v<T, std::void_t<decltype(std::declval<const T&>().process(std::declval<PixelTile&>()))>> = true;
-
-template <class T, class = void>
-inline constexpr bool is_pointwise_v = false;
-template <class T>
-inline constexpr bool is_pointwise_v<T, std::void_t<decltype(T::pointwise)>> = T::pointwise;
-
-template <class T, class = void>
-inline constexpr bool has_pixel_new_frame_v = false;
-template <class T>
-inline constexpr bool has_pixel_new_frame_v<
-    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()))>> = true;
+DFB_DETECTS(has_process_v, std::declval<const T&>().process(std::declval<PixelTile&>()));
+DFB_SETTING(bool, is_pointwise_v, false, pointwise);
+DFB_DETECTS(has_pixel_new_frame_v, std::declval<T&>().newFrame(std::declval<const typename FrameDataOf<T>::type&>()));
 
 } // namespace detail
 

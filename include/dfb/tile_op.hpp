@@ -45,6 +45,7 @@
 //   void report(TileReport&) const;              after finish(): figures of the tile
 #pragma once
 
+#include <dfb/base/detect.hpp>
 #include <dfb/blend/background_pixels.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/image.hpp>
@@ -330,80 +331,27 @@ struct FrameDataOf<T, std::void_t<typename T::FrameData>> {
 };
 
 template <class T, class = void>
-inline constexpr int tile_size_v = 64;
-template <class T>
-inline constexpr int tile_size_v<T, std::void_t<decltype(T::tileSize)>> = T::tileSize;
-
-template <class T, class = void>
 inline constexpr bool has_channels_v = false;
 template <class T>
 inline constexpr bool has_channels_v<T, std::void_t<decltype(T::channels)>> =
     std::is_convertible_v<decltype(T::channels), ChannelMask>;
 
-template <class T, class = void>
-inline constexpr ChannelMask needed_channels_v = T::channels;
-template <class T>
-inline constexpr ChannelMask needed_channels_v<T, std::void_t<decltype(T::neededChannels)>> = T::neededChannels;
+DFB_SETTING(int, tile_size_v, 64, tileSize);
+DFB_SETTING(ChannelMask, needed_channels_v, T::channels, neededChannels);
+DFB_SETTING(bool, active_by_depth_v, false, activeByDepth);
+DFB_SETTING(bool, empty_is_background_v, false, emptyIsBackground);
+DFB_SETTING(bool, reads_in_place_v, false, readsInPlace);
+DFB_SETTING(bool, takes_order_v, false, takesOrder);
+DFB_SETTING(bool, keeps_state_v, false, keepsState);
 
-template <class T, class = void>
-inline constexpr bool has_new_frame_v = false;
-template <class T>
-inline constexpr bool
-    has_new_frame_v<T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>()))>> = true;
-
-template <class T, class = void>
-inline constexpr bool has_new_frame_with_data_v = false;
-template <class T>
-inline constexpr bool has_new_frame_with_data_v<
-    T, std::void_t<decltype(std::declval<T&>().newFrame(std::declval<const TileInfo&>(),
-                                                        std::declval<const typename FrameDataOf<T>::type&>()))>> = true;
-
-template <class T, class = void>
-inline constexpr bool has_add_v = false;
-template <class T>
-inline constexpr bool has_add_v<T, std::void_t<decltype(std::declval<T&>().add(std::declval<Fragment&&>()))>> = true;
-
-template <class T, class = void>
-inline constexpr bool has_finish_v = false;
-template <class T>
-inline constexpr bool has_finish_v<T, std::void_t<decltype(std::declval<T&>().finish(std::declval<FinishedTile&>()))>> =
-    true;
-
-template <class T, class = void>
-inline constexpr bool active_by_depth_v = false;
-template <class T>
-inline constexpr bool active_by_depth_v<T, std::void_t<decltype(T::activeByDepth)>> = T::activeByDepth;
-
-template <class T, class = void>
-inline constexpr bool empty_is_background_v = false;
-template <class T>
-inline constexpr bool empty_is_background_v<T, std::void_t<decltype(T::emptyIsBackground)>> = T::emptyIsBackground;
-
-template <class T, class = void>
-inline constexpr bool reads_in_place_v = false;
-template <class T>
-inline constexpr bool reads_in_place_v<T, std::void_t<decltype(T::readsInPlace)>> = T::readsInPlace;
-
-template <class T, class = void>
-inline constexpr bool takes_order_v = false;
-template <class T>
-inline constexpr bool takes_order_v<T, std::void_t<decltype(T::takesOrder)>> = T::takesOrder;
-
-template <class T, class = void>
-inline constexpr bool opaque_hides_v = false;
-template <class T>
-inline constexpr bool opaque_hides_v<T, std::void_t<decltype(T::opaqueHides(std::declval<const TileInfo&>()))>> = true;
-
-template <class T, class = void>
-inline constexpr bool keeps_state_v = false;
-template <class T>
-inline constexpr bool keeps_state_v<T, std::void_t<decltype(T::keepsState)>> = T::keepsState;
-
-template <class T, class = void>
-inline constexpr bool has_report_v = false;
-template <class T>
-inline constexpr bool
-    has_report_v<T, std::void_t<decltype(std::declval<const T&>().report(std::declval<TileReport&>()))>> = true;
+DFB_DETECTS(has_new_frame_v, std::declval<T&>().newFrame(std::declval<const TileInfo&>()));
+DFB_DETECTS(has_new_frame_with_data_v,
+            std::declval<T&>().newFrame(std::declval<const TileInfo&>(),
+                                        std::declval<const typename FrameDataOf<T>::type&>()));
+DFB_DETECTS(has_add_v, std::declval<T&>().add(std::declval<Fragment&&>()));
+DFB_DETECTS(has_finish_v, std::declval<T&>().finish(std::declval<FinishedTile&>()));
+DFB_DETECTS(opaque_hides_v, T::opaqueHides(std::declval<const TileInfo&>()));
+DFB_DETECTS(has_report_v, std::declval<const T&>().report(std::declval<TileReport&>()));
 
 template <class T, class = void>
 inline constexpr bool has_is_complete_v = false;

@@ -4,8 +4,8 @@ cmake_minimum_required(VERSION 3.21)
 
 # A header includes only headers of a strictly lower level.
 set(level_0 version.hpp)
-set(level_1 base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp frame/hidden_tiles.hpp fwd.hpp
-            testing/reference.hpp trace.hpp)
+set(level_1 base/detect.hpp base/fifo.hpp base/function_ref.hpp channels.hpp comm/quiescence.hpp
+            frame/hidden_tiles.hpp fwd.hpp testing/reference.hpp trace.hpp)
 set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp compiled.hpp
             error.hpp testing/error_report.hpp)
 set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp

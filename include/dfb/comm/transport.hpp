@@ -57,6 +57,7 @@
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
 #pragma once
 
+#include <dfb/base/detect.hpp>
 #include <dfb/buffer.hpp>
 #include <dfb/error.hpp>
 
@@ -131,16 +132,8 @@ template <class T>
 inline constexpr bool has_communicator_v<T, std::void_t<typename T::Communicator>> =
     std::is_constructible_v<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress>;
 
-template <class T, class = void>
-inline constexpr bool has_rank_and_size_v = false;
-template <class T>
-inline constexpr bool has_rank_and_size_v<
-    T, std::void_t<decltype(std::declval<const T&>().rank()), decltype(std::declval<const T&>().size())>> = true;
-
-template <class T, class = void>
-inline constexpr bool has_send_v = false;
-template <class T>
-inline constexpr bool has_send_v<T, std::void_t<decltype(std::declval<T&>().send(0, std::declval<Buffer&&>()))>> = true;
+DFB_DETECTS(has_rank_and_size_v, std::declval<const T&>().rank(), std::declval<const T&>().size());
+DFB_DETECTS(has_send_v, std::declval<T&>().send(0, std::declval<Buffer&&>()));
 
 template <class T, class = void>
 inline constexpr bool has_poll_v = false;
@@ -150,36 +143,17 @@ inline constexpr bool has_poll_v<
                    decltype(std::declval<const T&>().mayPoll()), decltype(std::declval<const T&>().quiet())>> =
     std::is_same_v<bool, decltype(std::declval<T&>().poll())>;
 
-template <class T, class = void>
-inline constexpr bool has_nap_v = false;
-template <class T>
-inline constexpr bool has_nap_v<
-    T, std::void_t<decltype(std::declval<T&>().nap(std::chrono::nanoseconds())),
-                   decltype(std::declval<T&>().interrupt()), decltype(std::declval<const T&>().wakesOnArrival())>> =
-    true;
-
-template <class T, class = void>
-inline constexpr bool has_start_and_stop_v = false;
-template <class T>
-inline constexpr bool
-    has_start_and_stop_v<T, std::void_t<decltype(std::declval<T&>().start(std::declval<TransportHandler&>())),
-                                        decltype(std::declval<T&>().stop(true))>> = true;
+DFB_DETECTS(has_nap_v, std::declval<T&>().nap(std::chrono::nanoseconds()), std::declval<T&>().interrupt(),
+            std::declval<const T&>().wakesOnArrival());
+DFB_DETECTS(has_start_and_stop_v, std::declval<T&>().start(std::declval<TransportHandler&>()),
+            std::declval<T&>().stop(true));
 
 // Optional.
-template <class T, class = void>
-inline constexpr bool shares_memory_v = false;
-template <class T>
-inline constexpr bool shares_memory_v<
-    T, std::void_t<decltype(std::declval<const T&>().lendsTo(0)), decltype(std::declval<const T&>().placeOf(nullptr)),
-                   decltype(std::declval<const T&>().blockAt(0, 0, 0))>> = true;
-
-// Optional.
-template <class T, class = void>
-inline constexpr bool limits_threads_v = false;
-template <class T>
-inline constexpr bool
-    limits_threads_v<T, std::void_t<decltype(T::mayHaveThread(std::declval<const typename T::Communicator&>()))>> =
-        true;
+DFB_DETECTS(shares_memory_v, std::declval<const T&>().lendsTo(0), std::declval<const T&>().placeOf(nullptr),
+            std::declval<const T&>().blockAt(0, 0, 0));
+DFB_DETECTS(limits_threads_v, T::mayHaveThread(std::declval<const typename T::Communicator&>()));
+DFB_DETECTS(knows_sharing_v, std::declval<const T&>().sharingRanks());
+DFB_DETECTS(can_abort_v, std::declval<T&>().abort(std::declval<const std::string&>()));
 
 // Thread or Caller for Progress::Auto.
 template <class T>
@@ -192,19 +166,6 @@ Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communic
     else
         return Progress::Thread;
 }
-
-// Optional.
-template <class T, class = void>
-inline constexpr bool knows_sharing_v = false;
-template <class T>
-inline constexpr bool knows_sharing_v<T, std::void_t<decltype(std::declval<const T&>().sharingRanks())>> = true;
-
-// Optional.
-template <class T, class = void>
-inline constexpr bool can_abort_v = false;
-template <class T>
-inline constexpr bool
-    can_abort_v<T, std::void_t<decltype(std::declval<T&>().abort(std::declval<const std::string&>()))>> = true;
 
 } // namespace detail
 

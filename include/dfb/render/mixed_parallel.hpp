@@ -11,6 +11,7 @@
 // All ranks must get the same answers. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
+#include <dfb/base/detect.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/render/loops.hpp>
 #include <dfb/render/shared_world.hpp>
@@ -158,14 +159,9 @@ private:
 
 namespace detail {
 
-template <class Owner, class = void>
-inline constexpr bool has_plan_v = false;
-template <class Owner>
-inline constexpr bool
-    has_plan_v<Owner, std::void_t<decltype(std::declval<Owner&>().plan(std::declval<const SharedWorld&>(),
-                                                                       std::declval<const std::vector<BrickInTile>&>(),
-                                                                       std::declval<const std::vector<int>&>()))>> =
-        true;
+DFB_DETECTS(has_plan_v,
+            std::declval<T&>().plan(std::declval<const SharedWorld&>(), std::declval<const std::vector<BrickInTile>&>(),
+                                    std::declval<const std::vector<int>&>()));
 
 struct MixedJob {
     std::size_t pair = 0;

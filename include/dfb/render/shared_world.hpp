@@ -2,6 +2,7 @@
 // of bricks from front to back.
 #pragma once
 
+#include <dfb/base/detect.hpp>
 #include <dfb/render/cameras.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/tile.hpp>
@@ -107,10 +108,7 @@ inline RayOrigin rayOrigin(const MatrixCamera& camera)
     return {{from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0}};
 }
 
-template <class Camera, class = void>
-inline constexpr bool has_common_eye_v = false;
-template <class Camera>
-inline constexpr bool has_common_eye_v<Camera, std::void_t<decltype(std::declval<const Camera&>().commonEye())>> = true;
+DFB_DETECTS(has_common_eye_v, std::declval<const T&>().commonEye());
 
 // Of any camera; nullopt if it has no such origin, or does not say.
 template <class Camera>
