@@ -47,50 +47,28 @@ public:
     Buffer() = default;
     // `sizeClass` is the owner's own affair.
     Buffer(std::shared_ptr<BlockOwner> owner, std::byte* data, std::size_t size, int sizeClass) noexcept
-        : owner_(std::move(owner)), data_(data), size_(size), sizeClass_(sizeClass)
+        : block_(data, {std::move(owner), sizeClass}), size_(size)
     {
-    }
-    Buffer(Buffer&& other) noexcept
-        : owner_(std::move(other.owner_)), data_(std::exchange(other.data_, nullptr)),
-          size_(std::exchange(other.size_, 0)), sizeClass_(other.sizeClass_)
-    {
-    }
-    Buffer& operator=(Buffer&& other) noexcept
-    {
-        Buffer moved(std::move(other));
-        swap(moved);
-        return *this;
-    }
-    Buffer(const Buffer&) = delete;
-    Buffer& operator=(const Buffer&) = delete;
-    ~Buffer()
-    {
-        if (data_)
-            owner_->giveBack(data_, sizeClass_);
     }
 
-    void swap(Buffer& other) noexcept
-    {
-        std::swap(owner_, other.owner_);
-        std::swap(data_, other.data_);
-        std::swap(size_, other.size_);
-        std::swap(sizeClass_, other.sizeClass_);
-    }
-
-    std::byte* data() noexcept { return data_; }
-    const std::byte* data() const noexcept { return data_; }
-    std::size_t size() const noexcept { return size_; }
-    bool empty() const noexcept { return size_ == 0; }
+    std::byte* data() noexcept { return block_.get(); }
+    const std::byte* data() const noexcept { return block_.get(); }
+    std::size_t size() const noexcept { return block_ ? size_ : 0; }
+    bool empty() const noexcept { return size() == 0; }
 
     // Makes the block count as shorter; the memory stays. `byteCount` must not exceed size().
     void shrink(std::size_t byteCount) noexcept { size_ = byteCount < size_ ? byteCount : size_; }
 
 private:
     friend class MemoryPool;
-    std::shared_ptr<BlockOwner> owner_;
-    std::byte* data_ = nullptr;
+    struct GiveBack {
+        std::shared_ptr<BlockOwner> owner;
+        int sizeClass;
+        void operator()(std::byte* block) const noexcept { owner->giveBack(block, sizeClass); }
+    };
+
+    std::unique_ptr<std::byte, GiveBack> block_;
     std::size_t size_ = 0;
-    int sizeClass_ = 0;
 };
 
 // Memory that other processes see as well, in which a pool may have its blocks; comm/node_memory.hpp is such. All
@@ -182,12 +160,12 @@ public:
     std::byte* lend(Buffer& buffer)
     {
         std::lock_guard<std::mutex> lock(mutex_);
-        if (buffer.owner_.get() != this || !shared_ || !shared_->holds(buffer.data_))
+        const auto& [owner, sizeClass] = buffer.block_.get_deleter();
+        if (owner.get() != this || !shared_ || !shared_->holds(buffer.data()))
             return nullptr;
-        classes_[static_cast<std::size_t>(buffer.sizeClass_)].lent.push(buffer.data_);
-        shared_->lend(buffer.data_);
-        buffer.size_ = 0;
-        return std::exchange(buffer.data_, nullptr);
+        classes_[static_cast<std::size_t>(sizeClass)].lent.push(buffer.data());
+        shared_->lend(buffer.data());
+        return buffer.block_.release();
     }
 
 private:
