@@ -9,10 +9,11 @@
 #include <dfb/version.hpp>
 
 #include <algorithm>
-#include <array>
+#include <bitset>
 #include <cstddef>
 #include <cstdint>
 #include <thread>
+#include <type_traits>
 
 #if (defined(__GNUC__) || defined(__clang__)) && defined(__x86_64__)
 #include <immintrin.h>
@@ -163,32 +164,17 @@ public:
     }
 
     // `processor`: 0 to limit - 1.
-    void add(int processor) noexcept
-    {
-        words_[static_cast<std::size_t>(processor) / 64] |= std::uint64_t{1} << (processor % 64);
-    }
+    void add(int processor) noexcept { set_[static_cast<std::size_t>(processor)] = true; }
 
-    int count() const noexcept
-    {
-        int count = 0;
-        for (std::uint64_t word : words_)
-            for (; word != 0; word &= word - 1)
-                ++count;
-        return count;
-    }
+    int count() const noexcept { return static_cast<int>(set_.count()); }
 
     // Whether any is in both.
-    bool meets(const Processors& other) const noexcept
-    {
-        for (std::size_t i = 0; i < words_.size(); ++i)
-            if (words_[i] & other.words_[i])
-                return true;
-        return false;
-    }
+    bool meets(const Processors& other) const noexcept { return (set_ & other.set_).any(); }
 
 private:
-    std::array<std::uint64_t, limit / 64> words_{};
+    std::bitset<limit> set_;
 };
+static_assert(std::is_trivially_copyable_v<Processors> && sizeof(Processors) == Processors::limit / 8);
 
 // How many threads each of `ranks` should have that share so many processors: an equal part, at least 1.
 inline int threadShare(int processors, int ranks) noexcept { return std::max(1, processors / std::max(1, ranks)); }
