@@ -55,10 +55,10 @@ public:
     void newEpoch()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        free_ += extraInUse_;
-        extraInUse_ = 0;
-        for (auto& [rank, peer] : peers_)
+        for (auto& [rank, peer] : peers_) {
+            free_ += peer.in.extra;
             peer.reset(allowance_);
+        }
         asking_.clear();
         underWay_ = 0;
         peakInboxBytes_ = inboxBytes_; // the next epoch's first messages may be there already
@@ -75,12 +75,10 @@ public:
             Outgoing& out = peer.out;
             for (std::size_t left = out.queue.size(); left > 0; --left) {
                 Buffer message = out.queue.pop();
-                if (matters_(message)) {
+                if (matters_(message))
                     out.queue.push(std::move(message));
-                    continue;
-                }
-                underWay_ -= message.size();
-                out.queuedBytes -= message.size();
+                else
+                    underWay_ -= message.size();
             }
         }
     }
@@ -102,12 +100,11 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             if (matters_ && !matters_(message))
                 return;
-            Outgoing& out = outgoingTo(destination);
+            Outgoing& out = peerOf(destination).out;
             underWay_ += message.size();
             if (!out.queue.empty() || out.sent + message.size() > out.granted) {
-                out.queuedBytes += message.size();
                 out.queue.push(std::move(message));
-                if (out.asked)
+                if (out.asked())
                     return;
                 request = requestOf(out);
             } else {
@@ -132,10 +129,14 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         std::string text;
-        for (const auto& [destination, peer] : peers_)
-            if (const std::uint64_t bytes = peer.out.sent - peer.out.consumed + peer.out.queuedBytes; bytes > 0)
+        for (const auto& [destination, peer] : peers_) {
+            std::uint64_t bytes = peer.out.sent - peer.out.consumed;
+            for (const Buffer& message : peer.out.queue)
+                bytes += message.size();
+            if (bytes > 0)
                 text += printed("%srank %d has not taken %llu bytes", text.empty() ? "" : ", ", destination,
                                 static_cast<unsigned long long>(bytes));
+        }
         return text;
     }
 
@@ -146,7 +147,7 @@ public:
             failMalformed("credit for more than a pool", static_cast<std::int64_t>(pool_),
                           static_cast<std::int64_t>(credit.granted - credit.consumed));
         std::unique_lock<std::mutex> lock(mutex_);
-        Outgoing& out = outgoingTo(from);
+        Outgoing& out = peerOf(from).out;
         if (credit.consumed > out.sent)
             failMalformed("credit for more than was sent", static_cast<std::int64_t>(out.sent),
                           static_cast<std::int64_t>(credit.consumed));
@@ -156,19 +157,14 @@ public:
             out.consumed += more;
             underWay_ -= more;
         }
-        for (;;) {
-            if (out.granted >= out.askedFor) // each time: the last message may have made room
-                out.asked = false;
-            if (out.queue.empty() || out.sent + out.queue.front().size() > out.granted)
-                break;
+        while (!out.queue.empty() && out.sent + out.queue.front().size() <= out.granted) {
             Buffer message = out.queue.pop();
             out.sent += message.size();
-            out.queuedBytes -= message.size();
             lock.unlock();
             callbacks_.transmit(from, std::move(message));
             lock.lock();
         }
-        if (out.queue.empty() || out.asked)
+        if (out.queue.empty() || out.asked())
             return;
         const Request request = requestOf(out);
         lock.unlock();
@@ -196,7 +192,7 @@ public:
     void consumed(int source, std::size_t byteCount)
     {
         std::unique_lock<std::mutex> lock(mutex_);
-        Incoming& in = incomingFrom(source);
+        Incoming& in = peerOf(source).in;
         in.consumed += byteCount;
         inboxBytes_ -= byteCount;
         updateExtra(in);
@@ -212,19 +208,18 @@ public:
     void requested(int source, const Request& request)
     {
         std::unique_lock<std::mutex> lock(mutex_);
-        Incoming& in = incomingFrom(source);
+        Incoming& in = peerOf(source).in;
         if (request.all < request.first || (request.all > in.granted && request.all - in.granted > pool_))
             failMalformed("a request for more than a pool", static_cast<std::int64_t>(pool_),
                           static_cast<std::int64_t>(request.all - in.granted));
         if (request.first > in.granted && request.first - in.granted > pool_ / 4)
             failMalformed("a request for more than the largest message", static_cast<std::int64_t>(pool_ / 4),
                           static_cast<std::int64_t>(request.first - in.granted));
-        if (request.first <= in.granted || (in.asks && request.first <= in.request.first))
+        if (request.first <= in.granted || (in.asks() && request.first <= in.request.first))
             return; // it has its answer, or a later one has overtaken it
-        in.request = request;
-        if (!in.asks)
+        if (!in.asks())
             asking_.push(source);
-        in.asks = true;
+        in.request = request;
         serve(lock);
     }
 
@@ -238,32 +233,18 @@ public:
 private:
     struct Outgoing {
         std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
+        std::uint64_t askedFor = 0;                        // Request::first
         Fifo<Buffer> queue;
-        std::size_t queuedBytes = 0;
-        std::uint64_t askedFor = 0; // Request::first, as long as `asked`
-        bool asked = false;
 
-        void reset(std::uint64_t allowance)
-        {
-            granted = allowance;
-            sent = consumed = askedFor = 0;
-            queue.clear();
-            queuedBytes = 0;
-            asked = false;
-        }
+        bool asked() const { return askedFor > granted; } // and has no answer yet
     };
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
         std::uint64_t told = 0;                  // of consumed
         std::uint64_t extra = 0;                 // granted beyond the allowance and not consumed
         Request request;
-        bool asks = false;
 
-        void reset(std::uint64_t allowance)
-        {
-            *this = Incoming();
-            granted = allowance;
-        }
+        bool asks() const { return request.first > granted; } // once answered, it will ask again if it wants more
     };
 
     struct Peer {
@@ -272,8 +253,10 @@ private:
 
         void reset(std::uint64_t allowance)
         {
-            out.reset(allowance);
-            in.reset(allowance);
+            out.queue.clear();
+            out.sent = out.consumed = out.askedFor = 0;
+            in = Incoming();
+            out.granted = in.granted = allowance;
         }
     };
 
@@ -284,13 +267,10 @@ private:
             place->second.reset(allowance_);
         return place->second;
     }
-    Outgoing& outgoingTo(int rank) { return peerOf(rank).out; }
-    Incoming& incomingFrom(int rank) { return peerOf(rank).in; }
 
     // For the first message that waits, and as many of the next as fit in a quarter of the pool.
     Request requestOf(Outgoing& out) const
     {
-        out.asked = true;
         Request request;
         std::uint64_t total = out.sent;
         for (const Buffer& message : out.queue) {
@@ -314,7 +294,6 @@ private:
     void updateExtra(Incoming& in)
     {
         const std::uint64_t now = extraOf(in, in.granted);
-        extraInUse_ = extraInUse_ + now - in.extra;
         free_ = free_ + in.extra - now;
         in.extra = now;
     }
@@ -323,8 +302,6 @@ private:
     {
         in.granted = std::max(in.granted, total);
         updateExtra(in);
-        if (in.asks && in.granted >= in.request.first)
-            in.asks = false; // it will ask again if it wants more
         in.told = in.consumed;
         grants_.push({source, {in.granted, in.consumed}});
     }
@@ -334,8 +311,8 @@ private:
     {
         while (!asking_.empty()) {
             const int source = asking_.front();
-            Incoming& in = incomingFrom(source);
-            if (in.asks) {
+            Incoming& in = peerOf(source).in;
+            if (in.asks()) {
                 const auto fits = [&](std::uint64_t total) { return extraOf(in, total) <= free_ + in.extra; };
                 if (fits(in.request.all))
                     grant(source, in, in.request.all);
@@ -356,8 +333,7 @@ private:
 
     const std::size_t pool_, allowance_;
     mutable std::mutex mutex_;
-    std::size_t free_;           // of the half that is granted on request
-    std::size_t extraInUse_ = 0; // the rest of it
+    std::size_t free_; // of the half that is granted on request: what is nobody's `extra`
     // Of each rank since it was first met:
     std::unordered_map<int, Peer> peers_;
     Fifo<int> asking_;
