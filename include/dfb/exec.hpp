@@ -46,8 +46,22 @@ public:
         wake();
     }
 
-    // Runs one waiting task on the calling thread. For threads that wait themselves. Returns false if there is none.
-    bool help() { return runOne(); }
+    // Runs the oldest waiting task on the calling thread. For threads that wait themselves. Returns false if there is
+    // none.
+    bool help()
+    {
+        Task task;
+        {
+            std::lock_guard<std::mutex> lock(mutex_);
+            if (tasks_.empty())
+                return false;
+            task = tasks_.pop();
+        }
+        ++depth();
+        task();
+        --depth();
+        return true;
+    }
     bool hasTasks() // that wait; from any thread
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -76,7 +90,7 @@ public:
                 stop.store(true, std::memory_order_relaxed);
             }
             // Not within a task: tasks with loops would run in each other, as deep as there are many.
-            while (depth() == 0 && runOne()) {
+            while (depth() == 0 && help()) {
             }
         };
         run(count, std::ref(guarded)); // which, unlike a copy, takes no memory
@@ -85,26 +99,10 @@ public:
     }
 
 protected:
-    // Sees to it that a worker calls runOne() soon.
+    // Sees to it that a worker calls help() soon.
     virtual void wake() = 0;
     // Calls body(i) for all i on the workers, and waits. The body does not throw.
     virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
-
-    // Runs the oldest waiting task, if there is one.
-    bool runOne()
-    {
-        Task task;
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            if (tasks_.empty())
-                return false;
-            task = tasks_.pop();
-        }
-        ++depth();
-        task();
-        --depth();
-        return true;
-    }
 
 private:
     // Of tasks that the calling thread is in.
@@ -209,7 +207,7 @@ private:
             if (signals_ > 0) {
                 --signals_;
                 lock.unlock();
-                while (runOne()) {
+                while (help()) {
                 }
                 lock.lock();
             } else if (!loops_.empty()) {

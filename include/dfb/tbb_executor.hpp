@@ -6,8 +6,10 @@
 #include <tbb/parallel_for.h>
 #include <tbb/task_arena.h>
 
-#include <condition_variable>
-#include <mutex>
+#include <atomic>
+#include <cstddef>
+#include <functional>
+#include <thread>
 
 DFB_NAMESPACE_BEGIN
 
@@ -24,8 +26,8 @@ public:
 
     ~TbbExecutor() override
     {
-        std::unique_lock<std::mutex> lock(mutex_);
-        idle_.wait(lock, [this] { return enqueued_ == 0; });
+        while (enqueued_ > 0)
+            std::this_thread::yield();
     }
 
     int concurrency() const noexcept override { return arena_.max_concurrency(); }
@@ -33,15 +35,10 @@ public:
 private:
     void wake() override
     {
-        {
-            std::lock_guard<std::mutex> lock(mutex_);
-            ++enqueued_;
-        }
+        ++enqueued_;
         arena_.enqueue([this] {
-            runOne();
-            std::lock_guard<std::mutex> lock(mutex_);
-            if (--enqueued_ == 0)
-                idle_.notify_all();
+            help();
+            --enqueued_; // last: the destructor waits for it
         });
     }
 
@@ -59,9 +56,7 @@ private:
     }
 
     tbb::task_arena arena_;
-    std::mutex mutex_;
-    std::condition_variable idle_;
-    std::size_t enqueued_ = 0;
+    std::atomic<std::size_t> enqueued_{0};
 };
 
 DFB_NAMESPACE_END
