@@ -26,7 +26,6 @@ public:
     [[gnu::noinline]] SmallBytes& operator=(const SmallBytes&) = default;
     [[gnu::noinline]] SmallBytes& operator=(SmallBytes&&) = default;
     [[gnu::noinline]] ~SmallBytes() = default;
-    explicit SmallBytes(std::size_t count) : fewCount_(std::min(count, most)), many_(count > most ? count : 0) {}
     SmallBytes(const std::byte* first, const std::byte* last) { append(first, last); }
 
     std::size_t size() const noexcept { return many_.empty() ? fewCount_ : many_.size(); }
@@ -54,12 +53,6 @@ public:
             many_.assign(few_.data(), few_.data() + fewCount_);
         many_.insert(many_.end(), first, last);
     }
-
-    friend bool operator==(const SmallBytes& a, const SmallBytes& b)
-    {
-        return std::equal(a.begin(), a.end(), b.begin(), b.end());
-    }
-    friend bool operator!=(const SmallBytes& a, const SmallBytes& b) { return !(a == b); }
 
 private:
     static constexpr std::size_t most = 256; // a verdict without an error or figures has 221

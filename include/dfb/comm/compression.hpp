@@ -90,8 +90,6 @@ private:
     struct Peer {
         std::atomic<std::int64_t> raw{0}, sent{0};
         int pause = 0, interval = firstInterval; // in frames
-        Peer() = default;
-        Peer(const Peer&) {} // for the vector, which never copies a used one
     };
     std::vector<Peer> peers_;
 };
@@ -106,9 +104,6 @@ class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.
     bool compresses() const noexcept { return mode_; }
-
-    // Whether that is more than a trial.
-    bool isChosen() const noexcept { return phase_ == Phase::Settled; }
 
     // The frame with compresses() has taken so long, in any unit. Not to be told of frames that have failed.
     void took(double time)
