@@ -14,6 +14,7 @@
 #include <cstddef>
 #include <cstdlib>
 #include <exception>
+#include <optional>
 #include <thread>
 #include <vector>
 
@@ -21,12 +22,26 @@ DFB_NAMESPACE_BEGIN
 
 class MpiSession {
 public:
-    // Initialises MPI at the highest thread level that it has. With MPI_THREAD_MULTIPLE messages move by themselves
-    // (see Progress). Throws TransportError if MPI has been initialised or finalised before.
-    MpiSession(int& argc, char**& argv) : MpiSession(argc, argv, MPI_THREAD_MULTIPLE, MPI_THREAD_SINGLE) {}
-
-    // Initialises MPI at this thread level or a higher one. Throws TransportError also if MPI does not have it.
-    MpiSession(int& argc, char**& argv, int level) : MpiSession(argc, argv, level, level) {}
+    // Initialises MPI at this thread level or a higher one; without `level` at the highest that it has. With
+    // MPI_THREAD_MULTIPLE messages move by themselves (see Progress). Throws TransportError if MPI has been initialised
+    // or finalised before, or does not have the level.
+    MpiSession(int& argc, char**& argv, std::optional<int> level = std::nullopt)
+    {
+        if (detail::mpiSays(MPI_Finalized))
+            throw TransportError("MPI has been finalised: it cannot be initialised again");
+        if (detail::mpiSays(MPI_Initialized))
+            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
+        detail::checkMpi(MPI_Init_thread(&argc, &argv, level.value_or(MPI_THREAD_MULTIPLE), &level_), "MPI_Init_thread",
+                         -1);
+        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
+        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
+        if (level && level_ < *level) {
+            finalize();
+            throw TransportError(detail::printed("this MPI library has the thread level %s at most, %s was asked for",
+                                                 detail::mpiLevelName(level_), detail::mpiLevelName(*level)),
+                                 rank_);
+        }
+    }
 
     MpiSession(const MpiSession&) = delete;
     MpiSession& operator=(const MpiSession&) = delete;
@@ -36,9 +51,7 @@ public:
     // the exception; when the process exits, it aborts the job with code 1.
     ~MpiSession()
     {
-        int finalized = 0;
-        MPI_Finalized(&finalized);
-        if (finalized)
+        if (detail::mpiSays(MPI_Finalized))
             return;
         if (!isGivenUp_ && std::uncaught_exceptions() == exceptions_)
             finalize();
@@ -56,34 +69,13 @@ public:
     MPI_Comm communicator() const noexcept { return MPI_COMM_WORLD; }
 
 private:
-    MpiSession(int& argc, char**& argv, int asked, int needed)
-    {
-        int initialized = 0, finalized = 0;
-        MPI_Initialized(&initialized);
-        MPI_Finalized(&finalized);
-        if (finalized)
-            throw TransportError("MPI has been finalised: it cannot be initialised again");
-        if (initialized)
-            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
-        detail::checkMpi(MPI_Init_thread(&argc, &argv, asked, &level_), "MPI_Init_thread", -1);
-        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
-        if (level_ < needed) {
-            finalize();
-            throw TransportError(detail::printed("this MPI library has the thread level %s at most, %s was asked for",
-                                                 detail::mpiLevelName(level_), detail::mpiLevelName(needed)),
-                                 rank_);
-        }
-    }
-
     // Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
     // second at most. Then waits for the launcher: it may drop output that a rank has written just before MPI_Abort.
     static void abortJob()
     {
-        int finalized = 0, done = 0;
-        MPI_Finalized(&finalized);
-        if (finalized)
+        if (detail::mpiSays(MPI_Finalized))
             return;
+        int done = 0;
         MPI_Request request = MPI_REQUEST_NULL;
         MPI_Ibarrier(MPI_COMM_WORLD, &request);
         detail::Patience patience;
@@ -114,7 +106,7 @@ private:
         MPI_Comm comm = MPI_COMM_NULL;
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
-        wait(request);
+        detail::waitMpi(request, rank_);
         check(MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
 
         std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
@@ -128,18 +120,11 @@ private:
                 check(MPI_Isend(&bytes.back(), 1, MPI_CHAR, other, 0, comm, &requests.back()), "MPI_Isend");
             }
         for (MPI_Request& each : requests)
-            wait(each);
+            detail::waitMpi(each, rank_);
         check(MPI_Ibarrier(comm, &request), "MPI_Ibarrier");
-        wait(request);
+        detail::waitMpi(request, rank_);
         MPI_Comm_free(&comm);
         std::this_thread::sleep_for(std::chrono::milliseconds(20));
-    }
-
-    void wait(MPI_Request& request) const
-    {
-        int done = 0;
-        for (detail::Patience patience; check(MPI_Test(&request, &done, MPI_STATUS_IGNORE), "MPI_Test"), !done;)
-            patience.nap();
     }
 
     void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }

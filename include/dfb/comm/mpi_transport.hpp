@@ -71,6 +71,14 @@ inline void checkMpi(int code, const char* call, int rank, int peer = -1)
                          rank);
 }
 
+// What MPI_Initialized, MPI_Finalized or MPI_Is_thread_main says.
+inline bool mpiSays(int (*ask)(int*))
+{
+    int answer = 0;
+    ask(&answer);
+    return answer != 0;
+}
+
 // For waiting without spinning and without a blocking call.
 class Patience {
 public:
@@ -85,6 +93,14 @@ private:
     static constexpr std::chrono::microseconds shortest{20};
     std::chrono::microseconds next_ = shortest;
 };
+
+// Waits until the request has completed. Throws as checkMpi() does.
+inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STATUS_IGNORE)
+{
+    int done = 0;
+    for (Patience patience; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
+        patience.nap();
+}
 
 } // namespace detail
 
@@ -134,19 +150,15 @@ public:
     MpiTransport& operator=(const MpiTransport&) = delete;
     ~MpiTransport()
     {
-        int finalized = 0;
-        MPI_Finalized(&finalized);
-        if (comm_ != MPI_COMM_NULL && !finalized)
+        if (comm_ != MPI_COMM_NULL && !detail::mpiSays(MPI_Finalized))
             release();
     }
 
     // Only where any thread may call MPI while others do. False, too, if MPI is not there: the constructor says why.
     static bool mayHaveThread(const Communicator&) noexcept
     {
-        int initialized = 0, finalized = 0, level = MPI_THREAD_SINGLE;
-        MPI_Initialized(&initialized);
-        MPI_Finalized(&finalized);
-        if (initialized && !finalized)
+        int level = MPI_THREAD_SINGLE;
+        if (detail::mpiSays(MPI_Initialized) && !detail::mpiSays(MPI_Finalized))
             MPI_Query_thread(&level);
         return level == MPI_THREAD_MULTIPLE;
     }
@@ -226,9 +238,7 @@ public:
     // come; MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
-        int finalized = 0;
-        MPI_Finalized(&finalized);
-        if (finalized) {
+        if (detail::mpiSays(MPI_Finalized)) {
             std::fputs("dfb: MPI_Finalize() was called before the last framebuffer, compositor or wall was destroyed\n",
                        stderr);
         } else if (orderly && !failed_) {
@@ -254,10 +264,8 @@ private:
 
     void checkLevel(Progress progress)
     {
-        int initialized = 0, finalized = 0;
-        MPI_Initialized(&initialized);
-        MPI_Finalized(&finalized);
-        if (!initialized || finalized)
+        const bool finalized = detail::mpiSays(MPI_Finalized);
+        if (finalized || !detail::mpiSays(MPI_Initialized))
             throw TransportError(finalized ? "MPI has been finalised"
                                            : "MPI is not initialised: call MPI_Init or MPI_Init_thread first");
         int level = MPI_THREAD_SINGLE;
@@ -268,9 +276,7 @@ private:
                                 "call MPI_Init_thread with it, or leave Progress::Auto",
                                 detail::mpiLevelName(level)));
         if (level < MPI_THREAD_SERIALIZED) {
-            int isMain = 0;
-            MPI_Is_thread_main(&isMain);
-            if (!isMain)
+            if (!detail::mpiSays(MPI_Is_thread_main))
                 throw TransportError(detail::printed(
                     "MPI was initialised at thread level %s by another thread: only that one may call MPI",
                     detail::mpiLevelName(level)));
@@ -563,19 +569,7 @@ private:
         return done != 0;
     }
 
-    void wait(MPI_Request& request) const
-    {
-        for (detail::Patience patience; !completed(request);)
-            patience.nap();
-    }
-
-    bool completed(std::vector<MPI_Request>& requests) const
-    {
-        int done = 0;
-        check(MPI_Testall(static_cast<int>(requests.size()), requests.data(), &done, MPI_STATUSES_IGNORE),
-              "MPI_Testall");
-        return done != 0;
-    }
+    void wait(MPI_Request& request) const { detail::waitMpi(request, rank_); }
 
     bool move()
     {
@@ -897,7 +891,10 @@ private:
             goodbyes.push_back(MPI_REQUEST_NULL);
             check(MPI_Issend(nullptr, 0, MPI_BYTE, peer, 0, comm_, &goodbyes.back()), "MPI_Issend");
         }
-        if (!moveUntil([&] { return completed(goodbyes); }) || !barrier())
+        const auto haveLeft = [&] {
+            return std::all_of(goodbyes.begin(), goodbyes.end(), [this](MPI_Request& each) { return completed(each); });
+        };
+        if (!moveUntil(haveLeft) || !barrier())
             return false;
         // A receive that cannot be cancelled any more has a packet.
         cancelPackets([this](int slot, std::size_t byteCount) {
@@ -918,9 +915,8 @@ private:
             if (request == MPI_REQUEST_NULL)
                 continue;
             MPI_Status& status = statuses_[slot];
-            int done = 0, cancelled = 0;
-            for (detail::Patience patience; check(MPI_Test(&request, &done, &status), "MPI_Test"), !done;)
-                patience.nap();
+            int cancelled = 0;
+            detail::waitMpi(request, rank_, &status);
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(static_cast<int>(slot), byteCountOf(status));
@@ -951,9 +947,8 @@ private:
     // left to it.
     void abandon()
     {
-        int finalized = 0, done = 0;
-        MPI_Finalized(&finalized);
-        if (!finalized)
+        int done = 0;
+        if (!detail::mpiSays(MPI_Finalized))
             for (auto* requests : {&packetRequests_, &receives_.requests})
                 for (MPI_Request& request : *requests)
                     if (request != MPI_REQUEST_NULL && MPI_Cancel(&request) == MPI_SUCCESS)
