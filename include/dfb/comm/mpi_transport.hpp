@@ -489,23 +489,16 @@ private:
         detail::Fifo<Buffer> waiting;
         int inFlight = 0; // sends to it that have not completed
         int tag = 0;      // the last one used
-        bool listed = false, addressed = false;
+        bool addressed = false;
         std::shared_ptr<detail::NodeMemory> itsMemory; // if it is on this node
         bool seesMine = false;                         // my memory
     };
 
     // More would not be faster, but every poll() looks at each.
     static constexpr int sendsPerPeer = 32;
-    static constexpr std::size_t smallestLent = 2048; // to copy less is quicker
     static constexpr std::size_t bodiesAtOnce = 64;
 
     void check(int code, const char* call, int peer = -1) const { detail::checkMpi(code, call, rank_, peer); }
-
-    [[noreturn]] void failAsTold(std::string text, int source)
-    {
-        told_ = true;
-        throw TransportError(std::move(text), source);
-    }
 
     // `action()`, or false if it failed.
     bool guarded(detail::FunctionRef<bool()> action)
@@ -523,7 +516,7 @@ private:
     void fail(const ErrorInfo& error)
     {
         failed_ = true;
-        if (!told_)
+        if (error.rank == rank_) // else it was another rank that told all
             tellFailure(error.message);
         finishNotices();
         if (handler_)
@@ -604,10 +597,10 @@ private:
         }
         for (auto& [destination, message] : starting_) {
             Peer& peer = peers_[static_cast<std::size_t>(destination)];
+            if (peer.waiting.empty())
+                waitingPeers_.push_back(destination);
             peer.waiting.push(std::move(message));
             peer.addressed = true;
-            if (!std::exchange(peer.listed, true))
-                waitingPeers_.push_back(destination);
         }
         starting_.clear();
 
@@ -617,7 +610,6 @@ private:
             Peer& peer = peers_[static_cast<std::size_t>(destination)];
             any = startSends(destination, peer) || any;
             if (peer.waiting.empty()) {
-                peer.listed = false;
                 waitingPeers_[i] = waitingPeers_.back();
                 waitingPeers_.pop_back();
             } else {
@@ -634,7 +626,7 @@ private:
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
             const std::size_t byteCount = message.size();
-            if (peer.seesMine && byteCount >= smallestLent) {
+            if (peer.seesMine && byteCount >= MemoryPool::smallestShared) { // to copy less is quicker
                 if (const std::byte* lent = pool_->lend(message)) {
                     if (!packet_.hasRoom(0))
                         sendPacket(destination);
@@ -746,7 +738,7 @@ private:
                             rank_);
                     deliver(source, std::move(message));
                 } else if (record.kind == Record::Failure) {
-                    failAsTold(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
+                    throw TransportError(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
                 } else {
                     Buffer message = pool_->acquire(payloadBytes);
                     if (payloadBytes > 0)
@@ -981,7 +973,7 @@ private:
     bool sending_ = false; // under mutex_; something has left the outbox and not completed
 
     // Only the thread that polls uses these.
-    bool failed_ = false, told_ = false, leaving_ = false;
+    bool failed_ = false, leaving_ = false;
     std::vector<std::pair<int, Buffer>> starting_;
     std::vector<Peer> peers_;
     std::vector<int> waitingPeers_; // those with messages that wait
