@@ -109,7 +109,6 @@ public:
         dfb::InprocCommunicator ranks;
         std::shared_ptr<Counters> counters;
     };
-    static constexpr const char* name = "inproc, counted";
 
     CountedTransport(const Communicator& communicator, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : inner_(communicator.ranks, std::move(pool), progress), counters_(communicator.counters)

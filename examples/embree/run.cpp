@@ -17,15 +17,13 @@ int runOver(std::shared_ptr<dfb::Connection> connection, const char* transport, 
 
 int runInproc(const dfb::InprocCommunicator& communicator, const Options& options, int threads)
 {
-    return runOver(dfb::connect<dfb::InprocTransport>(communicator, networkOf(options)), dfb::InprocTransport::name,
-                   options, threads);
+    return runOver(dfb::connect<dfb::InprocTransport>(communicator, networkOf(options)), "inproc", options, threads);
 }
 
 #if defined(DFB_HAS_MPI)
 int runMpi(MPI_Comm communicator, const Options& options, int threads)
 {
-    return runOver(dfb::connect<dfb::MpiTransport>(communicator, networkOf(options)), dfb::MpiTransport::name, options,
-                   threads);
+    return runOver(dfb::connect<dfb::MpiTransport>(communicator, networkOf(options)), "mpi", options, threads);
 }
 #endif
 

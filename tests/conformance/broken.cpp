@@ -71,7 +71,6 @@ public:
         Base::Communicator communicator;
         Defect defect;
     };
-    [[maybe_unused]] static constexpr const char* name = "broken";
 
     Broken(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : defect_(communicator.defect), pool_(pool), base_(communicator.communicator, std::move(pool), progress)

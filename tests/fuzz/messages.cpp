@@ -156,7 +156,6 @@ struct Peer {
 class PlayedTransport {
 public:
     using Communicator = std::shared_ptr<Peer>;
-    [[maybe_unused]] static constexpr const char* name = "played";
 
     PlayedTransport(const Communicator& peer, std::shared_ptr<dfb::MemoryPool>, dfb::Progress) : peer_(peer) {}
     int rank() const { return 0; }

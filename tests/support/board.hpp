@@ -86,7 +86,6 @@ public:
         dfb::InprocCommunicator inner;
         std::shared_ptr<Board> board;
     };
-    [[maybe_unused]] static constexpr const char* name = "board";
 
     BoardTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : Forward(c.inner, std::move(pool), progress), board_(c.board)

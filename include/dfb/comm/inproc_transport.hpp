@@ -113,7 +113,6 @@ private:
 class InprocTransport {
 public:
     using Communicator = InprocCommunicator;
-    static constexpr const char* name = "inproc";
 
     InprocTransport(const Communicator& communicator, std::shared_ptr<MemoryPool>, Progress)
         : hub_(communicator.hub_), rank_(communicator.rank()), channel_(&hub_->open(rank_))

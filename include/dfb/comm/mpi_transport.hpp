@@ -107,7 +107,6 @@ inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STA
 class MpiTransport {
 public:
     using Communicator = MPI_Comm;
-    static constexpr const char* name = "mpi";
 
     static constexpr int postedPackets = 8;                         // receives; their memory is said above
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints

@@ -2,7 +2,6 @@
 // somebody calls poll(). It knows nothing of tiles.
 //
 //   using Communicator = ...;                   what a program has: a group of ranks, and which of them this one is
-//   static constexpr const char* name;          for reports
 //   T(const Communicator&, std::shared_ptr<MemoryPool>, Progress);
 //                                               collective over the communicator. Messages of two transports on one
 //                                               communicator do not mix. Throws TransportError

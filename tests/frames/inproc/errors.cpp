@@ -62,7 +62,6 @@ public:
         dfb::InprocCommunicator inner;
         std::shared_ptr<Switchboard> board;
     };
-    [[maybe_unused]] static constexpr const char* name = "inspected";
 
     InspectedTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : Forward(c.inner, std::move(pool), progress), board_(c.board)

@@ -50,7 +50,6 @@ public:
         BoardTransport::Communicator inner;
         std::shared_ptr<Holds> holds;
     };
-    [[maybe_unused]] static constexpr const char* name = "held";
 
     HeldTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : Forward(c.inner, std::move(pool), progress), holds_(c.holds)

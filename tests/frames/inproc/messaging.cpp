@@ -674,7 +674,6 @@ namespace {
 class Hasty : public Forward<dfb::InprocTransport> {
 public:
     using Communicator = dfb::InprocCommunicator;
-    [[maybe_unused]] static constexpr const char* name = "hasty";
     using Forward::Forward;
 
     void send(int to, dfb::Buffer&& message)

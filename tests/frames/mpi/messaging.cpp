@@ -68,7 +68,6 @@ public:
         Tamper tamper;
         std::shared_ptr<Held> held{};
     };
-    [[maybe_unused]] static constexpr const char* name = "tampering";
 
     TamperingTransport(const Communicator& c, std::shared_ptr<dfb::MemoryPool> pool, dfb::Progress progress)
         : Forward(c.communicator, std::move(pool), progress), tamper_(c.tamper), held_(c.held)

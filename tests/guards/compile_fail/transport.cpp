@@ -11,7 +11,6 @@ struct Transport {
     using Communicator = int;
     Transport(const Communicator&, std::shared_ptr<dfb::MemoryPool>, dfb::Progress);
 #endif
-    static constexpr const char* name = "archetype";
 
     int rank() const;
 #if defined(CASE_NO_SIZE) // expect: dfb: Transport must provide int rank() const and int size() const

@@ -38,7 +38,6 @@ struct Wire {
 class PlayedTransport {
 public:
     using Communicator = std::shared_ptr<Wire>;
-    [[maybe_unused]] static constexpr const char* name = "played";
 
     PlayedTransport(const Communicator& wire, std::shared_ptr<dfb::MemoryPool>, dfb::Progress) : wire_(wire) {}
     int rank() const { return wire_->rank; }

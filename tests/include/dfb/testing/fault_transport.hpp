@@ -99,7 +99,6 @@ public:
         typename Base::Communicator communicator;
         FaultOptions faults;
     };
-    static constexpr const char* name = "fault";
 
     FaultTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : pool_(pool), base_(communicator.communicator, std::move(pool), progress), options_(communicator.faults),
