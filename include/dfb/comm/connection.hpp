@@ -523,8 +523,8 @@ private:
                             "nothing of it for %lld ms (peerTimeout)",
                             rank(), static_cast<long long>(config_.peerTimeout.count()));
         const ErrorInfo error = detail::errorInfo(ErrorKind::Transport, text, other);
-        if (link_->canAbort() && !config_.onPeerLost)
-            link_->abort(error.describe());
+        if (!config_.onPeerLost)
+            link_->abort(error.describe()); // if the transport can
         if (giveUp(error) && config_.onPeerLost)
             config_.onPeerLost(error);
     }

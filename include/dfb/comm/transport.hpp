@@ -219,7 +219,6 @@ public:
     virtual std::int32_t placeOf(const std::byte* block) const = 0;
     virtual std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const = 0;
     virtual int sharingRanks() const = 0;
-    virtual bool canAbort() const = 0;
     virtual void abort(const std::string& text) = 0;
 };
 
@@ -249,36 +248,16 @@ public:
     void stop(bool orderly) override { transport_.stop(orderly); }
 
     bool knowsSharedMemory() const override { return shares_memory_v<Transport>; }
-    bool lendsTo([[maybe_unused]] int other) const override
+    bool lendsTo(int other) const override { return with<shares_memory_v<Transport>>().lendsTo(other); }
+    std::int32_t placeOf(const std::byte* block) const override
     {
-        if constexpr (shares_memory_v<Transport>)
-            return transport_.lendsTo(other);
-        else
-            return false;
+        return with<shares_memory_v<Transport>>().placeOf(block);
     }
-    std::int32_t placeOf([[maybe_unused]] const std::byte* block) const override
+    std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const override
     {
-        if constexpr (shares_memory_v<Transport>)
-            return transport_.placeOf(block);
-        else
-            return -1;
+        return with<shares_memory_v<Transport>>().blockAt(other, place, byteCount);
     }
-    std::byte* blockAt([[maybe_unused]] int other, [[maybe_unused]] std::int32_t place,
-                       [[maybe_unused]] std::size_t byteCount) const override
-    {
-        if constexpr (shares_memory_v<Transport>)
-            return transport_.blockAt(other, place, byteCount);
-        else
-            return nullptr;
-    }
-    int sharingRanks() const override
-    {
-        if constexpr (knows_sharing_v<Transport>)
-            return transport_.sharingRanks();
-        else
-            return 1;
-    }
-    bool canAbort() const override { return can_abort_v<Transport>; }
+    int sharingRanks() const override { return with<knows_sharing_v<Transport>>().sharingRanks(); }
     void abort([[maybe_unused]] const std::string& text) override
     {
         if constexpr (can_abort_v<Transport>)
@@ -286,6 +265,22 @@ public:
     }
 
 private:
+    struct Without {
+        bool lendsTo(int) const { return false; }
+        std::int32_t placeOf(const std::byte*) const { return -1; }
+        std::byte* blockAt(int, std::int32_t, std::size_t) const { return nullptr; }
+        int sharingRanks() const { return 1; }
+    };
+    // What has the optional members.
+    template <bool Has>
+    decltype(auto) with() const
+    {
+        if constexpr (Has)
+            return (transport_);
+        else
+            return Without();
+    }
+
     Transport transport_;
 };
 
