@@ -64,28 +64,27 @@ protected:
 // Which messages of one sender have come: each number once, in any order.
 class SequenceWindow {
 public:
-    enum class Result { New, Duplicate, Absurd };
-
     SequenceWindow() { holes_.reserve(16); }
 
-    Result arrive(std::uint32_t sequence)
+    // Returns whether it is new. Throws Error (MalformedMessage) for one that is too far ahead.
+    bool arrive(std::uint32_t sequence)
     {
         const auto ahead = static_cast<std::int32_t>(sequence - next_);
         if (ahead >= 0) {
             if (ahead > maxHoles - static_cast<std::int32_t>(holes_.size()))
-                return Result::Absurd;
+                failMalformed("a running number far from the others");
             for (; next_ != sequence; ++next_)
                 holes_.push_back(next_);
             ++next_;
-            return Result::New;
+            return true;
         }
         const auto hole = std::lower_bound(holes_.begin(), holes_.end(), sequence, [this](auto a, auto b) {
             return next_ - a > next_ - b; // also where the numbers have begun again
         });
         if (hole == holes_.end() || *hole != sequence)
-            return Result::Duplicate;
+            return false;
         holes_.erase(hole);
-        return Result::New;
+        return true;
     }
 
     // Messages that later ones have overtaken, or that are lost.
@@ -443,11 +442,9 @@ private:
                 askers_.push_back(source);
             isAsked_ = true;
         }
-        const auto result = peers_[source].received.arrive(header.sequence);
-        if (result == detail::SequenceWindow::Result::Absurd)
-            detail::failMalformed("a running number far from the others");
-        duplicates_ += result == detail::SequenceWindow::Result::Duplicate;
-        return result == detail::SequenceWindow::Result::New;
+        const bool isFirst = peers_[source].received.arrive(header.sequence);
+        duplicates_ += !isFirst;
+        return isFirst;
     }
 
     bool setFailure(const ErrorInfo& error)

@@ -52,11 +52,11 @@ public:
         std::lock_guard<std::mutex> lock(mutex_);
         const std::size_t index = opened_[static_cast<std::size_t>(rank)]++;
         if (index == channels_.size()) {
-            channels_.push_back(std::make_unique<Channel>(static_cast<std::size_t>(size_)));
-            for (std::size_t r = 0; shuffleSeed_ && r < channels_.back()->size(); ++r)
-                (*channels_.back())[r].random = *shuffleSeed_ + 1000003 * index + 7919 * r;
+            channels_.emplace_back(static_cast<std::size_t>(size_));
+            for (std::size_t r = 0; shuffleSeed_ && r < channels_.back().size(); ++r)
+                channels_.back()[r].random = *shuffleSeed_ + 1000003 * index + 7919 * r;
         }
-        return *channels_[index];
+        return channels_[index];
     }
 
     // The first failure; a rank that starts later gets it too.
@@ -75,8 +75,8 @@ public:
             if (failure_)
                 return;
             failure_ = error;
-            for (auto& channel : channels_)
-                channels.push_back(channel.get());
+            for (Channel& channel : channels_)
+                channels.push_back(&channel);
         }
         for (Channel* channel : channels)
             for (Endpoint& endpoint : *channel) {
@@ -91,7 +91,7 @@ private:
     std::optional<std::uint64_t> shuffleSeed_;
     std::mutex mutex_;
     std::vector<std::size_t> opened_;
-    std::deque<std::unique_ptr<Channel>> channels_;
+    std::deque<Channel> channels_;
     std::optional<ErrorInfo> failure_;
 };
 
