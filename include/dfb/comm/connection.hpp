@@ -7,6 +7,7 @@
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
+#include <dfb/comm/reduction.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/fwd.hpp>
 
@@ -111,8 +112,9 @@ public:
             return;
         try {
             progress_.start();
-            for (const int other : heartbeat_.neighbours())
-                sendSign(other, detail::MessageKind::Present);
+            if (heartbeat_.isOn())
+                for (const int other : detail::treeNeighbours(rank_, size_))
+                    sendSign(other, detail::MessageKind::Present);
         } catch (const std::exception& e) { // no thread, no memory: the others have made theirs
             leave(e.what());
             end();
@@ -547,7 +549,7 @@ private:
     mutable std::mutex peersMutex_;
     // Under peersMutex_:
     std::unordered_map<int, Peer> peers_; // made when first needed
-    detail::Heartbeat heartbeat_{rank_, size_, peerTimeout()};
+    detail::Heartbeat heartbeat_{detail::treeNeighbours(rank_, size_), peerTimeout()};
     std::vector<int> askers_; // that want a sign of life
 
     std::atomic<bool> isAsked_{false}; // there are askers

@@ -23,28 +23,16 @@ public:
     using Time = std::chrono::steady_clock::time_point;
     using Duration = Time::duration;
 
-    // `timeout` 0: it listens for nobody.
-    Heartbeat(int rank, int size, std::chrono::milliseconds timeout) : timeout_(timeout)
+    // `neighbours`: the ranks that this one listens for, and they for it: those in the tree of reductions, whose
+    // messages they get in each frame anyway. Each rank has one at least and no more than log2 of their number, and
+    // whichever ranks are lost, one of them has a neighbour that is not. `timeout` 0: it listens for nobody.
+    Heartbeat(const std::vector<int>& neighbours, std::chrono::milliseconds timeout) : timeout_(timeout)
     {
-        if (timeout.count() <= 0)
-            return;
-        if (rank != 0)
-            peers_.push_back(Peer{rank & (rank - 1)});
-        for (int bit = 1; bit < size && !(rank & bit); bit <<= 1)
-            if (rank + bit < size)
-                peers_.push_back(Peer{rank + bit});
+        for (const int rank : neighbours)
+            if (timeout.count() > 0)
+                peers_.push_back(Peer{rank});
     }
 
-    // The ranks that this one listens for, and they for it: its neighbours in the tree of reductions, whose messages
-    // they get in each frame anyway. Each rank has one at least and no more than log2 of their number, and whichever
-    // ranks are lost, one of them has a neighbour that is not.
-    std::vector<int> neighbours() const
-    {
-        std::vector<int> ranks;
-        for (const Peer& peer : peers_)
-            ranks.push_back(peer.rank);
-        return ranks;
-    }
     bool isOn() const noexcept { return !peers_.empty(); }
 
     // Without a message for so long, a rank is asked; and it must answer sooner than that.

@@ -82,7 +82,7 @@ public:
     void stop()
     {
         if (!isEnding_ && !failed())
-            for (const int neighbour : reductions_.neighbours())
+            for (const int neighbour : treeNeighbours(rank(), size()))
                 sendBody(neighbour, MessageKind::Leaving, epoch_, Leaving{reductionCount_, std::uncaught_exceptions()});
         connection_->detach(address_);
         std::unique_lock<std::mutex> lock(mutex_);

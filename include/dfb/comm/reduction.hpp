@@ -26,6 +26,22 @@ struct ReductionKey {
     bool operator==(const ReductionKey& o) const { return scope == o.scope && number == o.number; }
 };
 
+namespace detail {
+
+// The ranks that a rank exchanges parts and results with: its parent, unless it is the root, and then its children.
+inline std::vector<int> treeNeighbours(int rank, int size)
+{
+    std::vector<int> ranks;
+    if (rank != 0)
+        ranks.push_back(rank & (rank - 1));
+    for (int bit = 1; bit < size && !(rank & bit); bit <<= 1)
+        if (rank + bit < size)
+            ranks.push_back(rank + bit);
+    return ranks;
+}
+
+} // namespace detail
+
 // All members may be called from any thread. The callbacks are called without a lock held, on the calling thread.
 class ReductionTable {
 public:
@@ -35,22 +51,13 @@ public:
     // Sends a partial result up to the parent or the result down to a child.
     using Send = std::function<void(int destination, const ReductionKey&, bool up, const Bytes&)>;
 
-    ReductionTable(int rank, int size, Send send) : rank_(rank), size_(size), send_(std::move(send))
+    ReductionTable(int rank, int size, Send send)
+        : rank_(rank), size_(size), send_(std::move(send)), children_(detail::treeNeighbours(rank, size))
     {
-        for (int bit = 1; bit < size_ && !(rank_ & bit); bit <<= 1)
-            if (rank_ + bit < size_)
-                children_.push_back(rank_ + bit);
+        if (rank_ != 0)
+            children_.erase(children_.begin());
         for (int i = 0; i < 4; ++i) // more are hardly under way at once
             states_.emplace_back(children_.size() + 1);
-    }
-
-    // The ranks that this one exchanges parts and results with.
-    std::vector<int> neighbours() const
-    {
-        std::vector<int> all = children_;
-        if (rank_ != 0)
-            all.push_back(parent());
-        return all;
     }
 
     // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1: a

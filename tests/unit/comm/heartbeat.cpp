@@ -16,6 +16,7 @@ namespace heartbeat_cases {
 namespace {
 
 using dfb::detail::Heartbeat;
+using dfb::detail::treeNeighbours;
 using std::chrono::milliseconds;
 
 constexpr int timeoutMs = 3200;
@@ -30,9 +31,9 @@ struct Rank {
     int lostAt = -1; // ms since the first step
     int ms = 0;
 
-    Rank(int rank, int size) : beat(rank, size, milliseconds(timeoutMs))
+    Rank(int rank, int size) : beat(treeNeighbours(rank, size), milliseconds(timeoutMs))
     {
-        for (const int other : beat.neighbours())
+        for (const int other : treeNeighbours(rank, size))
             beat.heard(other, true);
         step(0);
     }
@@ -60,8 +61,8 @@ TEST_CASE("A rank listens for its neighbours in the tree of reductions, and they
     for (int size = 1; size <= 40; ++size) {
         std::vector<std::set<int>> listens(static_cast<std::size_t>(size));
         for (int rank = 0; rank < size; ++rank) {
-            const Heartbeat beat(rank, size, milliseconds(timeoutMs));
-            const auto neighbours = beat.neighbours();
+            const auto neighbours = treeNeighbours(rank, size);
+            const Heartbeat beat(neighbours, milliseconds(timeoutMs));
             listens[static_cast<std::size_t>(rank)].insert(neighbours.begin(), neighbours.end());
             CHECK(beat.isOn() == (size > 1));
             CHECK(listens[static_cast<std::size_t>(rank)].size() == neighbours.size());
@@ -96,9 +97,8 @@ TEST_CASE("A rank listens for its neighbours in the tree of reductions, and they
 
 TEST_CASE("Without a time-out it listens for nobody", "[heartbeat]")
 {
-    Heartbeat beat(0, 8, milliseconds(0));
+    Heartbeat beat(treeNeighbours(0, 8), milliseconds(0));
     CHECK_FALSE(beat.isOn());
-    CHECK(beat.neighbours().empty());
     const auto due = beat.due(Heartbeat::Time{} + std::chrono::hours(1), true);
     CHECK((due.ask.empty() && due.lost < 0));
 }
@@ -142,7 +142,7 @@ TEST_CASE("Any message is a sign of life of its sender, and of nobody else", "[h
 
 TEST_CASE("Who has never said that it answers is neither asked nor lost", "[heartbeat]")
 {
-    Heartbeat beat(1, 2, milliseconds(timeoutMs));
+    Heartbeat beat({0}, milliseconds(timeoutMs));
     auto now = Heartbeat::Time{} + std::chrono::hours(1);
     beat.heard(0, false); // a message, but no promise
     for (int i = 0; i < 3 * timeoutMs / stepMs; ++i, now += milliseconds(stepMs)) {
@@ -194,7 +194,7 @@ TEST_CASE("Two ranks that answer in time never lose each other, however they are
         std::mt19937 random(seed);
         const auto upTo = [&](int ms) { return static_cast<int>(random() % static_cast<unsigned>(ms + 1)); };
         const milliseconds step(10);
-        Heartbeat a(0, 2, milliseconds(timeoutMs)), b(1, 2, milliseconds(timeoutMs));
+        Heartbeat a({1}, milliseconds(timeoutMs)), b({0}, milliseconds(timeoutMs));
         a.heard(1, true), b.heard(0, true);
         struct Message {
             Heartbeat::Time at;
