@@ -202,9 +202,9 @@ public:
 
     // Returns how many messages of the epoch have been sent and taken, of those that make their receiver do something.
     // Returns nothing unless this object rests: no task of it is queued or runs, and nothing waits to be sent.
-    std::optional<MessageCounts> countsAtRest()
+    std::optional<Quiescence::Report> countsAtRest()
     {
-        const MessageCounts counts{sentOn_, takenOn_};
+        const Quiescence::Report counts{sentOn_, takenOn_};
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             if (tasks_ > 0)

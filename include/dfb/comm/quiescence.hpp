@@ -19,22 +19,17 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Messages between ranks that make the one that takes them do something.
-struct MessageCounts {
-    std::uint64_t sent = 0, taken = 0;
-};
-
 // One per rank. newFrame() apart, members may be called from any thread; each round is entered and then ended.
 class Quiescence {
 public:
     // The counts of one rank, or the sums of several.
     struct Report {
-        MessageCounts messages;
-        std::uint64_t unfinished = 0; // ranks that wait for more than the others' word that all are done
+        std::uint64_t sent = 0, taken = 0; // messages between ranks that make the one that takes them do something
+        std::uint64_t unfinished = 0;      // ranks that wait for more than the others' word that all are done
     };
     static Report sum(const Report& a, const Report& b) noexcept
     {
-        return {{a.messages.sent + b.messages.sent, a.messages.taken + b.messages.taken}, a.unfinished + b.unfinished};
+        return {a.sent + b.sent, a.taken + b.taken, a.unfinished + b.unfinished};
     }
 
     // `first`: so long a rank waits before the first round; see interval().
@@ -52,16 +47,14 @@ public:
         return first_ * (std::int64_t{1} << std::clamp(rounds_ - 1, 0, 4));
     }
 
-    // Whether this rank may enter a round: it is in none.
-    bool mayEnter() const noexcept { return !isInRound_; }
-    void enter() noexcept { isInRound_ = true; }
+    // Begins a round, for a rank that is in none. Returns false if it is in one.
+    bool tryEnter() noexcept { return !isInRound_.exchange(true); }
 
     // `all`: of the round that this rank has entered. True if it is proven that nothing is under way and that some rank
     // waits for more: on all ranks in the same round.
     bool endRound(const Report& all)
     {
-        const bool isQuiet = last_ && all.messages.sent == all.messages.taken
-                             && last_->messages.sent == all.messages.sent && last_->messages.taken == all.messages.taken
+        const bool isQuiet = last_ && all.sent == all.taken && last_->sent == all.sent && last_->taken == all.taken
                              && all.unfinished > 0;
         last_ = all;
         ++rounds_;

@@ -403,12 +403,12 @@ private:
     void look()
     {
         tryVote();
-        const auto counts = mailbox_.countsAtRest();
-        if (!counts || !quiescence_.mayEnter())
+        auto counts = mailbox_.countsAtRest();
+        if (!counts || !quiescence_.tryEnter())
             return;
         const auto isWaiting = [this] { return !isDone() && !failed(); };
-        const Round mine{terms_, {*counts, isWaiting() ? 1u : 0u}};
-        quiescence_.enter();
+        counts->unfinished = isWaiting() ? 1 : 0;
+        const Round mine{terms_, *counts};
         mailbox_.reductions().enter({Quiet, frame_.number()}, mine.bytes(), Round::combine,
                                     [this, isWaiting](const Bytes& all) {
                                         if (quiescence_.endRound(Round::from(all).report) && isWaiting())

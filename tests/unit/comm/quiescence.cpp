@@ -110,13 +110,12 @@ private:
     void enter(std::size_t which)
     {
         Rank& r = ranks_[which];
-        if (r.tasks > 0 || !r.quiescence.mayEnter())
+        if (r.tasks > 0 || !r.quiescence.tryEnter())
             return;
-        r.quiescence.enter();
-        round_ = Quiescence::sum(round_, {{r.sent, r.taken}, 1});
+        round_ = Quiescence::sum(round_, {r.sent, r.taken, 1});
         if (++entered_ < ranks_.size())
             return;
-        outcome_.wrongRounds += round_.messages.sent == round_.messages.taken && !isQuiet();
+        outcome_.wrongRounds += round_.sent == round_.taken && !isQuiet();
         for (Rank& other : ranks_)
             other.results.push_back(round_);
         round_ = {};
@@ -148,7 +147,7 @@ private:
 
 dfb::detail::Quiescence::Report reportOf(std::uint64_t sent, std::uint64_t taken, std::uint64_t unfinished = 1)
 {
-    return {{sent, taken}, unfinished};
+    return {sent, taken, unfinished};
 }
 
 } // namespace
@@ -188,9 +187,8 @@ TEST_CASE("It takes two rounds with the same sums, as many taken as sent, and a 
         bool last = false;
         for (const Quiescence::Report& round : rounds) {
             CHECK_FALSE(last);
-            CHECK(q.mayEnter());
-            q.enter();
-            CHECK_FALSE(q.mayEnter());
+            CHECK(q.tryEnter());
+            CHECK_FALSE(q.tryEnter());
             last = q.endRound(round);
         }
         return last;
@@ -215,7 +213,7 @@ TEST_CASE("Rounds become rarer, up to a limit, and begin again with the next fra
         std::vector<std::int64_t> waits;
         for (int round = 0; round < 8; ++round) {
             waits.push_back(q.interval().count());
-            q.enter();
+            q.tryEnter();
             q.endRound(reportOf(static_cast<std::uint64_t>(round), 0));
         }
         CHECK(waits
