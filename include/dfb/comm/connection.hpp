@@ -276,23 +276,29 @@ public:
         return whileThrown;
     }
 
-    // Tells the progress thread something for as long as an object of this type exists.
-    template <void (ProgressThread::*Tell)(bool)>
+    // Each true is followed by one false; see Hurry and StandIn.
+    void hurry(bool more) { progress_.hurry(more); }
+    void standIn(bool more) { progress_.standIn(more); }
+
+    // Tells the connection something for as long as an object of this type exists.
+    template <void (Connection::*Tell)(bool)>
     class Telling {
     public:
-        explicit Telling(Connection& connection) : progress_(connection.progress_) { (progress_.*Tell)(true); }
+        explicit Telling(Connection& connection) : connection_(connection) { (connection_.*Tell)(true); }
         Telling(const Telling&) = delete;
         Telling& operator=(const Telling&) = delete;
-        ~Telling() { (progress_.*Tell)(false); }
+        ~Telling() { (connection_.*Tell)(false); }
 
     private:
-        ProgressThread& progress_;
+        Connection& connection_;
     };
+    // Messages may come.
+    using Expecting = Telling<&Connection::expectMessages>;
     // The connection looks for messages often.
-    using Hurry = Telling<&ProgressThread::hurry>;
+    using Hurry = Telling<&Connection::hurry>;
     // The calling thread moves messages in place of the progress thread: it stays in calls that do so. Two threads on
     // one processor would take turns for each message.
-    using StandIn = Telling<&ProgressThread::standIn>;
+    using StandIn = Telling<&Connection::standIn>;
 
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
     // moved.

@@ -360,26 +360,18 @@ public:
         const std::int64_t number = reductionCount_++;
         auto damage = takeDamage(); // now: the others go on when they have this rank's part
         checkLeft();
-        connection_->expectMessages(true);
+        const Connection::Expecting expecting(*connection_);
         try {
-            try {
-                reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
-                                  [this, result](const Bytes& bytes) {
-                                      result->bytes = bytes;
-                                      result->there = true;
-                                      notify();
-                                  });
-            } catch (const Error& e) { // from an earlier message of a rank below in the tree
-                ErrorInfo error = e.info();
-                error.rank = rank();
-                connection_->giveUp(error);
-            }
-            waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
-        } catch (...) {
-            connection_->expectMessages(false);
-            throw;
+            reductions_.enter({ownScope, number}, std::move(own), std::move(combine),
+                              [this, result](const Bytes& bytes) {
+                                  result->bytes = bytes;
+                                  result->there = true;
+                                  notify();
+                              });
+        } catch (const Error& e) { // from an earlier message of a rank below in the tree
+            giveUp(-1, e.info());
         }
-        connection_->expectMessages(false);
+        waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
         return result->bytes;
     }
 

@@ -63,24 +63,15 @@ public:
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
         mailbox_->requireProgress();
-        mailbox_->connection().expectMessages(true);
-        bool complete = true;
-        std::string missing;
-        try {
-            std::optional<std::chrono::steady_clock::time_point> deadline;
-            if (timeout.count() > 0)
-                deadline = std::chrono::steady_clock::now() + timeout;
-            tellSent(frame);
-            mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
-            missing = whatIsMissing(frame);
-            complete = missing.empty();
-        } catch (...) {
-            mailbox_->connection().expectMessages(false);
-            throw;
-        }
-        Agreement mine{complete, complete ? "" : missing, mailbox_->rank()};
+        const Connection::Expecting expecting(mailbox_->connection());
+        std::optional<std::chrono::steady_clock::time_point> deadline;
+        if (timeout.count() > 0)
+            deadline = std::chrono::steady_clock::now() + timeout;
+        tellSent(frame);
+        mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
+        const std::string missing = whatIsMissing(frame);
+        Agreement mine{missing.empty(), missing, mailbox_->rank()};
         const auto all = Agreement::from(mailbox_->reduce(mine.bytes(), Agreement::combine));
-        mailbox_->connection().expectMessages(false);
         const std::lock_guard<std::mutex> lock(mutex_);
         if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
             for (auto& [display, picture] : *done->second)
