@@ -260,7 +260,7 @@ private:
     // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
-        const std::uint32_t scope = mailbox_.keyOf(header, message).scope;
+        const std::uint32_t scope = mailbox_.scopeOf(message);
         const bool isUp = header.kind == MessageKind::ReduceUp;
         bool differs = false;
         try {

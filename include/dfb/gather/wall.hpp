@@ -216,7 +216,7 @@ private:
             case MessageKind::FinishedTiles: store(header.number, message); break;
             case MessageKind::ReduceUp:
             case MessageKind::ReduceDown:
-                if (mailbox_->keyOf(header, message).scope == SentPixels) {
+                if (mailbox_->scopeOf(message) == SentPixels) {
                     receiveSent(source, header, message);
                     break;
                 }
