@@ -1,6 +1,7 @@
 // A suite that passes everything is worth nothing: transports that break the contract, each in one way, and what
 // checkTransport() is to say of them.
 #include "catch.hpp"
+#include "shuffled.hpp"
 
 #include <dfb/comm/inproc_transport.hpp>
 #include <dfb/testing/fault_transport.hpp>
@@ -66,7 +67,7 @@ struct Started {
 // One type for all, as each takes a while to compile with the suite.
 class Broken : private TransportHandler {
 public:
-    using Base = testing::FaultTransport<InprocTransport>;
+    using Base = testing::FaultTransport<ShuffledTransport>;
     struct Communicator {
         Base::Communicator communicator;
         Defect defect;
@@ -212,15 +213,13 @@ std::string failuresOf(Defect defect, Over over = Over::Plain, Progress mode = P
     faults.delay = over == Over::Late ? 1 : 0;
     std::mutex mutex;
     std::string text;
-    runRanks(
-        2,
-        [&](const InprocCommunicator& communicator) {
-            const Broken::Communicator broken{{communicator, faults}, defect};
-            const std::string own = testing::describeFailures(testing::checkTransport<Broken>(broken, options));
-            const std::lock_guard<std::mutex> lock(mutex);
-            text += own;
-        },
-        over == Over::Shuffled ? std::optional<std::uint64_t>(1) : std::nullopt);
+    const auto seed = over == Over::Shuffled ? std::optional<std::uint64_t>(1) : std::nullopt;
+    runRanks(2, [&](const InprocCommunicator& communicator) {
+        const Broken::Communicator broken{{{communicator, seed}, faults}, defect};
+        const std::string own = testing::describeFailures(testing::checkTransport<Broken>(broken, options));
+        const std::lock_guard<std::mutex> lock(mutex);
+        text += own;
+    });
     return text;
 }
 

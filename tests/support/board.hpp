@@ -3,6 +3,7 @@
 #pragma once
 
 #include "forward.hpp"
+#include "shuffled.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -80,10 +81,10 @@ struct Board {
     }
 };
 
-class BoardTransport : public Forward<dfb::InprocTransport> {
+class BoardTransport : public Forward<ShuffledTransport> {
 public:
     struct Communicator {
-        dfb::InprocCommunicator inner;
+        ShuffledTransport::Communicator inner;
         std::shared_ptr<Board> board;
     };
 
@@ -155,12 +156,7 @@ inline void runOn(const std::shared_ptr<Board>& board, int ranks,
     });
     std::string thrown;
     try {
-        dfb::runRanks(
-            ranks,
-            [&](dfb::InprocCommunicator communicator) {
-                body({communicator, board});
-            },
-            shuffleSeed);
+        dfb::runRanks(ranks, [&](dfb::InprocCommunicator communicator) { body({{communicator, shuffleSeed}, board}); });
     } catch (const std::exception& e) {
         thrown = e.what();
     }

@@ -8,6 +8,7 @@
 #include "any_transport.hpp"
 #include "catch.hpp"
 #include "random_scene.hpp"
+#include "shuffled.hpp"
 
 #include <cstdint>
 #include <mutex>
@@ -35,17 +36,15 @@ inline Result inProcess(Run run, int ranks)
     std::mutex mutex;
     std::string wrong;
     try {
-        dfb::runRanks(
-            ranks,
-            [&](const dfb::InprocCommunicator& communicator) {
-                const Result mine = run(AnyTransport::Communicator::of<dfb::InprocTransport>(communicator, true));
-                const std::lock_guard<std::mutex> lock(mutex);
-                if (communicator.rank() == 0)
-                    first = mine;
-                if (!mine.wrong.empty())
-                    wrong += "rank " + std::to_string(communicator.rank()) + ": " + mine.wrong + "\n";
-            },
-            static_cast<std::uint64_t>(ranks));
+        dfb::runRanks(ranks, [&](const dfb::InprocCommunicator& inOrder) {
+            const ShuffledTransport::Communicator communicator(inOrder, static_cast<std::uint64_t>(ranks));
+            const Result mine = run(AnyTransport::Communicator::of<ShuffledTransport>(communicator, true));
+            const std::lock_guard<std::mutex> lock(mutex);
+            if (communicator.rank() == 0)
+                first = mine;
+            if (!mine.wrong.empty())
+                wrong += "rank " + std::to_string(communicator.rank()) + ": " + mine.wrong + "\n";
+        });
     } catch (const std::exception& e) {
         wrong += std::string("thrown: ") + e.what();
     }

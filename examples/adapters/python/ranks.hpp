@@ -26,7 +26,7 @@ inline std::shared_ptr<dfb::Connection> connect(const py::object& comm)
 {
     std::optional<dfb::InprocCommunicator> threads;
     if (comm.is_none())
-        threads.emplace(std::make_shared<dfb::detail::InprocHub>(1, std::nullopt), 0);
+        threads.emplace(std::make_shared<dfb::detail::InprocHub>(1), 0);
     else if (py::isinstance<dfb::InprocCommunicator>(comm))
         threads = comm.cast<dfb::InprocCommunicator>();
     if (threads) {

@@ -1,6 +1,7 @@
 // The image of a frame: right by the serial reference, and the same bit for bit whatever could get in between.
 #include "catch.hpp"
 #include "random_scene.hpp"
+#include "shuffled.hpp"
 
 #include <algorithm>
 #include <cstdint>
@@ -23,7 +24,7 @@ using scene::Scene;
 using Blend = dfb::BasicAlphaBlend<16>;
 using Single = dfb::BasicImageParallel<16>;
 template <class TileOp, class PixelOp = dfb::NoPixelOp>
-using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, dfb::InprocTransport>;
+using FrameBuffer = dfb::DistributedFrameBuffer<TileOp, PixelOp, ShuffledTransport>;
 
 struct Options {
     int ranks = 3;
@@ -70,20 +71,17 @@ Picture picture(const Scene& s, const Options& o)
     Picture result;
     int imagesElsewhere = 0;
     std::mutex mutex;
-    dfb::runRanks(
-        o.ranks,
-        [&](dfb::InprocCommunicator communicator) {
-            FrameBuffer<TileOp> fb(communicator, configOf(s, o));
-            dfb::FrameReport report;
-            for (int frame = 0; frame < o.frames; ++frame)
-                report = scene::renderLoop(fb, s, o.loop, o.deal);
-            const std::lock_guard<std::mutex> lock(mutex);
-            if (fb.isDisplayRank())
-                result = Picture(fb.image(), report);
-            else
-                imagesElsewhere += !fb.image().empty();
-        },
-        o.shuffleSeed);
+    dfb::runRanks(o.ranks, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<TileOp> fb({communicator, o.shuffleSeed}, configOf(s, o));
+        dfb::FrameReport report;
+        for (int frame = 0; frame < o.frames; ++frame)
+            report = scene::renderLoop(fb, s, o.loop, o.deal);
+        const std::lock_guard<std::mutex> lock(mutex);
+        if (fb.isDisplayRank())
+            result = Picture(fb.image(), report);
+        else
+            imagesElsewhere += !fb.image().empty();
+    });
     if (imagesElsewhere > 0)
         throw std::logic_error("a rank that does not display has an image");
     return result;
