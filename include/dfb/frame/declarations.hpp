@@ -14,7 +14,7 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <limits>
+#include <iterator>
 #include <mutex>
 #include <tuple>
 #include <utility>
@@ -105,48 +105,37 @@ public:
         toTell_.clear();
         for (const TileInput& input : inputs)
             toTell_.push_back({ownerOf(input.tile), input});
-        std::sort(toTell_.begin(), toTell_.end(), [](const Addressed& a, const Addressed& b) {
-            return std::tie(a.owner, a.input.tile, a.input.source, a.input.part)
-                   < std::tie(b.owner, b.input.tile, b.input.source, b.input.part);
-        });
+        std::sort(toTell_.begin(), toTell_.end());
         news_.clear();
-        for (std::size_t before = 0, now = 0; before < told_.size() || now < toTell_.size();) {
-            const int owner = std::min(ownerAt(told_, before), ownerAt(toTell_, now));
-            const Part was = partOf(told_, before, owner), is = partOf(toTell_, now, owner);
-            if (!std::equal(told_.begin() + was.begin, told_.begin() + was.end, toTell_.begin() + is.begin,
-                            toTell_.begin() + is.end,
-                            [](const Addressed& a, const Addressed& b) { return a.input == b.input; }))
-                news_.push_back(is);
-            before = static_cast<std::size_t>(was.end);
-            now = static_cast<std::size_t>(is.end);
-        }
+        std::set_symmetric_difference(told_.begin(), told_.end(), toTell_.begin(), toTell_.end(),
+                                      std::back_inserter(news_));
+        const auto haveOneOwner = [](const Addressed& a, const Addressed& b) { return a.owner == b.owner; };
+        news_.erase(std::unique(news_.begin(), news_.end(), haveOneOwner), news_.end());
         bool isWaiting = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             declared_ = true;
-            for (const Part& part : news_) // all of them, before the first can answer
-                if (part.owner == rank) {
+            for (const Addressed& its : news_) // all of them, before the first can answer
+                if (its.owner == rank) {
                     changedRanks_.push_back(rank);
-                    for (std::ptrdiff_t i = part.begin; i < part.end; ++i) {
-                        const TileInput& input = toTell_[static_cast<std::size_t>(i)].input;
+                    forEachOf(its.owner, [&](const TileInput& input) {
                         changedInputs_.push_back({input.tile, input.source, input.part, rank});
-                    }
+                    });
                 } else {
-                    acksMissing_.push_back(part.owner);
+                    acksMissing_.push_back(its.owner);
                     isWaiting = true;
                 }
         }
-        for (const Part& part : news_) {
-            if (part.owner == rank)
+        for (const Addressed& its : news_) {
+            if (its.owner == rank)
                 continue;
             manifest_.clear();
-            for (std::ptrdiff_t i = part.begin; i < part.end; ++i) {
-                const TileInput& input = toTell_[static_cast<std::size_t>(i)].input;
+            forEachOf(its.owner, [&](const TileInput& input) {
                 manifest_.put(static_cast<std::int32_t>(input.tile));
                 manifest_.put(input.source);
                 manifest_.put(input.part);
-            }
-            send(part.owner, manifest_.bytes());
+            });
+            send(its.owner, manifest_.bytes());
         }
         told_.swap(toTell_);
         return isWaiting;
@@ -209,25 +198,21 @@ private:
     struct Addressed {
         int owner = 0;
         TileInput input;
-    };
-    // Of a list that is ordered by owner: those of one owner.
-    struct Part {
-        int owner = 0;
-        std::ptrdiff_t begin = 0, end = 0;
+        bool operator<(const Addressed& o) const
+        {
+            return std::tie(owner, input.tile, input.source, input.part)
+                   < std::tie(o.owner, o.input.tile, o.input.source, o.input.part);
+        }
     };
 
-    // Comes after all owners where the list ends.
-    static int ownerAt(const std::vector<Addressed>& list, std::size_t i)
+    // Calls take(input) for each input in toTell_ of that owner.
+    template <class Take>
+    void forEachOf(int owner, const Take& take) const
     {
-        return i < list.size() ? list[i].owner : std::numeric_limits<int>::max();
-    }
-    // Empty, from `begin` on, if that owner has none.
-    static Part partOf(const std::vector<Addressed>& list, std::size_t begin, int owner)
-    {
-        std::size_t end = begin;
-        while (ownerAt(list, end) == owner)
-            ++end;
-        return {owner, static_cast<std::ptrdiff_t>(begin), static_cast<std::ptrdiff_t>(end)};
+        auto its = std::partition_point(toTell_.begin(), toTell_.end(),
+                                        [owner](const Addressed& other) { return other.owner < owner; });
+        for (; its != toTell_.end() && its->owner == owner; ++its)
+            take(its->input);
     }
 
     mutable std::mutex mutex_;
@@ -241,7 +226,7 @@ private:
     std::vector<TileInput> mine_;          // as it was declared last
     bool haveMoved_ = false;               // tiles, since then
     std::vector<Addressed> told_, toTell_; // by owner: told in the last frame; its successor
-    std::vector<Part> news_;               // the parts of toTell_ that are not as in told_
+    std::vector<Addressed> news_;          // in one of them alone, then one for each owner
     ByteWriter manifest_;                  // for one owner
 };
 
