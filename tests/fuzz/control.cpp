@@ -273,9 +273,9 @@ void jobs(fuzz::Input in)
                               "what is handed out is there");
             });
         } else if (what % 3 == 1) {
-            if (const auto range = worker.take(count, 1, 3))
+            bool asks = false;
+            if (const auto range = worker.take(count, 1, 3, asks))
                 note(*range);
-            worker.shouldAsk();
         } else {
             const dfb::JobRange range{in.take<std::int64_t>(), in.take<std::int64_t>()};
             refused([&] { worker.receive(range); });

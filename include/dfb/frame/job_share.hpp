@@ -33,9 +33,9 @@ public:
     void newFrame()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        next_ = -1;
+        next_ = count_ = -1;
         mine_.clear();
-        asked_ = began_ = exhausted_ = false;
+        asked_ = exhausted_ = false;
     }
 
     // On the rank that hands out. Throws Error (MalformedMessage).
@@ -67,31 +67,25 @@ public:
             exhausted_ = true;
     }
 
-    // The next range to do: nullopt if it has been asked for and has not come yet; empty if there are no more.
-    std::optional<JobRange> take(std::int64_t count, int rank, int rankCount)
+    // The next range to do: nullopt if it has been asked for and has not come yet; empty if there are no more. `asks`:
+    // whether it is time to ask for more, true once for each request: at most one is out.
+    std::optional<JobRange> take(std::int64_t count, int rank, int rankCount, bool& asks)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        count_ = count;
-        if (!began_) {
-            began_ = true;
+        if (std::exchange(count_, count) < 0) {
             const std::int64_t fixed = fixedPart(count);
             const JobRange share{fixed * rank / rankCount, fixed * (rank + 1) / rankCount};
             if (share.begin < share.end)
                 mine_.push(share);
         }
+        std::optional<JobRange> range;
         if (!mine_.empty())
-            return mine_.pop();
-        return exhausted_ ? std::optional<JobRange>(JobRange{}) : std::nullopt;
-    }
-
-    // Whether it is time to ask for more: at most one request is out. True once for each.
-    bool shouldAsk()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        if (asked_ || exhausted_ || !mine_.empty())
-            return false;
-        asked_ = true;
-        return true;
+            range = mine_.pop();
+        else if (exhausted_)
+            range.emplace();
+        asks = !asked_ && !exhausted_ && mine_.empty();
+        asked_ = asked_ || asks;
+        return range;
     }
 
     // take() would return something.
@@ -106,9 +100,10 @@ private:
 
     mutable std::mutex mutex_;
     std::int64_t next_ = -1; // to hand out; -1: nobody has asked yet
-    std::int64_t handedOutOf_ = 0, count_ = 0;
+    std::int64_t handedOutOf_ = 0;
+    std::int64_t count_ = -1; // of all jobs; -1: nothing was taken yet
     Fifo<JobRange> mine_;
-    bool began_ = false, asked_ = false, exhausted_ = false;
+    bool asked_ = false, exhausted_ = false;
 };
 
 // One per rank. Rank `server` hands out.
@@ -165,8 +160,9 @@ private:
     // Asks for more at once, so that it comes while this is worked on.
     std::optional<JobRange> take(std::int64_t count)
     {
-        const auto range = share_.take(count, mailbox_.rank(), mailbox_.size());
-        if (share_.shouldAsk()) {
+        bool asks = false;
+        const auto range = share_.take(count, mailbox_.rank(), mailbox_.size(), asks);
+        if (asks) {
             const JobRequest request{count, mailbox_.executor().concurrency(), 0};
             if (mailbox_.rank() == server_)
                 outcome_.guarded([&] { share_.receive(share_.give(request, mailbox_.size())); });
