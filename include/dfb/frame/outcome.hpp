@@ -41,7 +41,8 @@ public:
         terms_ = terms;
         verdict_.reset();
         decidedAt_.reset();
-        isEnding_ = false;
+        endedAt_.reset();
+        givesUpAt_.reset();
         quiescence_.newFrame(quiet);
     }
 
@@ -147,26 +148,33 @@ public:
     // next two.
     void beginEnd()
     {
-        if (isEnding_)
+        if (endedAt_)
             return;
-        isEnding_ = true;
         frame_.finish();
         endedAt_ = Clock::now();
-        nextLook_ = endedAt_ + quiescence_.interval();
+        nextLook_ = *endedAt_ + quiescence_.interval();
+        if (hasTimeout())
+            givesUpAt_ = *endedAt_ + 2 * terms_.timeout();
         tryVote();
     }
 
-    // Whether conclude() need not wait for the verdict. Does the work of a rank that waits for it.
+    // Whether conclude() need not wait for the verdict any more: it is here, or will not come. Does the work of a rank
+    // that waits for it: looks now and then whether anything is under way, and makes the frame fail when its time is
+    // up.
     bool isConcluded()
     {
+        if (isDecided() || mailbox_.failed())
+            return true;
         const auto now = Clock::now();
-        const bool isDecided = frame_.state() == FrameState::Decided || mailbox_.failed();
-        if (!isDecided)
-            lookInTime(now);
-        const bool isLate = terms_.timeoutMs > 0 && now >= endedAt_ + terms_.timeout();
-        if (!isDecided && isLate && !failed())
+        if (now >= nextLook_) {
+            nextLook_ = now + quiescence_.interval();
+            look();
+        }
+        if (hasTimeout() && now >= *endedAt_ + terms_.timeout() && !failed())
             fail(missing(ErrorKind::TimedOut));
-        return isDecided || (isLate && now >= endedAt_ + 2 * terms_.timeout());
+        if (isVerdictInDoubt())
+            givesUpAt_ = now + mailbox_.connection().config().peerTimeout;
+        return givesUpAt_ && now >= *givesUpAt_;
     }
 
     // Waits for the verdict of all ranks and closes the frame, also when it throws TransportError.
@@ -176,7 +184,12 @@ public:
         Verdict verdict;
         try {
             beginEnd();
-            verdict = terms_.timeoutMs > 0 ? waitInTime() : waitWithoutLimit();
+            do { // at least once: with Progress::Caller wait() sends on what other ranks need
+                mailbox_.wait([this] { return isDecided() || isVerdictInDoubt(); }, nextEvent());
+            } while (!isConcluded());
+            if (!isDecided())
+                giveUpVerdict();
+            verdict = *verdict_;
             if (!verdict.error)
                 verdict.error = verdict.strayInputs();
             if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
@@ -211,9 +224,6 @@ public:
     }
 
 private:
-    // How long end() waits between two looks at things that no message tells.
-    static constexpr std::chrono::milliseconds untilAsked{2000};
-
     ReductionKey verdictKey() const { return {FrameVerdict, frame_.number()}; }
 
     ErrorInfo placed(ErrorInfo info) const
@@ -301,72 +311,32 @@ private:
 
     // ---- waiting
 
-    // Null if the verdict has not come before `deadline`. Throws TransportError.
-    const Verdict* wait(Clock::time_point deadline)
+    bool isDecided() const noexcept { return frame_.state() == FrameState::Decided; }
+    bool hasTimeout() const noexcept { return terms_.timeoutMs > 0; }
+
+    // A damaged message was noticed, which may have been part of the verdict, and there is no time-out: from now on the
+    // verdict is waited for no longer than for a rank of which nothing is heard.
+    bool isVerdictInDoubt() const
     {
-        const auto isDecided = [this] { return frame_.state() == FrameState::Decided; };
-        return mailbox_.wait(isDecided, deadline) ? &*verdict_ : nullptr;
+        return !givesUpAt_ && frame_.isDamaged() && mailbox_.connection().config().peerTimeout.count() > 0;
     }
 
-    // Returns the verdict. Makes the frame fail for missing inputs. Throws TransportError if the ranks cannot even
-    // agree on that.
-    Verdict waitInTime()
+    // When isConcluded() has something to do.
+    Clock::time_point nextEvent() const
     {
-        if (const Verdict* verdict = waitAndLook(endedAt_ + terms_.timeout()))
-            return *verdict;
-        if (!failed())
-            fail(missing(ErrorKind::TimedOut));
-        if (const Verdict* verdict = wait(endedAt_ + 2 * terms_.timeout()))
-            return *verdict;
-        giveUpVerdict(2 * terms_.timeout());
-    }
-
-    // The verdict, however long others render. Only where a damaged message was noticed, which may have been part of
-    // the verdict, is it waited for no longer than for a rank of which nothing is heard.
-    Verdict waitWithoutLimit()
-    {
-        const auto limit = mailbox_.connection().config().peerTimeout;
-        const auto step = limit.count() > 0 ? std::min(limit, untilAsked) : untilAsked;
-        std::optional<Clock::time_point> deadline;
-        for (;;) {
-            if (const Verdict* verdict = waitAndLook(Clock::now() + step))
-                return *verdict;
-            if (!deadline && limit.count() > 0 && frame_.isDamaged())
-                deadline = Clock::now() + limit;
-            if (deadline && Clock::now() >= *deadline)
-                giveUpVerdict(limit);
-        }
-    }
-
-    // The verdict; null if it has not come by then. Meanwhile this rank looks, now and then, whether anything is under
-    // way.
-    const Verdict* waitAndLook(Clock::time_point deadline)
-    {
-        for (;;) {
-            if (const Verdict* verdict = wait(std::min(deadline, nextLook_)))
-                return verdict;
-            const auto now = Clock::now();
-            lookInTime(now);
-            if (now >= deadline)
-                return nullptr;
-        }
-    }
-    void lookInTime(Clock::time_point now)
-    {
-        if (now < nextLook_)
-            return;
-        nextLook_ = now + quiescence_.interval();
-        look();
+        auto next = nextLook_;
+        if (hasTimeout() && !failed())
+            next = std::min(next, *endedAt_ + terms_.timeout());
+        return givesUpAt_ ? std::min(next, *givesUpAt_) : next;
     }
 
     // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
     void waitForFinishedTiles()
     {
         const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
-        const bool hasLimit = terms_.timeoutMs > 0;
-        if (!hasLimit) // a message that could not be read does not come again
+        if (!hasTimeout()) // a message that could not be read does not come again
             mailbox_.wait([&] { return areThere() || frame_.isDamaged(); });
-        mailbox_.wait(areThere, Clock::now() + (hasLimit ? terms_.timeout() : untilAsked));
+        mailbox_.wait(areThere, Clock::now() + (hasTimeout() ? terms_.timeout() : std::chrono::seconds(2)));
     }
 
     // The message of one round of quiescence_. Ranks that were given different parameters could wait for each other for
@@ -462,8 +432,10 @@ private:
             info.message += (info.message.empty() ? "" : ", ") + text;
     }
 
-    [[noreturn]] void giveUpVerdict(std::chrono::milliseconds after)
+    [[noreturn]] void giveUpVerdict()
     {
+        mailbox_.connection().throwIfFailed();
+        const auto after = hasTimeout() ? 2 * terms_.timeout() : mailbox_.connection().config().peerTimeout;
         ErrorInfo info =
             placed(errorInfo(ErrorKind::Transport, printed("not all ranks have ended this frame after %lld ms",
                                                            static_cast<long long>(after.count()))));
@@ -483,9 +455,10 @@ private:
     std::optional<Verdict> verdict_; // set once, before the frame is Decided
     std::optional<Clock::time_point> decidedAt_;
     Quiescence quiescence_;
-    bool isEnding_ = false;      // beginEnd() was called
-    Clock::time_point endedAt_;  // then
-    Clock::time_point nextLook_; // at it; of the thread that is in end()
+    // Of the thread that is in end():
+    std::optional<Clock::time_point> endedAt_;   // beginEnd() was called
+    Clock::time_point nextLook_;                 // whether anything is under way; from then on
+    std::optional<Clock::time_point> givesUpAt_; // waiting for the verdict
 };
 
 } // namespace detail

@@ -530,6 +530,46 @@ TEST_CASE("A damaged vote or verdict does not hang a frame that has no time-out"
         });
 }
 
+TEST_CASE("A damaged vote does not keep a frame open that is ended by tryEnd()", "[messaging]")
+{
+    enum : std::uint32_t { FrameVerdict = 2 };
+    const auto board = std::make_shared<Board>();
+    std::atomic<bool> done{false};
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (header.kind == MessageKind::ReduceUp
+            && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) == FrameVerdict
+            && !done.exchange(true))
+            message.data()[message.size() - 1] ^= std::byte{0x24};
+        return Board::What::Pass;
+    };
+    std::vector<std::string> texts(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        dfb::NetworkConfig options;
+        options.checksums = true;
+        options.peerTimeout = std::chrono::milliseconds(300);
+        FrameBuffer<Blend> fb(communicator, configOf(sceneFor(Loop::Declared)), options);
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            dfb::FrameConfig params;
+            params.declared = true;
+            auto frame = fb.begin(params);
+            frame.declare({});
+            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+            while (!frame.tryEnd()) {
+                if (std::chrono::steady_clock::now() > limit)
+                    throw std::runtime_error("the frame is still open");
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+            }
+        });
+    });
+    INFO(joined(texts));
+    CHECK(done);
+    CHECK(std::any_of(texts.begin(), texts.end(), [](const std::string& text) {
+        return has(text, "not all ranks have ended this frame after 300 ms");
+    }));
+    for (const std::string& text : texts)
+        CHECK(has(text, "TransportError"));
+}
+
 TEST_CASE("With frames in flight a damaged message costs frames, not the framebuffer", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared);
