@@ -15,7 +15,7 @@ struct TraceEvent {
     using Clock = std::chrono::steady_clock;
 
     enum class Kind : std::uint8_t {
-        // Of a frame, told when it has ended, also if it failed:
+        // Of a frame, told at its end, also if it failed:
         Frame,   // begin() to the return of end(): FrameReport::totalMs
         Render,  // begin() to the call of end(): renderMs
         End,     // the call of end() to its return: compositingOverheadMs

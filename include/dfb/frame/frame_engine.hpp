@@ -167,7 +167,6 @@ public:
         bytesBefore_ = mailbox_->bytesSent();
         messagesBefore_ = mailbox_->messagesSent();
         renderNs_ = 0;
-        votedAt_.reset();
         isEnding_ = false;
         figures_.newFrame();
         std::int64_t rendered = 0;
@@ -454,10 +453,6 @@ private:
         add(TraceEvent::Kind::Frame, beginTime_, end);
         add(TraceEvent::Kind::Render, beginTime_, rendered);
         add(TraceEvent::Kind::End, rendered, end);
-        if (!votedAt_)
-            return;
-        event.byteCount = votedBytes_;
-        add(TraceEvent::Kind::Verdict, *votedAt_, outcome_->decidedAt().value_or(end));
     }
 
     // Lets messages of the frame in. `tiles`: how many this rank expects to finish. `withoutSamples`: tiles without
@@ -789,9 +784,7 @@ private:
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
         v.maxima[Verdict::RenderNs] = renderNs_;
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
-        votedAt_ = Clock::now();
-        votedBytes_ = v.sums[Verdict::BytesSent];
-        v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(*votedAt_ - beginTime_).count();
+        v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
         v.wireErrorBound = reports.wireErrorBound;
         v.tileErrors = FrameFigures::of(reports.errors);
         figures_.addTo(v);
@@ -839,8 +832,6 @@ private:
     bool isEnding_ = false; // beginEnd() was called
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
-    std::optional<Clock::time_point> votedAt_;  // the verdict was entered
-    std::int64_t votedBytes_ = 0;               // sent until then
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 
     std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others

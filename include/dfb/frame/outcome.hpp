@@ -40,7 +40,6 @@ public:
     {
         terms_ = terms;
         verdict_.reset();
-        decidedAt_.reset();
         endedAt_.reset();
         givesUpAt_.reset();
         quiescence_.newFrame(quiet);
@@ -133,12 +132,14 @@ public:
         mine.terms = terms_;
         mine.error = frame_.reason();
         addFigures_(mine);
+        verdictSpan_.emplace(mailbox_.trace(), TraceEvent::Kind::Verdict, frame_.number());
+        if (TraceEvent* event = verdictSpan_->event())
+            event->byteCount = mine.sums[Verdict::BytesSent];
         if (terms_.allowPartial)
             mine.incomplete = tiles_.table().unfinished(terms_.declared);
         mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {
             verdict_ = Verdict::from(result);
-            if (mailbox_.trace())
-                decidedAt_ = Clock::now();
+            verdictSpan_.reset();
             frame_.decide();
             mailbox_.notify();
         });
@@ -200,6 +201,7 @@ public:
             transportError = std::current_exception();
         }
         frame_.close([this] { return mailbox_.executor().help(); });
+        verdictSpan_.reset(); // if there is no verdict
         mailbox_.reductions().forget(AllDeclared, frame_.number());
         mailbox_.reductions().forget(Quiet, frame_.number());
         mailbox_.connection().expectMessages(false);
@@ -213,9 +215,6 @@ public:
             std::rethrow_exception(transportError);
         return verdict;
     }
-
-    // When the verdict came, for the trace. Nothing: it did not. After conclude().
-    std::optional<Clock::time_point> decidedAt() const noexcept { return decidedAt_; }
 
     // The frame has an image although something is missing.
     bool isPartial(const Verdict& verdict) const
@@ -452,8 +451,8 @@ private:
     std::function<void(Verdict&)> addFigures_;
     FrameTerms terms_;
     bool lastFailed_ = false;
-    std::optional<Verdict> verdict_; // set once, before the frame is Decided
-    std::optional<Clock::time_point> decidedAt_;
+    std::optional<Verdict> verdict_;       // set once, before the frame is Decided
+    std::optional<TraceSpan> verdictSpan_; // from this rank's vote on
     Quiescence quiescence_;
     // Of the thread that is in end():
     std::optional<Clock::time_point> endedAt_;   // beginEnd() was called
