@@ -124,7 +124,7 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     gatherConfig.format = format;
     gatherConfig.channels = channels;
     gatherConfig.codec = flags & HasCodec ? codec() : nullptr;
-    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, 2, ownerOf, [](dfb::Buffer&&) {});
+    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, 2, ownerOf, [](dfb::Buffer&&, std::size_t) {});
     if (flags & Shared) // other ranks put tiles into it
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});
@@ -144,9 +144,10 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
         }
         body = fuzz::Output().put(h).text(body).bytes();
     }
-    const auto give = [&](const auto& call) {
+    const auto give = [&](d::MessageKind kind, const std::string& bytes) {
+        const auto header = d::MessageHeader::of(kind, 0, 1);
         try {
-            call();
+            display.receive(1, header, fuzz::ExactBlocks::copyOf(fuzz::Output().put(header).text(bytes).bytes()));
             return true;
         } catch (const dfb::Error& e) {
             fuzz::require(e.info().kind == dfb::ErrorKind::MalformedMessage
@@ -155,15 +156,12 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
             return false;
         }
     };
-    const auto messageOf = [](const std::string& bytes) {
-        return fuzz::ExactBlocks::copyOf(fuzz::Output().put(d::MessageHeader()).text(bytes).bytes());
-    };
-    give([&] { display.receiveTiles(1, messageOf(body)); });
-    const bool counted = give([&] { display.receiveDone(1, messageOf(done)); });
+    give(d::MessageKind::FinishedTiles, body);
+    const bool counted = give(d::MessageKind::TilesDone, done);
     const bool isComplete = display.complete();
     fuzz::require(!isComplete || counted, "nothing is complete before the count has come");
-    fuzz::require(!give([&] { display.receiveDone(1, messageOf(done)); }), "a second count is refused");
-    give([&] { display.receiveTiles(1, messageOf(body)); });
+    fuzz::require(!give(d::MessageKind::TilesDone, done), "a second count is refused");
+    give(d::MessageKind::FinishedTiles, body);
     for (int tile = 0; tile < layout().tileCount(); tile += 2) { // those of rank 0
         const dfb::Region r = layout().region(tile);
         for (int y = r.y0; y < r.y1; ++y) {

@@ -519,7 +519,7 @@ std::pair<std::string, std::string> finished(Way way)
     gatherConfig.channels = config.image.depth ? dfb::depthChannel : 0;
     gatherConfig.codec = config.messages.codec;
     const dfb::TileLayout layout(width, height, side);
-    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message) {
+    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message, std::size_t) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });

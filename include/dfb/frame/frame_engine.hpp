@@ -68,9 +68,9 @@ public:
             bool hasFarRanks = false;
             for (int other = 0; other < size(); ++other)
                 hasFarRanks = hasFarRanks || isFar(other);
-            pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
-                                                       mailbox_->address(),
-                                                       [this](Buffer&& message) { sendToDisplay(std::move(message)); });
+            pipeline_ = std::make_unique<TilePipeline>(
+                pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(),
+                [this](Buffer&& message, std::size_t raw) { sendToDisplay(std::move(message), raw); });
             outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                       [this](Verdict& verdict) { addFigures(verdict); });
             // The rank after the display rank hands out jobs, as that one has enough to do.
@@ -506,9 +506,9 @@ private:
         outcome_->guarded([&] { handle(source, header, std::move(message)); }, {}, source);
     }
 
-    void sendToDisplay(Buffer&& message)
+    void sendToDisplay(Buffer&& message, std::size_t raw)
     {
-        if (const std::size_t raw = FinalGather::rawBytesOf(message); raw > 0)
+        if (raw > 0)
             compression_->sent(config_.image.displayRank, raw, message.size());
         mailbox_->send(config_.image.displayRank, std::move(message));
     }

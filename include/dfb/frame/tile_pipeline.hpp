@@ -297,8 +297,9 @@ public:
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
         for (int tile = 0; tile < table_.layout().tileCount(); ++tile)
-            if (gather_.isOnItsWay(tile, table_.owner(tile))
-                || (!backgroundIsFine_ && gather_.hasNothing(tile) && table_.samples(tile).count > 0))
+            if (gather_.hasNothing(tile)
+                && (gather_.isMissingFrom(table_.owner(tile))
+                    || (!backgroundIsFine_ && table_.samples(tile).count > 0)))
                 tiles.push_back(tile);
         std::sort(tiles.begin(), tiles.end()); // an owner may have said so already
         tiles.erase(std::unique(tiles.begin(), tiles.end()), tiles.end());

@@ -41,7 +41,8 @@ struct GatherConfig {
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
 class FinalGather {
 public:
-    using Send = std::function<void(Buffer&&)>; // to the display rank
+    // To the display rank. `raw`: the bytes that it had before a codec was to make it smaller; else 0.
+    using Send = std::function<void(Buffer&&, std::size_t raw)>;
     using OwnerOf = std::function<int(int tile)>;
 
     // Where a finished tile goes.
@@ -141,15 +142,6 @@ public:
         return places;
     }
 
-    // The bytes that a message with finished tiles had before a codec was to make it smaller; else 0.
-    static std::size_t rawBytesOf(const Buffer& message)
-    {
-        if (loadAs<MessageHeader>(message.data()).kind != MessageKind::FinishedTiles)
-            return 0;
-        const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
-        return h.isTried ? prefix + h.rawBytes : 0;
-    }
-
     // On another rank, with the places that shareImage() has told rank `source`. `blockAt(place, byteCount)`: what lies
     // there, or null. Throws Error (MalformedMessage).
     template <class BlockAt>
@@ -222,17 +214,10 @@ public:
                 place.writer = std::move(writer);
                 return place;
             }
-        std::size_t bytes = 0;
-        for (std::size_t c = 0; c < channelCount; ++c)
-            bytes += alignedTo16(record_.pixelBytes(c) * pixelsIn(region));
-        place.own = pool_->acquire(bytes);
-        std::byte* plane = place.own.data();
-        for (std::size_t c = 0; c < channelCount; ++c)
-            if (travels(c)) {
-                place.planes.at[c] = plane;
-                plane += alignedTo16(record_.pixelBytes(c) * pixelsIn(region));
-            }
         place.stride = static_cast<std::size_t>(region.width());
+        const std::size_t pixels = place.stride * static_cast<std::size_t>(region.height());
+        place.own = pool_->acquire(pixels * record_.pixelBytes());
+        place.planes = record_.planesAt(place.own.data(), pixels);
         return place;
     }
 
@@ -322,7 +307,7 @@ public:
         }
         if (last)
             sendBatch(std::move(last));
-        send_(std::move(done));
+        send_(std::move(done), 0);
     }
 
     static bool isFinishedTile(MessageKind kind)
@@ -333,76 +318,12 @@ public:
     // The display rank's side of one of these. Throws Error (MalformedMessage).
     void receive(int source, const MessageHeader& header, Buffer&& message)
     {
+        if (!displays())
+            failMalformed("a finished tile was sent to a rank that displays nothing");
         if (header.kind == MessageKind::FinishedTiles)
             receiveTiles(source, std::move(message));
         else
             receiveDone(source, message);
-    }
-    void receiveTiles(int source, Buffer&& message)
-    {
-        requireDisplay();
-        if (message.size() < prefix)
-            failMalformed("a batch of tiles is too short");
-        const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
-        const std::byte* in = message.data() + prefix;
-        std::size_t left = message.size() - prefix;
-        if (h.codec == 0 && h.rawBytes != left)
-            failMalformed("a batch of tiles has the wrong size", static_cast<std::int64_t>(h.rawBytes),
-                          static_cast<std::int64_t>(left));
-        Buffer raw;
-        if (h.codec != 0) {
-            if (!config_.codec || config_.codec->id() != h.codec)
-                failMalformed("compressed by a codec that this rank does not have");
-            if (h.rawBytes > maxBatchBytes())
-                failMalformed("a batch of tiles is too large");
-            raw = pool_->acquire(h.rawBytes);
-            if (!config_.codec->decompress(in, left, raw.data(), h.rawBytes))
-                failMalformed("a batch of tiles does not decompress to its size");
-            in = raw.data();
-            left = h.rawBytes;
-        }
-        SentCount here{0, 1};
-        while (left > 0) {
-            int tile = -1;
-            const std::size_t bytes = record_.read(in, left, layout_, [&](int its, const Region& region) {
-                tile = its;
-                checkOwner(tile, source);
-                receiveOnce(tile);
-                return inImage(image_.planesAt(0), region);
-            });
-            tellTile(tile);
-            in += bytes;
-            left -= bytes;
-            ++here.tiles;
-        }
-        const std::lock_guard<std::mutex> lock(mutex_);
-        addReceived(tilesOf_[static_cast<std::size_t>(source)], here);
-    }
-
-    void receiveDone(int source, const Buffer& message)
-    {
-        requireDisplay();
-        const std::byte* in = message.data() + sizeof(MessageHeader);
-        const std::size_t bytes = message.size() - std::min(message.size(), sizeof(MessageHeader));
-        if (bytes < sizeof(SentCount) || (bytes - sizeof(SentCount)) % sizeof(std::int32_t) != 0)
-            failMalformed("a count of tiles has the wrong size");
-        const auto count = loadAs<SentCount>(in);
-        SentCount placed;
-        for (std::size_t at = sizeof count; at < bytes; at += sizeof(std::int32_t), ++placed.tiles) {
-            const auto tile = loadAs<std::int32_t>(in + at);
-            if (tile < 0 || tile >= layout_.tileCount() || !imageGate_)
-                failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
-            checkOwner(tile, source);
-            receiveOnce(tile);
-            tellTile(tile);
-        }
-        const std::lock_guard<std::mutex> lock(mutex_);
-        TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
-        if (its.announced || count.tiles < 0 || count.tiles > its.owned || count.batches < 0
-            || count.batches > count.tiles)
-            failMalformed("a count of tiles that cannot be", its.owned, count.tiles);
-        its.announced = count;
-        addReceived(its, placed);
     }
 
     // All tiles of the other ranks are in the image.
@@ -460,14 +381,11 @@ public:
         imageFrame_ = frame_;
     }
 
-    // On the display rank: whether tiles of that rank have not come, and whether this may be one of them.
-    bool isOnItsWay(int tile, int owner) const
+    // On the display rank: whether some tiles of that rank have not come.
+    bool isMissingFrom(int owner) const
     {
-        if (!displays() || owner == rank_)
-            return false;
         const std::lock_guard<std::mutex> lock(mutex_);
-        return isMissing(static_cast<std::size_t>(owner))
-               && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+        return isMissing(static_cast<std::size_t>(owner));
     }
     // On the display rank: hides a tile of a frame that is over. Called in the order of tiles.
     void setIncomplete(int tile)
@@ -480,7 +398,7 @@ public:
     // On the display rank: whether nothing has come for the tile in this frame.
     bool hasNothing(int tile) const
     {
-        return isDisplay() && !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+        return !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
     }
     bool isComplete(int tile) const
     {
@@ -550,15 +468,6 @@ private:
 
     bool isDisplay() const noexcept { return rank_ == displayRank_; }
     bool travels(std::size_t channel) const { return hasChannel(config_.channels | colorChannel, channel); }
-    static std::size_t pixelsIn(const Region& region)
-    {
-        return static_cast<std::size_t>(region.width()) * static_cast<std::size_t>(region.height());
-    }
-    std::size_t maxBatchBytes() const
-    {
-        return std::max(batchBytes, record_.mostBytes(pixelsIn({0, 0, layout_.tileWidth(), layout_.tileHeight()})));
-    }
-
     // `planes`: of the whole image.
     Place inImage(const Planes& planes, const Region& region) const
     {
@@ -579,14 +488,76 @@ private:
         return remote_;
     }
 
-    void checkOwner(int tile, int source) const
+    void receiveTiles(int source, Buffer&& message)
+    {
+        if (message.size() < prefix)
+            failMalformed("a batch of tiles is too short");
+        const auto h = loadAs<BatchHeader>(message.data() + sizeof(MessageHeader));
+        const std::byte* in = message.data() + prefix;
+        std::size_t left = message.size() - prefix;
+        if (h.codec == 0 && h.rawBytes != left)
+            failMalformed("a batch of tiles has the wrong size", static_cast<std::int64_t>(h.rawBytes),
+                          static_cast<std::int64_t>(left));
+        Buffer raw;
+        if (h.codec != 0) {
+            if (!config_.codec || config_.codec->id() != h.codec)
+                failMalformed("compressed by a codec that this rank does not have");
+            const std::size_t pixels =
+                static_cast<std::size_t>(layout_.tileWidth()) * static_cast<std::size_t>(layout_.tileHeight());
+            if (h.rawBytes > largestMessage(pixels, config_.format, config_.channels))
+                failMalformed("a batch of tiles is too large");
+            raw = pool_->acquire(h.rawBytes);
+            if (!config_.codec->decompress(in, left, raw.data(), h.rawBytes))
+                failMalformed("a batch of tiles does not decompress to its size");
+            in = raw.data();
+            left = h.rawBytes;
+        }
+        SentCount here{0, 1};
+        while (left > 0) {
+            int tile = -1;
+            const std::size_t bytes = record_.read(in, left, layout_, [&](int its, const Region& region) {
+                tile = its;
+                take(tile, source);
+                return inImage(image_.planesAt(0), region);
+            });
+            tellTile(tile);
+            in += bytes;
+            left -= bytes;
+            ++here.tiles;
+        }
+        const std::lock_guard<std::mutex> lock(mutex_);
+        addReceived(tilesOf_[static_cast<std::size_t>(source)], here);
+    }
+
+    void receiveDone(int source, const Buffer& message)
+    {
+        const std::byte* in = message.data() + sizeof(MessageHeader);
+        const std::size_t bytes = message.size() - std::min(message.size(), sizeof(MessageHeader));
+        if (bytes < sizeof(SentCount) || (bytes - sizeof(SentCount)) % sizeof(std::int32_t) != 0)
+            failMalformed("a count of tiles has the wrong size");
+        const auto count = loadAs<SentCount>(in);
+        SentCount placed;
+        for (std::size_t at = sizeof count; at < bytes; at += sizeof(std::int32_t), ++placed.tiles) {
+            const auto tile = loadAs<std::int32_t>(in + at);
+            if (tile < 0 || tile >= layout_.tileCount() || !imageGate_)
+                failMalformed("a finished tile outside the image", layout_.tileCount() - 1, tile);
+            take(tile, source);
+            tellTile(tile);
+        }
+        const std::lock_guard<std::mutex> lock(mutex_);
+        TilesOf& its = tilesOf_[static_cast<std::size_t>(source)];
+        if (its.announced || count.tiles < 0 || count.tiles > its.owned || count.batches < 0
+            || count.batches > count.tiles)
+            failMalformed("a count of tiles that cannot be", its.owned, count.tiles);
+        its.announced = count;
+        addReceived(its, placed);
+    }
+
+    // Takes note that a tile has come.
+    void take(int tile, int source)
     {
         if (const int owner = ownerOf_(tile); owner != source)
             failMalformed("a finished tile of another owner", owner, source);
-    }
-
-    void receiveOnce(int tile)
-    {
         if (state_[static_cast<std::size_t>(tile)].exchange(TileState::Received) == TileState::Received) {
             ErrorInfo info = errorInfo(ErrorKind::DuplicateInput, "a finished tile came twice");
             info.tile = tile;
@@ -636,13 +607,7 @@ private:
         const auto m = MessageHeader::of(MessageKind::FinishedTiles, config_.receiver, frame_);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
-        send_(std::move(message));
-    }
-
-    void requireDisplay() const
-    {
-        if (!displays())
-            failMalformed("a finished tile was sent to a rank that displays nothing");
+        send_(std::move(message), h.isTried ? prefix + h.rawBytes : 0);
     }
 
     std::shared_ptr<MemoryPool> pool_;

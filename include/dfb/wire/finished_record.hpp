@@ -43,6 +43,8 @@ public:
     // Of a pixel in a channel; 0 if the image does not have it.
     std::size_t pixelBytes(std::size_t channel) const noexcept { return format_.pixelBytes(channel); }
     std::size_t pixelBytes() const noexcept { return format_.pixelBytes(); } // in all channels
+    // The planes of so many pixels that begin there.
+    Planes planesAt(std::byte* first, std::size_t pixels) const { return format_.planesAt(first, pixels); }
     // Of a record with so many pixels, the most.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
