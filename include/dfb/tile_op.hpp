@@ -110,7 +110,8 @@ public:
     // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
     // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once. Returns what
     // convertPixels() or ditherPixels() returns.
-    double setRow(int y, const double* rgba, const float* depth, const AuxRow& aux = {})
+    template <class Real>
+    double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {})
     {
         const std::size_t first = static_cast<std::size_t>(y) * stride_;
         overwrites(0, y, width());
@@ -210,7 +211,8 @@ public:
     }
 
 private:
-    double convert(const double* rgba, int count, std::byte* color) const
+    template <class Real>
+    double convert(const Real* rgba, int count, std::byte* color) const
     {
         const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
         return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);

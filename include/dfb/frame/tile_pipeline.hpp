@@ -16,7 +16,6 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstring>
 #include <limits>
 #include <memory>
 #include <mutex>
@@ -350,8 +349,8 @@ private:
         const PlaneFormat format(channels, sizeof(float));
         Buffer floats = pool_->acquire(width * height * format.pixelBytes());
         const Planes planes = format.planesAt(floats.data(), width * height);
-        FinishedTile out(region, OutputFormat::RGBA32F, planes, width);
-        table_.finish(tile, out);
+        FinishedTile floatTile(region, OutputFormat::RGBA32F, planes, width);
+        table_.finish(tile, floatTile);
         PixelTile pixels;
         pixels.frame = table_.frameInfo().frame;
         pixels.tile = tile;
@@ -363,28 +362,10 @@ private:
         operations_.process(pixels);
         auto place = gather_.reserve(tile);
         table_.backgroundPixels(tile).newFrame(region.width(), region.height(), 0);
-        convert(planes, region, place);
-        return gather_.commit(tile, std::move(place), static_cast<std::int64_t>(width * height));
-    }
-
-    // Floats of a tile, to where they are stored in the image's format.
-    void convert(const Planes& planes, const Region& region, const FinalGather::Place& place) const
-    {
-        const auto width = static_cast<std::size_t>(region.width()), height = static_cast<std::size_t>(region.height());
-        for (std::size_t y = 0; y < height && place.planes.at[Color]; ++y) {
-            const float* row = floatsOf(planes.at[Color]) + 4 * width * y;
-            std::byte* to = place.planes.at[Color] + y * place.stride * bytesPerPixel(config_.image.format);
-            if (config_.image.dither)
-                ditherPixels(row, region.width(), config_.image.format, region.x0, region.y0 + static_cast<int>(y), to);
-            else
-                convertPixels(row, region.width(), config_.image.format, to);
-            for (std::size_t c = Depth; c < channelCount; ++c) {
-                const std::size_t bytes = 4 * static_cast<std::size_t>(channelWords[c]);
-                if (place.planes.at[c])
-                    std::memcpy(place.planes.at[c] + y * place.stride * bytes, planes.at[c] + y * width * bytes,
-                                width * bytes);
-            }
-        }
+        FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
+        for (int y = 0; y < region.height(); ++y)
+            out.setRow(y, floatsOf(floatTile.colorRow(y)), floatTile.depthRow(y), floatTile.auxRow(y));
+        return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
 
     PixelsInPlace inPlace(const InputPixels& tile) const { return pixelsInPlace(tile, sent_, traits().activeByDepth); }
