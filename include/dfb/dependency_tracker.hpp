@@ -35,16 +35,28 @@ public:
         generations_[0].expected = rootCount;
     }
 
+    // An input of generation 1 that will come, and the rank that has said so; -1: not known.
+    struct Declared {
+        std::uint32_t source = 0;
+        std::uint16_t part = 0;
+        int rank = -1;
+    };
+
     // The owner's own root (generation 0) has come, and generation 1 has exactly these (source, part) pairs, each once.
-    // Used where the counts come from the senders' manifests; call it once, in place of an arriving root. Throws as
-    // arrive() does, if an input came before that was not declared.
-    void declare(const std::vector<std::pair<std::uint32_t, std::uint16_t>>& inputs)
+    // Used where the counts come from the senders' manifests; call it once, in place of an arriving root. `Inputs`: a
+    // range of Declared, or of structs with these members. Throws as arrive() does, also if an input came before that
+    // was not declared.
+    template <class Inputs>
+    void declare(const Inputs& inputs)
     {
-        declared_ = inputs; // into memory that it has already
-        std::sort(declared_.begin(), declared_.end());
+        declared_.clear();
+        for (const auto& input : inputs)
+            declared_.push_back({1, input.source, input.part, input.rank, 0});
+        std::sort(declared_.begin(), declared_.end(),
+                  [](const Input& a, const Input& b) { return a == b ? a.rank < b.rank : a < b; });
         const auto twice = std::adjacent_find(declared_.begin(), declared_.end());
         if (twice != declared_.end())
-            failTwice(1, twice->first, twice->second, -1, -1);
+            failTwice(1, twice->source, twice->part, twice->rank, (twice + 1)->rank);
         hasDeclaration_ = true;
         for (const Input& input : inputs_)
             if (input.generation == 1)
@@ -95,37 +107,11 @@ public:
     bool complete() const noexcept { return closed_; }
     int arrivedCount() const noexcept { return static_cast<int>(inputs_.size()); }
 
-    // Throws Error (DuplicateInput): two ranks, which may be one, or -1 if that is not known, have the same input.
-    [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
-                                       int otherRank)
-    {
-        ErrorInfo info = detail::errorInfo(ErrorKind::DuplicateInput,
-                                           detail::printed("source %u (in the library's loops the id of a brick; in an "
-                                                           "ImageCompositor the place of an image)",
-                                                           source));
-        info.from = std::max(rank, otherRank);
-        info.generation = generation;
-        info.source = source;
-        info.expected = 1;
-        info.got = 2;
-        if (part > 0)
-            info.message += detail::printed(" part %d", part);
-        if (std::min(rank, otherRank) < 0 || rank == otherRank)
-            info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
-        else
-            info.message +=
-                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only. For "
-                                "bricks that several ranks hold there are SharedWorld and MixedParallelLoop",
-                                std::min(rank, otherRank), std::max(rank, otherRank));
-        throw Error(std::move(info));
-    }
-
     // The inputs that the first incomplete generation still waits for.
     struct Missing {
         int generation = 0;
         std::int64_t expected = 0, got = 0;
-        // Those that are known by name, because they were declared.
-        std::vector<std::pair<std::uint32_t, std::uint16_t>> inputs;
+        std::vector<Declared> inputs; // those that are known by name, because they were declared
         // Else: the inputs that announced those of this generation, and those of it that have come.
         struct Known {
             std::uint32_t source;
@@ -148,9 +134,9 @@ public:
         const Generation& g = generations_[static_cast<std::size_t>(current_)];
         Missing m{current_, g.expected, g.arrived, {}, {}, {}};
         if (hasDeclaration_ && current_ == 1) {
-            for (const auto& [source, part] : declared_)
-                if (!std::binary_search(inputs_.begin(), inputs_.end(), Input{1, source, part, -1, 0}))
-                    m.inputs.emplace_back(source, part);
+            for (const Input& input : declared_)
+                if (!std::binary_search(inputs_.begin(), inputs_.end(), input))
+                    m.inputs.push_back({input.source, input.part, input.rank});
             return m;
         }
         for (const Input& input : inputs_) {
@@ -232,7 +218,7 @@ private:
 
     void checkDeclared(const Input& input) const
     {
-        if (!std::binary_search(declared_.begin(), declared_.end(), std::make_pair(input.source, input.part)))
+        if (!std::binary_search(declared_.begin(), declared_.end(), input))
             fail(ErrorKind::UnannouncedInput, input.generation, input.source, input.rank, 0, 1,
                  detail::printed("its rank did not declare it, part %d", input.part));
     }
@@ -243,6 +229,31 @@ private:
         const auto first = firstFrom(generationIndex);
         const bool isThere = first != inputs_.end();
         fail(kind, generationIndex, isThere ? first->source : 0, isThere ? first->rank : -1, expected, got, "");
+    }
+
+    // Two ranks, which may be one, or -1 if that is not known, have the same input.
+    [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
+                                       int otherRank)
+    {
+        ErrorInfo info = detail::errorInfo(ErrorKind::DuplicateInput,
+                                           detail::printed("source %u (in the library's loops the id of a brick; in an "
+                                                           "ImageCompositor the place of an image)",
+                                                           source));
+        info.from = std::max(rank, otherRank);
+        info.generation = generation;
+        info.source = source;
+        info.expected = 1;
+        info.got = 2;
+        if (part > 0)
+            info.message += detail::printed(" part %d", part);
+        if (std::min(rank, otherRank) < 0 || rank == otherRank)
+            info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
+        else
+            info.message +=
+                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only. For "
+                                "bricks that several ranks hold there are SharedWorld and MixedParallelLoop",
+                                std::min(rank, otherRank), std::max(rank, otherRank));
+        throw Error(std::move(info));
     }
 
     [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, int rank,
@@ -260,9 +271,9 @@ private:
     // So many more than there are an input may add, lest one with a wrong number takes the memory of all.
     static constexpr std::size_t mostAhead = 64;
 
-    std::vector<Generation> generations_;                           // the first ones
-    std::vector<Input> inputs_;                                     // sorted; also of generations behind those
-    std::vector<std::pair<std::uint32_t, std::uint16_t>> declared_; // sorted
+    std::vector<Generation> generations_; // the first ones
+    std::vector<Input> inputs_;           // sorted; also of generations behind those
+    std::vector<Input> declared_;         // sorted
     bool hasDeclaration_ = false;
     int current_ = 0; // the first generation that is not complete
     bool closed_ = false;

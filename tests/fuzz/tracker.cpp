@@ -17,7 +17,7 @@
 
 namespace {
 
-using Names = std::vector<std::pair<std::uint32_t, std::uint16_t>>;
+using Names = std::vector<dfb::DependencyTracker::Declared>;
 
 // What has come; `contradicts()` if no tree can have it.
 class Model {
@@ -36,7 +36,9 @@ public:
     }
     bool declare(const Names& names)
     {
-        declared_.emplace(names.begin(), names.end());
+        declared_.emplace();
+        for (const auto& name : names)
+            declared_->emplace(name.source, name.part);
         arrived_[0] += 1;
         children_[0] += static_cast<std::int64_t>(names.size());
         return declared_->size() == names.size();
@@ -120,7 +122,7 @@ extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size
                 continue; // once is what its contract says
             for (int left = in.take<std::uint8_t>() % 8; left > 0; --left) {
                 const auto b = in.take<std::uint8_t>();
-                names.emplace_back(b % 8, static_cast<std::uint16_t>(b / 8 % 2));
+                names.push_back({b % 8u, static_cast<std::uint16_t>(b / 8 % 2)});
             }
         } else {
             roots = 1 + in.take<std::uint8_t>() % 3;

@@ -9,7 +9,7 @@
 #include <optional>
 #include <random>
 #include <string>
-#include <utility>
+#include <tuple>
 #include <vector>
 
 #include <sys/resource.h>
@@ -25,6 +25,7 @@ struct Input {
     int children;
 };
 using Tree = std::vector<Input>;
+using Names = std::vector<dfb::DependencyTracker::Declared>;
 
 struct Shape {
     const char* name;
@@ -368,7 +369,7 @@ TEST_CASE("An input that is far from all others takes no memory for those betwee
 
 TEST_CASE("Declared inputs: any order of declaration and arrivals completes at the last", "[tracker]")
 {
-    const std::vector<std::pair<std::uint32_t, std::uint16_t>> declared{{3, 0}, {1, 0}, {1, 1}, {8, 0}};
+    const Names declared{{3, 0, 5}, {1, 0}, {1, 1}, {8, 0}};
     // Number 4 stands for the declaration.
     std::size_t wrong = 0;
     forAllOrders(5, [&](const std::vector<std::size_t>& order) {
@@ -378,7 +379,7 @@ TEST_CASE("Declared inputs: any order of declaration and arrivals completes at t
             if (order[k] == 4)
                 tracker.declare(declared);
             else
-                tracker.arrive(1, declared[order[k]].first, declared[order[k]].second, 0);
+                tracker.arrive(1, declared[order[k]].source, declared[order[k]].part, 0);
             fine = fine && tracker.complete() == (k + 1 == order.size());
         }
         wrong += fine ? 0 : 1;
@@ -386,21 +387,24 @@ TEST_CASE("Declared inputs: any order of declaration and arrivals completes at t
     CHECK(wrong == 0);
 
     dfb::DependencyTracker nothing;
-    nothing.declare({});
+    nothing.declare(Names{});
     CHECK(nothing.complete());
 
     dfb::DependencyTracker tracker;
     tracker.declare(declared);
     tracker.arrive(1, 1, 1, 0);
-    REQUIRE(tracker.missing());
-    CHECK(tracker.missing()->text() == "generation 1 has 1 of 4 inputs");
-    const std::vector<std::pair<std::uint32_t, std::uint16_t>> absent{{1, 0}, {3, 0}, {8, 0}};
-    CHECK(tracker.missing()->inputs == absent);
+    const auto missing = tracker.missing();
+    REQUIRE(missing);
+    CHECK(missing->text() == "generation 1 has 1 of 4 inputs");
+    std::vector<std::tuple<std::uint32_t, std::uint16_t, int>> absent;
+    for (const auto& input : missing->inputs)
+        absent.emplace_back(input.source, input.part, input.rank);
+    CHECK(absent == decltype(absent){{1, 0, -1}, {3, 0, 5}, {8, 0, -1}});
 }
 
 TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twice", "[tracker]")
 {
-    const std::vector<std::pair<std::uint32_t, std::uint16_t>> declared{{1, 0}, {2, 0}};
+    const Names declared{{1, 0}, {2, 0}};
     // All orders of: declaration (0), the two declared inputs (1, 2), a culprit (3).
     const auto errors = [&](const Input& culprit) {
         std::vector<dfb::ErrorInfo> result;
@@ -411,7 +415,7 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
                     if (step == 0)
                         tracker.declare(declared);
                     else if (step < 3)
-                        tracker.arrive(1, declared[step - 1].first, declared[step - 1].second, 0);
+                        tracker.arrive(1, declared[step - 1].source, declared[step - 1].part, 0);
                     else
                         arrive(tracker, culprit);
                 }
@@ -443,11 +447,11 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
     }));
     dfb::DependencyTracker rootFirst;
     rootFirst.arrive(0, 2, 0, 0);
-    CHECK_THROWS_AS(rootFirst.declare({}), dfb::Error);
+    CHECK_THROWS_AS(rootFirst.declare(Names{}), dfb::Error);
 
     dfb::DependencyTracker tracker;
     try {
-        tracker.declare({{4, 0}, {5, 0}, {4, 0}});
+        tracker.declare(Names{{4, 0, 2}, {5, 0, 2}, {4, 0, 1}});
         FAIL("declared twice");
     } catch (const dfb::Error& e) {
         CHECK(e.info().kind == dfb::ErrorKind::DuplicateInput);
@@ -455,6 +459,7 @@ TEST_CASE("Declared inputs: what was not declared, declared twice, or comes twic
         CHECK(e.info().generation == 1);
         CHECK(e.info().expected == 1);
         CHECK(e.info().got == 2);
+        CHECK(e.info().message.find("comes from rank 1 and from rank 2") != std::string::npos);
     }
 }
 

@@ -272,11 +272,11 @@ public:
         int tiles = 0;
         std::string text;
         for (const int tile : owned_) {
-            const ExpectedInputs::Range inputs = expected ? expected->of(tile) : ExpectedInputs::Range{};
+            const bool isBackground = declared && (!expected || expected->of(tile).empty());
             const std::lock_guard<std::mutex> lock(mutexOf(tile));
             const auto& slot = slotOf(tile);
             const bool touched = isTouched(tile);
-            if (touched ? slot->ready : (declared && inputs.empty()) || samples(tile).count == 0)
+            if (touched ? slot->ready : isBackground || samples(tile).count == 0)
                 continue;
             const DependencyTracker untouched;
             for (int pass = 0; pass < samples(tile).count; ++pass) {
@@ -290,8 +290,10 @@ public:
                     first->tile = tile;
                     first->pass = pass;
                     first->generation = m->generation;
-                    first->source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().first);
-                    first->from = announcerOf(*m, inputs);
+                    first->source = m->inputs.empty() ? -1 : static_cast<std::int64_t>(m->inputs.front().source);
+                    first->from = !m->inputs.empty()      ? m->inputs.front().rank
+                                  : m->announcers.empty() ? -1
+                                                          : m->announcers.front().rank;
                     first->expected = m->expected;
                     first->got = m->got;
                 }
@@ -300,7 +302,7 @@ public:
                         printed(samples(tile).count > 1 ? "%stile %d pass %d: " : "%stile %d: ", tiles > 1 ? "; " : "",
                                 tile, pass);
                     text += m->text();
-                    text += namesOf(*m, inputs);
+                    text += namesOf(*m);
                 }
                 break;
             }
@@ -329,9 +331,8 @@ private:
         bool ready = false, touched = false, declared = false, hasPixels = false, finished = false;
         bool spoilt = false;  // an input has contradicted the others, or the op cannot do with it; also if finished
         bool counted = false; // by declare()
-        std::vector<DependencyTracker> trees;                       // one per pass
-        std::vector<std::pair<std::uint32_t, std::uint16_t>> names; // of the inputs that were declared
-        std::unique_ptr<TileStage> op;                              // made with the slot
+        std::vector<DependencyTracker> trees; // one per pass
+        std::unique_ptr<TileStage> op;        // made with the slot
         BackgroundPixels background;
     };
 
@@ -428,47 +429,19 @@ private:
     static void declareSlot(Slot& slot, const ExpectedInputs::Range& inputs)
     {
         slot.declared = true;
-        slot.names.clear();
-        for (const ExpectedInput& input : inputs)
-            slot.names.emplace_back(input.source, input.part);
-        try {
-            for (DependencyTracker& tree : slot.trees)
-                tree.declare(slot.names);
-        } catch (const Error&) {
-            failIfTwice(inputs); // with the ranks, which the tracker does not know
-            throw;
-        }
-    }
-
-    static void failIfTwice(const ExpectedInputs::Range& inputs)
-    {
-        for (const ExpectedInput& a : inputs)
-            for (const ExpectedInput& b : inputs)
-                if (&a < &b && a.source == b.source && a.part == b.part)
-                    DependencyTracker::failTwice(1, a.source, a.part, a.rank, b.rank);
-    }
-
-    // The rank that has declared the first of the inputs that are missing, or announced some of them, or -1.
-    static int announcerOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
-    {
-        if (!missing.inputs.empty())
-            for (const ExpectedInput& input : expected)
-                if (std::make_pair(input.source, input.part) == missing.inputs.front())
-                    return input.rank;
-        return missing.announcers.empty() ? -1 : missing.announcers.front().rank;
+        for (DependencyTracker& tree : slot.trees)
+            tree.declare(inputs);
     }
 
     // In words: which inputs are missing, and from which ranks; or which ranks announced them, and which have come.
-    static std::string namesOf(const DependencyTracker::Missing& missing, const ExpectedInputs::Range& expected)
+    static std::string namesOf(const DependencyTracker::Missing& missing)
     {
         std::string text;
-        for (const auto& [source, part] : missing.inputs) {
-            text += printed(text.empty() ? "; missing source %u" : ", %u", source);
-            if (part > 0)
-                text += printed(" part %d", part);
-            for (const ExpectedInput& input : expected)
-                if (input.source == source && input.part == part)
-                    text += printed(" of rank %d", input.rank);
+        for (const DependencyTracker::Declared& input : missing.inputs) {
+            text += printed(text.empty() ? "; missing source %u" : ", %u", input.source);
+            if (input.part > 0)
+                text += printed(" part %d", input.part);
+            text += printed(" of rank %d", input.rank);
         }
         return text + listOf("; announced by source ", missing.announcers)
                + listOf("; here are source ", missing.arrived);
