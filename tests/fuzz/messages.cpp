@@ -330,9 +330,11 @@ private:
         options.sharedMemory = false;
         options.checksums = way_.has(Checksums);
         const auto traits = d::OperationTraits::of<TileOp, PixelOp>();
-        const auto agreement =
-            d::Agreement::of(traits, config, options.checksums, {1, 0}, d::TilePipeline::travelling(traits, config),
-                             tileCount, [](int tile) { return ownerOf(tile); });
+        std::vector<int> owners;
+        for (int tile = 0; tile < tileCount; ++tile)
+            owners.push_back(ownerOf(tile));
+        const auto agreement = d::Agreement::of(traits, config, options.checksums, {1, 0},
+                                                d::TilePipeline::travelling(traits, config), owners);
         const auto agree = [&](std::uint32_t address, const d::Agreement& what) {
             peer_->send(messageOf(MessageKind::ReduceUp, address, 0, reductionOf(OwnScope, what.bytes())));
         };

@@ -13,6 +13,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cxxabi.h>
+#include <exception>
 #include <limits>
 #include <memory>
 #include <string>
@@ -23,15 +24,15 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// FNV-1a over 64-bit words.
-class Fingerprint {
-public:
-    void add(std::uint64_t v) noexcept { value_ = (value_ ^ v) * 1099511628211u; }
-    std::uint64_t value() const noexcept { return value_; }
-
-private:
-    std::uint64_t value_ = 1469598103934665603u;
-};
+// FNV-1a over a 64-bit word of each element.
+template <class List, class WordOf>
+std::uint64_t fingerprint(const List& list, const WordOf& wordOf)
+{
+    std::uint64_t value = 1469598103934665603u;
+    for (const auto& element : list)
+        value = (value ^ static_cast<std::uint64_t>(wordOf(element))) * 1099511628211u;
+    return value;
+}
 
 // The configuration of one rank, or its error. Combined: whether all are right and equal, and which share a node.
 struct Agreement {
@@ -67,15 +68,11 @@ struct Agreement {
         std::string text_;
     };
 
-    // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `ownerOf(tile)`:
-    // the owner map's answers.
-    template <class OwnerOf>
+    // `checksums`: see NetworkConfig; `sent`: those of the tile operation's channels that travel; `owners`: the owner
+    // map's answers.
     static Agreement of(const OperationTraits& operations, const FrameBufferConfig& c, bool checksums, OnNode here,
-                        ChannelMask sent, int tileCount, const OwnerOf& ownerOf)
+                        ChannelMask sent, const std::vector<int>& owners)
     {
-        Fingerprint owners;
-        for (int tile = 0; tile < tileCount; ++tile)
-            owners.add(static_cast<std::uint64_t>(ownerOf(tile)));
         Settings s;
         s.add("the version of dfb", printed("%d.%d", DFB_VERSION_MAJOR, DFB_VERSION_MINOR));
         s.add("width", c.image.width);
@@ -91,7 +88,7 @@ struct Agreement {
         s.add("dither", c.image.dither);
         s.add("displayRank", c.image.displayRank);
         s.add("framesInFlight", c.framesInFlight);
-        s.add(ownerMap, owners.value());
+        s.add("the hash of ownerMap", fingerprint(owners, [](int owner) { return owner; }));
         s.add("the id of messages.codec", c.messages.codec ? c.messages.codec->id() : 0);
         s.add("messages.compression", c.messages.compression == CompressionMode::Auto ? "Auto" : "Always");
         s.add("precision.color", nameOf(c.precision.color));
@@ -102,12 +99,6 @@ struct Agreement {
         s.add("messages.poolBytes", c.messages.poolBytes);
         s.add("checksums", checksums);
         return {true, s.text(), here.rank, {here}};
-    }
-
-    // Throws the exception for a result that is not fine, as all ranks do.
-    [[noreturn]] void refuse(Connection& connection) const
-    {
-        throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, text, rank), connection.throwByAll());
     }
 
     SmallBytes bytes() const
@@ -147,15 +138,31 @@ struct Agreement {
         if (!b.fine)
             return second;
         if (a.text != b.text)
-            return Agreement{false, difference(a, b), -1}.bytes();
+            return Agreement{false, difference(a.text, a.rank, b.text, b.rank) + ": it must be the same on all ranks",
+                             -1}
+                .bytes();
         a.nodes.insert(a.nodes.end(), b.nodes.begin(), b.nodes.end());
         return a.bytes();
+    }
+
+    // Which settings differ, in words, and their values on both ranks. A hash says least: it is shown if nothing else
+    // differs.
+    static std::string difference(const std::string& a, int rank, const std::string& b, int otherRank)
+    {
+        const auto as = settingsOf(a), bs = settingsOf(b);
+        const std::string ranks[] = {printed(" on rank %d", rank), printed(" on rank %d", otherRank)};
+        std::string differing;
+        for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
+            if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name.find(hash) != 0 || differing.empty()))
+                differing += (differing.empty() ? "" : "; ") + name + " is " + readable(name, value) + ranks[0]
+                             + " and " + readable(name, bs[i].second) + ranks[1];
+        return differing.empty() ? "the settings" + ranks[0] + " are not those" + ranks[1] : differing;
     }
 
 private:
     static constexpr const char* tileOperation = "the tile operation";
     static constexpr const char* pixelOperation = "the pixel operation";
-    static constexpr const char* ownerMap = "the hash of ownerMap"; // differs with the size, too
+    static constexpr const char* hash = "the hash of ";
     static constexpr char separator = '=';
 
     // The fewest digits that give this value back.
@@ -187,20 +194,6 @@ private:
         return text;
     }
 
-    // Which settings differ, in words.
-    static std::string difference(const Agreement& a, const Agreement& b)
-    {
-        const auto as = settingsOf(a.text), bs = settingsOf(b.text);
-        const std::string ranks[] = {printed(" on rank %d", a.rank), printed(" on rank %d", b.rank)};
-        std::string differing;
-        for (std::size_t i = 0; i < as.size() && as.size() == bs.size(); ++i)
-            if (const auto& [name, value] = as[i]; as[i] != bs[i] && (name != ownerMap || differing.empty()))
-                differing += (differing.empty() ? "" : "; ") + name + " is " + readable(name, value) + ranks[0]
-                             + " and " + readable(name, bs[i].second) + ranks[1];
-        if (differing.empty())
-            differing = "the settings" + ranks[0] + " are not those" + ranks[1];
-        return differing + ": it must be the same on all ranks";
-    }
     static std::vector<std::pair<std::string, std::string>> settingsOf(const std::string& text)
     {
         std::vector<std::pair<std::string, std::string>> settings;
@@ -215,19 +208,32 @@ private:
     }
 };
 
-// Finds out whether all ranks have the same configuration, and returns it, or the error. Collective. If something is
-// wrong, no rank returns before all know it: the first to throw may destroy the connection, and a rank that has not
-// heard the reason by then would report another error.
-inline Agreement agree(Mailbox& mailbox, const Agreement& mine)
+// Finds out whether all ranks have the same configuration, which makeMine() returns, and returns what all have.
+// Collective. Throws InvalidArgument on all ranks if something is wrong, as if makeMine() throws on one of them. No
+// rank throws before all know it: the first to throw may destroy the connection, and a rank that has not heard the
+// reason by then would report another error.
+template <class MakeMine>
+Agreement agree(Mailbox& mailbox, const MakeMine& makeMine)
 {
-    const auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
+    Agreement mine;
+    try {
+        mine = makeMine();
+    } catch (const InvalidArgument& e) {
+        mine = {false, e.info().message, mailbox.rank()};
+    } catch (const std::exception& e) { // the others must not wait for this rank
+        mine = {false, e.what(), mailbox.rank()};
+    }
+    auto all = Agreement::from(mailbox.reduce(mine.bytes(), Agreement::combine));
     if (!all.fine) {
         try {
             mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
         } catch (const TransportError&) {
             // One rank has left already, so all know.
         }
+        throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, all.text, all.rank),
+                              mailbox.connection().throwByAll());
     }
+    mailbox.connection().setAlike();
     return all;
 }
 

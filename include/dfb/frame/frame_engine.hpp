@@ -48,54 +48,22 @@ public:
                                              config_.trace.get());
         compression_.emplace(config_.messages.codec, config_.messages.compression, size());
         mailbox_->start();
-        Agreement mine;
-        try {
-            if (config_.image.displayRank < 0 || config_.image.displayRank >= size())
-                failArgument("the display rank is %d of %d", config_.image.displayRank, size());
-            if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
-                failArgument(
-                    "there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
-                    config_.framesInFlight);
-            if (config_.image.aux & ~(traits().channels & imageAuxChannels))
-                failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
-                             "do not have",
-                             config_.image.aux);
-            if (const long long ms = mailbox_->connection().config().peerTimeout.count(); ms != 0 && ms < 100)
-                failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
-            if (const long long ms = config_.quiet.count(); ms < 1)
-                failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
-            checkWire();
-            bool hasFarRanks = false;
-            for (int other = 0; other < size(); ++other)
-                hasFarRanks = hasFarRanks || isFar(other);
-            pipeline_ = std::make_unique<TilePipeline>(
-                pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(),
-                [this](Buffer&& message, std::size_t raw) { sendToDisplay(std::move(message), raw); });
-            outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
-                                                      [this](Verdict& verdict) { addFigures(verdict); });
-            // The rank after the display rank hands out jobs, as that one has enough to do.
-            jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
-            const Connection& network = mailbox_->connection();
-            mine = Agreement::of(traits(), config_, network.config().checksums, {rank(), network.firstOnNode()},
-                                 TilePipeline::travelling(traits(), config_), layout().tileCount(),
-                                 [this](int tile) { return tileOwner(tile); });
-        } catch (const InvalidArgument& e) {
-            mine = {false, e.info().message, rank()};
-        } catch (const OutOfMemory& e) {
-            const bool several = config_.framesInFlight > 1;
-            mine = {false,
-                    several
-                        ? printed("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight)
-                        : e.what(),
+        const auto all = agree(*mailbox_, [this] {
+            checkConfig();
+            try {
+                makeParts();
+            } catch (const OutOfMemory& e) {
+                if (config_.framesInFlight == 1)
+                    throw;
+                return Agreement{
+                    false,
+                    printed("%s; there is one for each of %d frames in flight", e.what(), config_.framesInFlight),
                     rank()};
-        } catch (const std::exception& e) {
-            // No memory, or out of the owner map: the others must not wait for this rank.
-            mine = {false, e.what(), rank()};
-        }
-        const auto all = agree(*mailbox_, mine);
-        if (!all.fine)
-            all.refuse(mailbox_->connection());
-        mailbox_->connection().setAlike();
+            }
+            const Connection& network = mailbox_->connection();
+            return Agreement::of(traits(), config_, network.config().checksums, {rank(), network.firstOnNode()},
+                                 TilePipeline::travelling(traits(), config_), pipeline_->table().ownersByMap());
+        });
         nodeOf_.resize(static_cast<std::size_t>(size()));
         for (const Agreement::OnNode& its : all.nodes)
             if (its.rank < size())
@@ -111,7 +79,10 @@ public:
     int size() const noexcept override { return mailbox_->size(); }
     const FrameBufferConfig& config() const noexcept override { return config_; }
     const TileLayout& layout() const noexcept override { return pipeline_->table().layout(); }
-    int tileOwner(int tile) const noexcept override { return pipeline_->table().ownerByMap(tile); }
+    int tileOwner(int tile) const noexcept override
+    {
+        return pipeline_->table().ownersByMap()[static_cast<std::size_t>(tile)];
+    }
     const std::vector<int>& ownedTiles() const noexcept override { return pipeline_->table().ownedByMap(); }
     int ownerNow(int tile) const noexcept override { return pipeline_->table().owner(tile); }
     const std::vector<int>& ownedNow() const noexcept override { return pipeline_->table().owned(); }
@@ -797,8 +768,22 @@ private:
             outcome_->tryVote();
     }
 
-    void checkWire() const
+    // Throws InvalidArgument.
+    void checkConfig() const
     {
+        if (config_.image.displayRank < 0 || config_.image.displayRank >= size())
+            failArgument("the display rank is %d of %d", config_.image.displayRank, size());
+        if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
+            failArgument("there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
+                         config_.framesInFlight);
+        if (config_.image.aux & ~(traits().channels & imageAuxChannels))
+            failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
+                         "do not have",
+                         config_.image.aux);
+        if (const long long ms = mailbox_->connection().config().peerTimeout.count(); ms != 0 && ms < 100)
+            failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
+        if (const long long ms = config_.quiet.count(); ms < 1)
+            failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
         const Precision& w = config_.precision;
         if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
             failArgument("half a level, and another precision");
@@ -808,6 +793,20 @@ private:
             failArgument("the format bytes is that of inputs of 8 bits, and cannot be asked for");
         if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
             failArgument("a least transmittance of %f", config_.minTransmittance);
+    }
+
+    void makeParts()
+    {
+        bool hasFarRanks = false;
+        for (int other = 0; other < size(); ++other)
+            hasFarRanks = hasFarRanks || isFar(other);
+        pipeline_ = std::make_unique<TilePipeline>(
+            pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(),
+            [this](Buffer&& message, std::size_t raw) { sendToDisplay(std::move(message), raw); });
+        outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
+                                                  [this](Verdict& verdict) { addFigures(verdict); });
+        // The rank after the display rank hands out jobs, as that one has enough to do.
+        jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
     }
 
     std::shared_ptr<MemoryPool> pool_;

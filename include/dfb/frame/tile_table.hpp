@@ -85,7 +85,7 @@ public:
     // Of this frame, and by the owner map alone.
     int owner(int tile) const noexcept { return (*owners_)[static_cast<std::size_t>(tile)]; }
     const std::vector<int>& owned() const noexcept { return owned_; }
-    int ownerByMap(int tile) const noexcept { return (*byMap_)[static_cast<std::size_t>(tile)]; }
+    const std::vector<int>& ownersByMap() const noexcept { return *byMap_; }
     const std::vector<int>& ownedByMap() const noexcept { return ownedByMap_; }
 
     bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }

@@ -12,7 +12,6 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
-#include <cstdio>
 #include <cstring>
 #include <exception>
 #include <iterator>
@@ -74,26 +73,19 @@ struct FrameTerms {
     {
         FrameTerms t;
         if (p.samples) {
-            Fingerprint f;
-            for (const TileSamples& s : *p.samples) {
-                f.add(static_cast<std::uint64_t>(s.first) << 32 | static_cast<std::uint32_t>(s.count));
-                t.sampleCount += s.count;
-            }
-            t.samplesHash = f.value();
+            for (const TileSamples& its : *p.samples)
+                t.sampleCount += its.count;
+            t.samplesHash = fingerprint(*p.samples, [](const TileSamples& its) {
+                return static_cast<std::uint64_t>(its.first) << 32 | static_cast<std::uint32_t>(its.count);
+            });
         }
         t.accumulationId = p.accumulationId;
-        if (p.order) {
-            Fingerprint f;
-            for (const SourceOrder::Place& place : p.order->places())
-                f.add(static_cast<std::uint64_t>(place.source) << 32 | static_cast<std::uint32_t>(place.place));
-            t.orderHash = f.value();
-        }
-        if (p.owners) {
-            Fingerprint f;
-            for (const int owner : *p.owners)
-                f.add(static_cast<std::uint64_t>(owner));
-            t.ownersHash = f.value();
-        }
+        if (p.order)
+            t.orderHash = fingerprint(p.order->places(), [](const SourceOrder::Place& its) {
+                return static_cast<std::uint64_t>(its.source) << 32 | static_cast<std::uint32_t>(its.place);
+            });
+        if (p.owners)
+            t.ownersHash = fingerprint(*p.owners, [](int owner) { return owner; });
         std::memcpy(t.background.data(), p.background.data(), sizeof t.background);
         t.passes = p.passes;
         t.maxLayers = p.maxLayers;
@@ -106,62 +98,40 @@ struct FrameTerms {
 
     std::chrono::milliseconds timeout() const { return std::chrono::milliseconds(timeoutMs); } // 0: none
 
-    // The first field that is not the same in both, with its values and ranks; "" if they are alike.
+    // Which fields are not the same in both, with their values and ranks; "" if they are alike.
     std::string difference(const FrameTerms& o) const
     {
         FrameTerms its = o;
         its.rank = rank;
         if (std::memcmp(this, &its, sizeof its) == 0) // as nearly always
             return {};
-        std::string text;
-        const auto compare = [&](const char* name, bool differs, const std::string& here, const std::string& there) {
-            if (text.empty() && differs)
-                text = printed("FrameConfig::%s is %s on rank %d and %s on rank %d", name, here.c_str(), rank,
-                               there.c_str(), o.rank);
-        };
-        const auto number = [&](const char* name, std::uint64_t here, std::uint64_t there) {
-            compare(name, here != there, numberText(here), numberText(there));
-        };
-        const auto flag = [&](const char* name, std::int32_t here, std::int32_t there) {
-            compare(name, here != there, here ? "true" : "false", there ? "true" : "false");
-        };
-        const auto planText = [&](const FrameTerms& t) {
-            if (t.samplesHash == 0)
-                return std::string("null");
-            std::string plan = "a plan of " + numberText(static_cast<std::uint64_t>(t.sampleCount)) + " samples";
-            if (sampleCount == o.sampleCount) // else that tells them apart
-                plan += " with hash " + numberText(t.samplesHash);
-            return plan;
-        };
-        compare("background", background != o.background, backgroundText(*this), backgroundText(o));
-        number("passes", static_cast<std::uint64_t>(passes), static_cast<std::uint64_t>(o.passes));
-        compare("samples", samplesHash != o.samplesHash, planText(*this), planText(o));
-        number("maxLayers", static_cast<std::uint64_t>(maxLayers), static_cast<std::uint64_t>(o.maxLayers));
-        number("accumulationId", accumulationId, o.accumulationId);
-        const auto hashText = [](std::uint64_t hash) {
-            return hash == 0 ? std::string("null") : "one with hash " + numberText(hash);
-        };
-        compare("order", orderHash != o.orderHash, hashText(orderHash), hashText(o.orderHash));
-        compare("owners", ownersHash != o.ownersHash, hashText(ownersHash), hashText(o.ownersHash));
-        flag("declared", declared, o.declared);
-        number("timeout", static_cast<std::uint64_t>(timeoutMs), static_cast<std::uint64_t>(o.timeoutMs));
-        flag("allowPartial", allowPartial, o.allowPartial);
-        return text;
+        return Agreement::difference(text(), rank, o.text(), o.rank);
     }
 
 private:
-    static std::string numberText(std::uint64_t value)
+    std::string text() const
     {
-        return printed("%llu", static_cast<unsigned long long>(value)); // all are 0 or more
-    }
-    static std::string backgroundText(const FrameTerms& t)
-    {
+        const auto hashText = [](std::uint64_t hash) {
+            return hash == 0 ? "null" : printed("one with hash %llu", static_cast<unsigned long long>(hash));
+        };
         std::array<float, 4> c{};
-        std::memcpy(c.data(), t.background.data(), sizeof c);
-        char text[80];
-        std::snprintf(text, sizeof text, "(%.9g, %.9g, %.9g, %.9g)", static_cast<double>(c[0]),
-                      static_cast<double>(c[1]), static_cast<double>(c[2]), static_cast<double>(c[3]));
-        return text;
+        std::memcpy(c.data(), background.data(), sizeof c);
+        Agreement::Settings s;
+        s.add("FrameConfig::background",
+              printed("(%.9g, %.9g, %.9g, %.9g)", static_cast<double>(c[0]), static_cast<double>(c[1]),
+                      static_cast<double>(c[2]), static_cast<double>(c[3])));
+        s.add("FrameConfig::passes", passes);
+        s.add("FrameConfig::samples",
+              samplesHash == 0 ? "null" : printed("a plan of %lld samples", static_cast<long long>(sampleCount)));
+        s.add("the hash of FrameConfig::samples", samplesHash);
+        s.add("FrameConfig::maxLayers", maxLayers);
+        s.add("FrameConfig::accumulationId", accumulationId);
+        s.add("FrameConfig::order", hashText(orderHash));
+        s.add("FrameConfig::owners", hashText(ownersHash));
+        s.add("FrameConfig::declared", declared != 0);
+        s.add("FrameConfig::timeout", timeoutMs);
+        s.add("FrameConfig::allowPartial", allowPartial != 0);
+        return s.text();
     }
 };
 static_assert(std::has_unique_object_representations_v<FrameTerms>); // no byte of a verdict is undefined
@@ -414,7 +384,6 @@ public:
         verdict.mergeErrors = sums(mergeErrors_);
     }
 
-private:
     // Sorts by key, then value, and adds up equal keys: so sums do not depend on the order in which threads added
     // values.
     static std::vector<Figure> sums(std::vector<Figure> figures)
@@ -424,6 +393,7 @@ private:
         return Verdict::summed(std::move(figures));
     }
 
+private:
     mutable std::mutex mutex_;
     std::vector<Figure> figures_, mergeErrors_; // by key, by tile
 };

@@ -41,19 +41,11 @@ public:
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), std::move(executor),
                                              std::max(poolBytes, 4 * largest), self);
         mailbox_->start();
-        Agreement mine{true, describe(), mailbox_->rank()};
-        if (const std::string wrong = whatIsWrong(); !wrong.empty())
-            mine = {false, wrong, mailbox_->rank()};
-        else
-            try {
-                takeMemory();
-            } catch (const std::exception& e) { // the others must not wait for this rank
-                mine = {false, e.what(), mailbox_->rank()};
-            }
-        const auto all = agree(*mailbox_, mine);
-        if (!all.fine)
-            all.refuse(mailbox_->connection());
-        mailbox_->connection().setAlike();
+        agree(*mailbox_, [this] {
+            checkLayout();
+            takeMemory();
+            return Agreement{true, describe(), mailbox_->rank()};
+        });
     }
 
     Wall(const Wall&) = delete;
@@ -175,19 +167,19 @@ private:
         return settings.text();
     }
 
-    std::string whatIsWrong() const
+    // Throws InvalidArgument.
+    void checkLayout() const
     {
         if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
             || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
-            return printed("a wall of %dx%d displays of %dx%d, bezels of %dx%d, format %s: cannot be", layout_.columns,
-                           layout_.rows, layout_.displayWidth, layout_.displayHeight, layout_.bezelX, layout_.bezelY,
-                           nameOf(format_));
+            failArgument("a wall of %dx%d displays of %dx%d, bezels of %dx%d, format %s: cannot be", layout_.columns,
+                         layout_.rows, layout_.displayWidth, layout_.displayHeight, layout_.bezelX, layout_.bezelY,
+                         nameOf(format_));
         if (layout_.ranks.size() != static_cast<std::size_t>(layout_.displayCount()))
-            return printed("a wall of %d displays names %zu ranks", layout_.displayCount(), layout_.ranks.size());
+            failArgument("a wall of %d displays names %zu ranks", layout_.displayCount(), layout_.ranks.size());
         for (const int rank : layout_.ranks)
             if (rank < 0 || rank >= mailbox_->size())
-                return printed("a display of the wall is driven by rank %d of %d", rank, mailbox_->size());
-        return "";
+                failArgument("a display of the wall is driven by rank %d of %d", rank, mailbox_->size());
     }
 
     // The displays of this rank, with nothing to show, and memory for the images that each of them will have, which it
