@@ -167,17 +167,18 @@ public:
         // Calls body(), the work of a loop of your own or a part of it. An exception of body() goes to abort(), and
         // end() throws a FrameError with its text on all ranks, also on this one. So call end() in any case. Returns
         // false if there was an exception. Any thread. Waits for no other rank. Throws nothing.
-        template <class Body>
-        bool guard(const Body& body)
-        {
-            return guardAbout(body, nullptr);
-        }
-        // Calls body(), which renders `tile`: the error names that tile, and with FrameConfig::allowPartial the frame
+        // With `tile`, which body() renders, the error names that tile, and with FrameConfig::allowPartial the frame
         // goes on without it. The tile's index is read when there is an exception.
         template <class Body>
-        bool guard(const Body& body, const TileHeader& tile)
+        bool guard(const Body& body, const TileHeader& tile = {})
         {
-            return guardAbout(body, &tile);
+            try {
+                body();
+                return true;
+            } catch (...) {
+                abort(std::current_exception(), tile.tile);
+                return false;
+            }
         }
 
         // Calls job(i, tile) for each i in [0, count), on this thread and the workers of the executor. Each thread has
@@ -262,18 +263,6 @@ public:
         std::optional<FrameReport> tryEnd() { return isDone() ? std::optional<FrameReport>(end()) : std::nullopt; }
 
     private:
-        template <class Body>
-        bool guardAbout(const Body& body, const TileHeader* tile)
-        {
-            try {
-                body();
-                return true;
-            } catch (...) {
-                abort(std::current_exception(), tile ? tile->tile : -1);
-                return false;
-            }
-        }
-
         friend class DistributedFrameBuffer;
         Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
         DistributedFrameBuffer* fb_;
