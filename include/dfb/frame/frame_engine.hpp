@@ -433,7 +433,7 @@ private:
         auto& early = open_.open();
         open_.expectTiles(tiles + static_cast<std::int64_t>(withoutSamples.size()));
         if (userError) // comes out of end(), on all ranks; nothing is made with half of the frame's data
-            outcome_->failWhole(userError);
+            outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)
             incoming(a.source, a.header, std::move(a.message));
         early.clear(); // some may still be there, if the frame has failed
@@ -757,7 +757,7 @@ private:
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
         v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
         v.wireErrorBound = reports.wireErrorBound;
-        v.tileErrors = FrameFigures::of(reports.errors);
+        v.tileErrors = FrameFigures::sums(reports.errors);
         figures_.addTo(v);
         repeatedBefore_ = repeated;
     }

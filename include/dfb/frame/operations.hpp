@@ -18,8 +18,8 @@ namespace detail {
 struct OperationTraits {
     int tileWidth = 64, tileHeight = 64;
     ChannelMask channels = 0, neededChannels = 0;
-    bool activeByDepth = false, emptyIsBackground = false, keepsState = false, endsEarly = false;
-    bool opaqueHides = false, reports = false, readsInPlace = false, takesOrder = false;
+    bool activeByDepth = false, emptyIsBackground = false, keepsState = false;
+    bool opaqueHides = false, readsInPlace = false, takesOrder = false;
     bool hasPixelOp = false, pixelOpIsPointwise = true;
     std::string tileOp, pixelOp; // names of the types, as the compiler has them
 
@@ -33,11 +33,9 @@ struct OperationTraits {
         t.activeByDepth = active_by_depth_v<TileOp>;
         t.emptyIsBackground = empty_is_background_v<TileOp>;
         t.keepsState = keeps_state_v<TileOp>;
-        t.endsEarly = has_is_complete_v<TileOp>;
         t.opaqueHides = opaque_hides_v<TileOp>;
         t.readsInPlace = reads_in_place_v<TileOp>;
         t.takesOrder = takes_order_v<TileOp>;
-        t.reports = has_report_v<TileOp>;
         t.hasPixelOp = !std::is_same_v<PixelOp, NoPixelOp>;
         t.pixelOpIsPointwise = is_pointwise_v<PixelOp>;
         t.tileOp = typeid(TileOp).name();

@@ -96,7 +96,6 @@ public:
         tryVote();
         return failure.inTime;
     }
-    bool failWhole(const std::exception_ptr& reason) { return failWhole(errorInfoOf(reason, {})); }
 
     // The frame has failed: messages that have not left count no more, unless finished tiles are wanted.
     void dropRest()

@@ -244,8 +244,7 @@ public:
         const FloatEnvironment floatEnvironment;
         if (traits().hasPixelOp ? finishThroughPixelOp(tile) : finishIntoPlace(tile))
             table_.setFinished(tile);
-        if (traits().reports)
-            addReport(tile);
+        addReport(tile);
         if (isLossy()) {
             const double bound = losses_.boundOf(tile, std::max(1, table_.samples(tile).count));
             const std::lock_guard<std::mutex> lock(reportsMutex_);
@@ -311,7 +310,7 @@ public:
 
     // The operation's reports on this rank's tiles, up to now.
     struct Reports {
-        std::vector<TileError> errors;
+        std::vector<Figure> errors; // by tile
         std::int64_t orderUndefinedPixels = 0;
         double wireErrorBound = 0;
     };
@@ -401,7 +400,7 @@ private:
             return;
         const std::lock_guard<std::mutex> lock(reportsMutex_);
         if (report.error >= 0)
-            reports_.errors.push_back({tile, report.error});
+            reports_.errors.push_back({static_cast<std::uint64_t>(tile), report.error});
         reports_.orderUndefinedPixels += report.orderUndefinedPixels;
     }
 

@@ -162,7 +162,7 @@ public:
             }
             slot.hasPixels = slot.hasPixels || !fragment.empty();
             slot.op->add(std::move(fragment));
-            const bool enough = traits().endsEarly && slot.op->isComplete();
+            const bool enough = slot.op->isComplete();
             const bool complete = tree.complete() && allComplete(slot);
             arrival.ready = becomesReady(slot, enough || complete);
             endedEarly_ += enough && !complete;

@@ -46,8 +46,6 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     fill(info.pass, where.pass);
     fill(info.generation, where.generation);
     fill(info.source, where.source);
-    if (!where.message.empty())
-        info.message += (info.message.empty() ? "" : ", ") + where.message;
     return info;
 }
 
@@ -366,15 +364,6 @@ public:
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         mergeErrors_.push_back({static_cast<std::uint64_t>(tile), bound});
-    }
-
-    // Of the tiles that this rank has finished: what their operation says.
-    static std::vector<Figure> of(const std::vector<TileError>& errors)
-    {
-        std::vector<Figure> figures;
-        for (const TileError& e : errors)
-            figures.push_back({static_cast<std::uint64_t>(e.tile), e.error});
-        return sums(std::move(figures));
     }
 
     void addTo(Verdict& verdict) const
