@@ -137,8 +137,7 @@ public:
         inputsSent_ = 0;
         bytesBefore_ = mailbox_->bytesSent();
         messagesBefore_ = mailbox_->messagesSent();
-        renderNs_ = 0;
-        isEnding_ = false;
+        renderNs_ = -1;
         figures_.newFrame();
         std::int64_t rendered = 0;
         std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
@@ -160,9 +159,7 @@ public:
     void setTile(const InputPixels& tile) override
     {
         const TraceSpan span(config_.trace.get(), TraceEvent::Kind::SetTile, tile.frame, tile.tile);
-        checkTile(tile, layout(), pipeline_->table().frameInfo(),
-                  [this](int index) { return pipeline_->table().samples(index).count; });
-        pipeline_->checkPlanes(tile);
+        pipeline_->check(tile);
         if (outcome_->failed() || isHidden(tile.tile, tile.generation))
             return;
         const int owner = ownerNow(tile.tile);
@@ -177,7 +174,7 @@ public:
         } else if (open_.enter(tile.frame)) {
             const OpenFrame::Inside inside(open_);
             if (isInPlace)
-                arrive([&](auto& where, auto& arrival) { pipeline_->arrive(tile, rank(), where, arrival); }, true);
+                arrive([&] { return pipeline_->inputOf(tile); }, rank(), true);
             else
                 arrive(encode(tile, owner), rank());
         }
@@ -273,9 +270,8 @@ public:
     // The end() of this rank, as far as it waits for nobody.
     void beginEnd()
     {
-        if (isEnding_)
+        if (renderNs_ >= 0)
             return;
-        isEnding_ = true;
         if (params_.declared && !declarations_.declared() && !outcome_->failed()) {
             const auto reason = open_.reason(); // why declare() was not called, in a frame that may be partial
             outcome_->failWhole(reason ? *reason
@@ -420,7 +416,7 @@ private:
             event.end = to;
             config_.trace->add(event);
         };
-        const auto rendered = isEnding_ ? beginTime_ + std::chrono::nanoseconds(renderNs_) : end;
+        const auto rendered = renderNs_ >= 0 ? beginTime_ + std::chrono::nanoseconds(renderNs_) : end;
         add(TraceEvent::Kind::Frame, beginTime_, end);
         add(TraceEvent::Kind::Render, beginTime_, rendered);
         add(TraceEvent::Kind::End, rendered, end);
@@ -453,22 +449,20 @@ private:
     {
         const std::size_t byteCount = message.size();
         const bool hasCredit = source != rank() && mailbox_->needsCredit(header.kind);
-        switch (open_.enter(source, header, message)) {
-        case OpenFrame::Entry::Kept: return;
-        case OpenFrame::Entry::Late:
+        const OpenFrame::Entry entry = open_.enter(source, header, message);
+        if (entry == OpenFrame::Entry::Kept)
+            return;
+        if (entry != OpenFrame::Entry::Inside) {
             if (hasCredit)
                 mailbox_->flow().discarded(byteCount);
+            if (entry == OpenFrame::Entry::Absurd) {
+                ErrorInfo info =
+                    errorInfo(ErrorKind::MalformedMessage, "a message of a frame that no rank can have begun");
+                info.expected = open_.next();
+                info.got = header.number;
+                undecodable(source, info);
+            }
             return;
-        case OpenFrame::Entry::Absurd: {
-            if (hasCredit)
-                mailbox_->flow().discarded(byteCount);
-            ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, "a message of a frame that no rank can have begun");
-            info.expected = open_.next();
-            info.got = header.number;
-            undecodable(source, info);
-            return;
-        }
-        case OpenFrame::Entry::Inside: break;
         }
         const OpenFrame::Inside inside(open_);
         if (hasCredit)
@@ -491,18 +485,17 @@ private:
         if (rank() != config_.image.displayRank)
             return;
         Connection& connection = mailbox_->connection();
-        std::vector<int> seers;
-        for (int other = 0; other < size(); ++other)
-            if (connection.isSeenBy(other))
-                seers.push_back(other);
-        if (seers.empty())
-            return;
-        const auto places =
-            pipeline_->gather().shareImage([&](const std::byte* block) { return connection.placeOf(block); });
-        if (!places)
-            return;
-        for (const int other : seers)
+        std::optional<ImagePlaces> places;
+        for (int other = 0; other < size(); ++other) {
+            if (!connection.isSeenBy(other))
+                continue;
+            if (!places)
+                places =
+                    pipeline_->gather().shareImage([&](const std::byte* block) { return connection.placeOf(block); });
+            if (!places)
+                return;
             mailbox_->sendBody(other, MessageKind::ImagePlace, open_.next(), *places);
+        }
     }
 
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
@@ -510,7 +503,7 @@ private:
     void undecodable(int source, const ErrorInfo& error) override
     {
         mailbox_->keepDamage(source, error); // first: begin() opens the gate and then looks
-        if (!open_.enterAny())
+        if (!open_.enter(open_.number()))
             return;
         const OpenFrame::Inside inside(open_); // until the end: the next begin() waits for it
         failForDamage();
@@ -613,28 +606,30 @@ private:
         const auto sharedBytes = [this, source](std::int64_t offset, std::int64_t byteCount) {
             return mailbox_->connection().bytesAt(source, offset, byteCount);
         };
-        arrive(
-            [&](ErrorInfo& where, TileTable::Arrival& arrival) {
-                pipeline_->arrive(std::move(message), source, sharedBytes, where, arrival);
-            },
-            saysInPlace(message), source == rank() ? -1 : source);
+        const bool isInPlace = saysInPlace(message);
+        arrive([&] { return pipeline_->inputOf(std::move(message), sharedBytes); }, source, isInPlace);
     }
 
-    // Takes an input by `take(where, arrival)`; `where` says which place is known. `source`: the rank whose message it
-    // is, or -1.
-    template <class Take>
-    void arrive(const Take& take, bool isInPlace, int source = -1)
+    // Takes the input that make() returns, of rank `source`.
+    template <class Make>
+    void arrive(const Make& make, int source, bool isInPlace)
     {
         if (!open_.beginReading(isInPlace))
             return;
+        const int sender = source == rank() ? -1 : source; // of the message
         ErrorInfo where;
         TileTable::Arrival arrival;
         {
             TraceSpan span(config_.trace.get(), TraceEvent::Kind::Input, open_.number());
-            outcome_->guarded([&] { take(where, arrival); }, where, source);
+            const auto take = [&] {
+                Fragment input = make();
+                TilePipeline::setPlace(where, input.header());
+                pipeline_->arrive(std::move(input), source, arrival);
+            };
+            outcome_->guarded(take, where, sender);
             if (TraceEvent* event = span.event()) {
                 event->tile = static_cast<std::int32_t>(where.tile);
-                event->peer = source;
+                event->peer = sender;
             }
         }
         if (arrival.spoilt) {
@@ -753,7 +748,7 @@ private:
         v.sums[Verdict::InputsLeft] = inputsSent_ - pipeline_->table().arrivedCount();
         v.sums[Verdict::TilesEndedEarly] = pipeline_->table().endedEarlyCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
-        v.maxima[Verdict::RenderNs] = renderNs_;
+        v.maxima[Verdict::RenderNs] = std::max<std::int64_t>(renderNs_, 0);
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
         v.maxima[Verdict::TotalNs] = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
         v.wireErrorBound = reports.wireErrorBound;
@@ -827,8 +822,7 @@ private:
     FrameFigures figures_;
     std::optional<Compression> compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
-    std::atomic<std::int64_t> renderNs_{0};
-    bool isEnding_ = false; // beginEnd() was called
+    std::atomic<std::int64_t> renderNs_{-1};  // until end() was called; -1: it was not
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()

@@ -221,15 +221,6 @@ public:
         return isOpen;
     }
 
-    // Enters whichever frame is open.
-    bool enterAny()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        const bool isOpen = state_ != FrameState::Closed;
-        inside_ += isOpen;
-        return isOpen;
-    }
-
     // Enters once more from inside, for work that goes on after the caller has left: close() waits for that, too, also
     // if it has begun to wait already.
     void enterAgain()

@@ -19,6 +19,7 @@
 #include <limits>
 #include <memory>
 #include <mutex>
+#include <string>
 #include <utility>
 #include <vector>
 
@@ -72,9 +73,7 @@ public:
     }
 
     TileTable& table() noexcept { return table_; }
-    const TileTable& table() const noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
-    const FinalGather& gather() const noexcept { return gather_; }
 
     // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `compresses`: whether
     // finished tiles are compressed. Throws the exceptions of user code: then all is ready but its data.
@@ -104,9 +103,32 @@ public:
 
     ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame
 
-    // Throws InvalidArgument if there is a colour but another channel that must travel is missing.
-    void checkPlanes(const InputPixels& tile) const
+    // Throws InvalidArgument for a tile that a renderer cannot have meant for this frame, and if it has a colour but
+    // not another channel that must travel.
+    void check(const InputPixels& tile) const
     {
+        const TileInfo& frame = table_.frameInfo();
+        const TileLayout& layout = table_.layout();
+        std::string wrong;
+        if (tile.frame != frame.frame)
+            wrong =
+                printed("a tile of frame %lld (prepare tiles with Frame::start)", static_cast<long long>(tile.frame));
+        else if (tile.tile < 0 || tile.tile >= layout.tileCount())
+            wrong = printed("outside the image, which has %d tiles", layout.tileCount());
+        else if (tile.region != layout.region(tile.tile))
+            wrong = "its region is not that of the tile";
+        else if (const int passes = table_.samples(tile.tile).count; tile.pass < 0 || tile.pass >= passes)
+            wrong = printed("the tile has %d passes", passes);
+        else if (tile.generation < 0 || tile.generation >= DependencyTracker::maxGenerations)
+            wrong = printed("the generation must be in [0, %d)", DependencyTracker::maxGenerations);
+        else if (tile.children < 0)
+            wrong = printed("it announces %d children", tile.children);
+        if (!wrong.empty()) {
+            ErrorInfo info = errorInfo(ErrorKind::InvalidArgument, std::move(wrong), frame.rank);
+            info.frame = frame.frame;
+            setPlace(info, tile);
+            throw InvalidArgument(std::move(info));
+        }
         const ConstPlanes& planes = tile.planes();
         if (!planes.at[Color])
             return;
@@ -115,6 +137,15 @@ public:
         for (std::size_t c = 0; c < channelCount; ++c)
             if (!planes.at[c] && hasChannel(sent_, c))
                 failArgument("a view of tile %d without its %s, which is needed", tile.tile, channelNames[c]);
+    }
+
+    // Makes an error name the place of an input.
+    static void setPlace(ErrorInfo& info, const TileHeader& input)
+    {
+        info.tile = input.tile;
+        info.pass = input.pass;
+        info.generation = input.generation;
+        info.source = input.source;
     }
 
     // Whether inputs of a tile are hidden by an opaque one.
@@ -170,8 +201,8 @@ public:
         return encodeInPlace(*pool_, tile, inPlace(tile), sent_ | colorChannel, address_, offsetOf);
     }
 
-    // Takes such an input of this rank's own. As the next arrive().
-    void arrive(const InputPixels& tile, int rank, ErrorInfo& where, TileTable::Arrival& arrival)
+    // Returns such an input of this rank's own.
+    Fragment inputOf(const InputPixels& tile)
     {
         Fragment::Parts parts;
         parts.encoding = FragmentEncoding::InPlace;
@@ -179,7 +210,7 @@ public:
         parts.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
         parts.inPlace = inPlace(tile);
         parts.faults = &faults_;
-        arrive(Fragment(tile, Buffer(), parts), rank, where, arrival);
+        return Fragment(tile, Buffer(), parts);
     }
 
     // Remembers the pixels of a tile that are to stay as they are. From several threads.
@@ -199,25 +230,18 @@ public:
         return -1;
     }
 
-    // Takes an input of rank `from`. `where` gets the tile as soon as it is known. See TileTable::arrive() for the
-    // rest.
-    void arrive(Buffer&& message, int from, const SharedBytes& sharedBytes, ErrorInfo& where,
-                TileTable::Arrival& arrival)
+    // Returns the input that a message has. Throws Error (MalformedMessage).
+    Fragment inputOf(Buffer&& message, const SharedBytes& sharedBytes)
     {
-        arrive(decodeFragment(
-                   *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
-                   config_.messages.codec.get(), coder_, sharedBytes, &faults_),
-               from, where, arrival);
+        return decodeFragment(
+            *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
+            config_.messages.codec.get(), coder_, sharedBytes, &faults_);
     }
-    void arrive(Fragment&& fragment, int from, ErrorInfo& where, TileTable::Arrival& arrival)
+
+    // Takes an input of rank `from`. See TileTable::arrive().
+    void arrive(Fragment&& fragment, int from, TileTable::Arrival& arrival)
     {
-        const TileHeader& h = fragment.header();
-        const int tile = h.tile;
-        where.tile = tile;
-        where.pass = h.pass;
-        where.generation = h.generation;
-        where.source = h.source;
-        if (!table_.isMine(tile))
+        if (!table_.isMine(fragment.header().tile))
             failMalformed("an input for a tile of another owner");
         if (const auto mine = static_cast<ChannelMask>(sent_ | colorChannel); fragment.channels() != mine)
             failMalformed("an input with other channels than this rank's", mine, fragment.channels());

@@ -27,37 +27,6 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Throws InvalidArgument for a tile that a renderer cannot have meant for this frame.
-// `passesOf(tile)`: how many passes that tile has.
-template <class PassesOf>
-void checkTile(const TileHeader& tile, const TileLayout& layout, const TileInfo& frame, const PassesOf& passesOf)
-{
-    std::string wrong;
-    if (tile.frame != frame.frame)
-        wrong = printed("a tile of frame %lld (prepare tiles with Frame::start)", static_cast<long long>(tile.frame));
-    else if (tile.tile < 0 || tile.tile >= layout.tileCount())
-        wrong = printed("outside the image, which has %d tiles", layout.tileCount());
-    else if (tile.region != layout.region(tile.tile))
-        wrong = "its region is not that of the tile";
-    else if (tile.pass < 0 || tile.pass >= passesOf(tile.tile))
-        wrong = printed("the tile has %d passes", passesOf(tile.tile));
-    else if (tile.generation < 0 || tile.generation >= DependencyTracker::maxGenerations)
-        wrong = printed("the generation must be in [0, %d)", DependencyTracker::maxGenerations);
-    else if (tile.children < 0)
-        wrong = printed("it announces %d children", tile.children);
-    else
-        return;
-    ErrorInfo info;
-    info.rank = frame.rank;
-    info.frame = frame.frame;
-    info.tile = tile.tile;
-    info.pass = tile.pass;
-    info.generation = tile.generation;
-    info.source = tile.source;
-    info.message = std::move(wrong);
-    throw InvalidArgument(std::move(info));
-}
-
 // arrive() and declare() may be called from any thread, for one frame at a time.
 class TileTable {
 public:
