@@ -165,13 +165,14 @@ inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept
     return static_cast<std::uint8_t>(level);
 }
 
-#if defined(__SSE2__)
-// Of as many as there are whole eights, which it returns; the rest is for toUnorm8(). Compilers do not vectorize
-// comparisons that could trap.
-inline int toUnorm8Sse2(const double* values, int count, std::uint8_t* out, double& farthest) noexcept
+// toUnorm8() of `count` values. Returns how far the farthest of 255 * value was from an integer, up to 1/2, which is a
+// tie.
+inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexcept
 {
-    const double shift = 4503599627370496.0;
+    const double shift = 4503599627370496.0; // as above
+    double farthest = 0;
     int i = 0;
+#if defined(__SSE2__) // compilers do not vectorize comparisons that could trap
     const __m128d zero = _mm_setzero_pd(), one = _mm_set1_pd(1.0), scale = _mm_set1_pd(255.0);
     const __m128d shifts = _mm_set1_pd(shift), noSign = _mm_castsi128_pd(_mm_set1_epi64x(0x7fffffffffffffff));
     __m128d distance = zero;
@@ -190,48 +191,6 @@ inline int toUnorm8Sse2(const double* values, int count, std::uint8_t* out, doub
         _mm_storel_epi64(reinterpret_cast<__m128i*>(out + i), _mm_packus_epi16(words, words));
     }
     farthest = std::max(_mm_cvtsd_f64(distance), _mm_cvtsd_f64(_mm_unpackhi_pd(distance, distance)));
-    return i;
-}
-
-// toUnorm8Sse2() four at a time.
-DFB_AVX2 inline int toUnorm8Avx2(const double* values, int count, std::uint8_t* out, double& farthest) noexcept
-{
-#if defined(DFB_HAS_AVX2_CLONES)
-    const __m256d zero = _mm256_setzero_pd(), one = _mm256_set1_pd(1.0), scale = _mm256_set1_pd(255.0);
-    const __m256d shifts = _mm256_set1_pd(4503599627370496.0);
-    const __m256d noSign = _mm256_castsi256_pd(_mm256_set1_epi64x(0x7fffffffffffffff));
-    __m256d distance = zero;
-    int i = 0;
-    for (; i + 8 <= count; i += 8) {
-        __m128i fours[2];
-        for (int half = 0; half < 2; ++half) {
-            const __m256d value = _mm256_loadu_pd(values + i + 4 * half);
-            const __m256d scaled = _mm256_mul_pd(_mm256_min_pd(_mm256_max_pd(value, zero), one), scale);
-            const __m256d rounded = _mm256_sub_pd(_mm256_add_pd(scaled, shifts), shifts);
-            distance = _mm256_max_pd(distance, _mm256_and_pd(_mm256_sub_pd(scaled, rounded), noSign));
-            fours[half] = _mm256_cvttpd_epi32(rounded);
-        }
-        const __m128i words = _mm_packs_epi32(fours[0], fours[1]);
-        _mm_storel_epi64(reinterpret_cast<__m128i*>(out + i), _mm_packus_epi16(words, words));
-    }
-    const __m128d two = _mm_max_pd(_mm256_castpd256_pd128(distance), _mm256_extractf128_pd(distance, 1));
-    farthest = std::max(_mm_cvtsd_f64(two), _mm_cvtsd_f64(_mm_unpackhi_pd(two, two)));
-    return i;
-#else
-    return toUnorm8Sse2(values, count, out, farthest);
-#endif
-}
-#endif
-
-// toUnorm8() of `count` values. Returns how far the farthest of 255 * value was from an integer, up to 1/2, which is a
-// tie.
-inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexcept
-{
-    const double shift = 4503599627370496.0; // as above
-    double farthest = 0;
-    int i = 0;
-#if defined(__SSE2__)
-    i = cpuHasAvx2() ? toUnorm8Avx2(values, count, out, farthest) : toUnorm8Sse2(values, count, out, farthest);
 #endif
     for (; i < count; ++i) {
         out[i] = toUnorm8(values[i]);
