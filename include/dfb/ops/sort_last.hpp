@@ -12,7 +12,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <limits>
-#include <tuple>
 #include <utility>
 #include <vector>
 
@@ -153,7 +152,7 @@ public:
 
 private:
     struct Scratch {
-        std::vector<const Fragment*> pointers;
+        std::vector<const Fragment*> pointers; // in the order of blending, pass by pass
         std::vector<FragmentCompositor> compositors;
         CompositeRow row;
         std::vector<std::uint8_t> isUndefined;
@@ -164,7 +163,6 @@ private:
     struct Exact {
         std::vector<DoubleDouble> mean;
         CompositeRow row;
-        std::vector<const Fragment*> pointers;
         FragmentCompositor compositor;
     };
 
@@ -185,6 +183,18 @@ private:
     const std::vector<DoubleDouble>& exactRow(int y);
     // All fragments, in the order of blending.
     void sort(std::vector<const Fragment*>& pointers) const;
+    // Calls f(pass, begin, end) for each pass, with its fragments.
+    template <class F>
+    void forEachPass(const std::vector<const Fragment*>& sorted, const F& f) const
+    {
+        auto next = sorted.begin();
+        for (int pass = 0; pass < info_.passes; ++pass) {
+            const auto first = next;
+            while (next != sorted.end() && (*next)->header().pass == pass)
+                ++next;
+            f(static_cast<std::size_t>(pass), first, next);
+        }
+    }
 
     BlendRule rule() const noexcept { return info_.order ? BlendRule::InOrder : rule_; }
 
@@ -380,15 +390,15 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
     pointers.clear();
     for (const Fragment& fragment : fragments_)
         pointers.push_back(&fragment);
-    std::sort(pointers.begin(), pointers.end(), [this](const Fragment* a, const Fragment* b) {
-        const TileHeader &x = a->header(), &y = b->header();
-        if (const SourceOrder* order = info_.order)
-            return std::make_tuple(x.pass, order->placeOf(x.source), x.part, x.generation)
-                   < std::make_tuple(y.pass, order->placeOf(y.source), y.part, y.generation);
+    const auto keyOf = [this](const TileHeader& h) -> std::array<std::int64_t, 4> {
+        if (info_.order)
+            return {h.pass, info_.order->placeOf(h.source), h.part, h.generation};
         if (rule_ == BlendRule::InOrder)
-            return std::tie(x.pass, x.generation, x.source) < std::tie(y.pass, y.generation, y.source);
-        return std::tie(x.pass, x.source, x.part, x.generation) < std::tie(y.pass, y.source, y.part, y.generation);
-    });
+            return {h.pass, h.generation, h.source, 0};
+        return {h.pass, h.source, h.part, h.generation};
+    };
+    std::sort(pointers.begin(), pointers.end(),
+              [&](const Fragment* a, const Fragment* b) { return keyOf(a->header()) < keyOf(b->header()); });
 }
 
 // Brings a compositor for each pass to the first row of its fragments.
@@ -396,20 +406,39 @@ DFB_COMPILED_ONCE FragmentStore::Scratch& FragmentStore::start()
 {
     auto& scratch = FragmentStore::scratch<Scratch>();
     sort(scratch.pointers);
-    const std::size_t passes = static_cast<std::size_t>(info_.passes);
-    scratch.compositors.resize(std::max(scratch.compositors.size(), passes));
-    auto next = scratch.pointers.begin();
-    for (std::size_t pass = 0; pass < passes; ++pass) {
-        const auto first = next;
-        while (next != scratch.pointers.end() && static_cast<std::size_t>((*next)->header().pass) == pass)
-            ++next;
-        scratch.compositors[pass].start(rule(), first, next);
-    }
+    scratch.compositors.resize(std::max(scratch.compositors.size(), static_cast<std::size_t>(info_.passes)));
+    forEachPass(scratch.pointers,
+                [&](std::size_t pass, auto begin, auto end) { scratch.compositors[pass].start(rule(), begin, end); });
     scratch.row.wantsDepth = (info_.wanted & depthChannel) != 0;
     scratch.row.wantsGaps = scratch.row.wantsSingles = true;
     scratch.row.minTransmittance = static_cast<double>(info_.minTransmittance);
     scratch.row.resize(info_.region.width(), tracked_);
     return scratch;
+}
+
+// A pixel of the background as the image stores it.
+inline std::array<std::byte, 16> storedBackground(const FinishedTile& out, const std::array<float, 4>& background)
+{
+    std::array<std::byte, 16> stored{};
+    convertPixels(background.data(), 1, out.format(), stored.data());
+    return stored;
+}
+
+// Calls f(x, count) for each run of pixels of row y that bitsOf(x, count) has, of up to 64, and fills in the
+// background between them.
+template <class BitsOf, class F>
+void forEachRunOfRow(FinishedTile& out, int y, const std::array<std::byte, 16>& background, const BitsOf& bitsOf,
+                     const F& f)
+{
+    int end = 0;
+    for (int x0 = 0; x0 < out.width(); x0 += 64)
+        forEachRun(bitsOf(x0, std::min(64, out.width() - x0)), [&](int at, int count) {
+            const int x = x0 + at;
+            out.fillPixels(end, y, x - end, background.data());
+            end = x + count;
+            f(x, count);
+        });
+    out.fillPixels(end, y, out.width() - end, background.data());
 }
 
 // One pass, and no more than colour and depth: pixels without an input are not composited.
@@ -419,9 +448,7 @@ DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
     CompositeRow& row = scratch.row;
     row.wantsGaps = false;
     row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are the output
-    std::array<std::byte, 16> background;
-    if (out.format() != OutputFormat::None)
-        convertPixels(info_.background.data(), 1, out.format(), background.data());
+    const auto background = storedBackground(out, info_.background);
     for (int y = 0; y < out.height(); ++y) {
         scratch.compositors.front().nextRow(row);
         int x = 0;
@@ -458,35 +485,27 @@ DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
     Scratch& scratch = start();
     CompositeRow& row = scratch.row;
     const bool isBlack = info_.background == std::array<float, 4>{};
-    std::array<std::byte, 16> background;
-    if (out.format() != OutputFormat::None)
-        convertPixels(info_.background.data(), 1, out.format(), background.data());
+    const auto background = storedBackground(out, info_.background);
     for (int y = 0; y < out.height(); ++y) {
         scratch.compositors.front().nextRow(scratch.nearest, out.width());
         const float* depth = scratch.nearest.depth.data();
-        int end = 0;
         double farthest = 0;
-        for (int x0 = 0; x0 < out.width(); x0 += 64) {
-            const int some = std::min(64, out.width() - x0);
-            forEachRun(
-                depthBits(depth + x0, some, std::numeric_limits<float>::infinity()).active, [&](int at, int count) {
-                    const int x = x0 + at;
-                    const std::byte* bytes = scratch.nearest.bytes.data() + 4 * x;
-                    out.fillPixels(end, y, x - end, background.data());
-                    end = x + count;
-                    if (out.format() == OutputFormat::RGBA8 && (isBlack || areOpaque(bytes, count))) {
-                        out.setStored(x, y, count, bytes, depth + x);
-                        return;
-                    }
-                    float rgba[4 * 64];
-                    bytesToFloats(bytes, static_cast<std::size_t>(count), rgba);
-                    row.clear(x, count);
-                    over(row, x, count, Layer{rgba, nullptr, nullptr});
-                    overBackground(row, x, count, info_.background.data());
-                    farthest = std::max(farthest, out.setPixels(x, y, count, row.rgba.data() + 4 * x, depth + x));
-                });
-        }
-        out.fillPixels(end, y, out.width() - end, background.data());
+        const auto bitsOf = [&](int x, int count) {
+            return depthBits(depth + x, count, std::numeric_limits<float>::infinity()).active;
+        };
+        forEachRunOfRow(out, y, background, bitsOf, [&](int x, int count) {
+            const std::byte* bytes = scratch.nearest.bytes.data() + 4 * x;
+            if (out.format() == OutputFormat::RGBA8 && (isBlack || areOpaque(bytes, count))) {
+                out.setStored(x, y, count, bytes, depth + x);
+                return;
+            }
+            float rgba[4 * 64];
+            bytesToFloats(bytes, static_cast<std::size_t>(count), rgba);
+            row.clear(x, count);
+            over(row, x, count, Layer{rgba, nullptr, nullptr});
+            overBackground(row, x, count, info_.background.data());
+            farthest = std::max(farthest, out.setPixels(x, y, count, row.rgba.data() + 4 * x, depth + x));
+        });
         roundExactly(out, y, farthest);
     }
     fragments_.clear();
@@ -504,22 +523,14 @@ DFB_COMPILED_ONCE bool FragmentStore::hasExactLevels(OutputFormat format) const
 DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
 {
     Scratch& scratch = start();
-    const std::array<std::byte, 4> background{};
+    const auto background = storedBackground(out, info_.background);
     for (int y = 0; y < out.height(); ++y) {
         scratch.levels.assign(4 * static_cast<std::size_t>(out.width()), 0);
         scratch.compositors.front().nextRow(scratch.levels.data());
         const auto* levels = reinterpret_cast<const std::byte*>(scratch.levels.data());
-        int end = 0;
-        for (int x0 = 0; x0 < out.width(); x0 += 64) {
-            const int some = std::min(64, out.width() - x0);
-            forEachRun(activeByteBits(levels + 4 * x0, some), [&](int at, int count) {
-                const int x = x0 + at;
-                out.fillPixels(end, y, x - end, background.data());
-                out.setStored(x, y, count, levels + 4 * x, nullptr);
-                end = x + count;
-            });
-        }
-        out.fillPixels(end, y, out.width() - end, background.data());
+        forEachRunOfRow(
+            out, y, background, [&](int x, int count) { return activeByteBits(levels + 4 * x, count); },
+            [&](int x, int count) { out.setStored(x, y, count, levels + 4 * x, nullptr); });
     }
     fragments_.clear();
 }
@@ -539,27 +550,24 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     }
 }
 
-// Row y in twice the precision, the mean of the passes. Holds until the thread's next call.
+// Row y in twice the precision, the mean of the passes. After start(). Holds until the thread's next call.
 DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
 {
     const int width = info_.region.width();
-    auto& [mean, row, pointers, compositor] = scratch<Exact>();
+    Exact& exact = scratch<Exact>();
+    CompositeRow& row = exact.row;
+    std::vector<DoubleDouble>& mean = exact.mean;
     mean.assign(4 * static_cast<std::size_t>(width), {});
     row.minTransmittance = static_cast<double>(info_.minTransmittance);
-    sort(pointers);
-    auto next = pointers.begin();
-    for (int pass = 0; pass < info_.passes; ++pass) {
-        const auto first = next;
-        while (next != pointers.end() && (*next)->header().pass == pass)
-            ++next;
-        compositor.start(rule(), first, next, false);
-        compositor.skipRows(y);
+    forEachPass(scratch<Scratch>().pointers, [&](std::size_t, auto begin, auto end) {
+        exact.compositor.start(rule(), begin, end, false);
+        exact.compositor.skipRows(y);
         row.resize(width, 0, true);
-        compositor.nextRow(row);
+        exact.compositor.nextRow(row);
         overBackground(row, 0, width, info_.background.data());
         for (std::size_t i = 0; i < mean.size(); ++i)
             mean[i] = mean[i] + DoubleDouble{row.rgba[i], row.rgbaLow[i]};
-    }
+    });
     for (DoubleDouble& value : mean)
         value = value / info_.passes;
     return mean;
