@@ -192,16 +192,9 @@ public:
     }
     std::int64_t writtenPixels() const noexcept { return writtenPixels_; }
 
-    // The stored colour of row y, after setRow(); null if colour is not wanted.
-    const std::byte* colorRow(int y) const noexcept { return rowOf(detail::Color, bytesPerPixel(format_), y); }
-    // The stored depth and auxiliary channels of row y, after setRow(); null where not wanted.
-    const float* depthRow(int y) const noexcept { return detail::floatsOf(rowOf(detail::Depth, y)); }
-    AuxRow auxRow(int y) const noexcept
-    {
-        return {detail::floatsOf(rowOf(detail::Normal, y)), detail::floatsOf(rowOf(detail::Albedo, y)),
-                detail::floatsOf(rowOf(detail::Position, y)), detail::idsOf(rowOf(detail::PrimitiveId, y)),
-                detail::idsOf(rowOf(detail::InstanceId, y))};
-    }
+    // The stored rows, after setRow(); null where a channel is not wanted.
+    const detail::Planes& planes() const noexcept { return to_; }
+    std::size_t stride() const noexcept { return stride_; } // from a row to the next, in pixels
 
     // Replaces value i in [0, 4 * width()) of row y by another 8-bit level, after setRow().
     void setLevel(int y, int i, std::uint8_t level)
@@ -216,16 +209,6 @@ private:
     {
         const int stored = isPastCache_ ? detail::streamPixels(rgba, count, detail::floatsOf(color)) : 0;
         return convertPixels(rgba + 4 * stored, count - stored, format_, color + 16 * stored);
-    }
-
-    const std::byte* rowOf(std::size_t channel, std::size_t pixelBytes, int y) const noexcept
-    {
-        const std::byte* first = to_.at[channel];
-        return first ? first + static_cast<std::size_t>(y) * stride_ * pixelBytes : nullptr;
-    }
-    const std::byte* rowOf(std::size_t channel, int y) const noexcept
-    {
-        return rowOf(channel, 4 * static_cast<std::size_t>(detail::channelWords[channel]), y);
     }
 
     std::size_t pixelAt(int x, int y) const

@@ -67,23 +67,33 @@ inline bool isOpaque(const double* transmittance, int count)
     return std::all_of(transmittance, transmittance + count, [](double t) { return t == 0.0; });
 }
 
-// Composites the layers under `count` pixels from `pixel` on, which are a block. False if nothing behind them can be
-// seen; so below.
-template <bool HasLeast>
-inline bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel, int count, const BlendGroup& group)
+// Composites layers under `count` pixels, which are a block; colorOf(k, p): of the k-th layer at pixel p. False if
+// nothing behind them can be seen; so below.
+template <bool HasLeast, class ColorOf>
+bool blendBlock(double* rgba, double* transmittance, int count, bool isFirst, int layers, double minTransmittance,
+                const ColorOf& colorOf)
 {
-    if (group.isFirst) {
+    if (isFirst) {
         std::fill_n(rgba, 4 * count, 0.0);
         std::fill_n(transmittance, count, 1.0);
     }
-    for (int k = 0; k < group.layers && !isOpaque(transmittance, count);) {
-        const int end = nextLook(k, group.layers);
+    for (int k = 0; k < layers && !isOpaque(transmittance, count);) {
+        const int end = nextLook(k, layers);
         for (int p = 0; p < count; ++p)
-            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], group.minTransmittance, k, end,
-                                 [&](int layer) { return group.colors[layer] + 4 * (pixel + p); });
+            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], minTransmittance, k, end,
+                                 [&](int layer) { return colorOf(layer, p); });
         k = end;
     }
     return !isOpaque(transmittance, count);
+}
+
+// Does so with a group's pixels from `pixel` on. `rgba` and `transmittance` are of the group's first pixel.
+template <bool HasLeast>
+bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel, int count, const BlendGroup& group)
+{
+    return blendBlock<HasLeast>(rgba + 4 * pixel, transmittance + pixel, count, group.isFirst, group.layers,
+                                group.minTransmittance,
+                                [&](int k, int p) { return group.colors[k] + 4 * (pixel + p); });
 }
 
 template <bool HasLeast>
@@ -92,9 +102,9 @@ inline bool blendGroupPlain(double* rgba, double* transmittance, int count, cons
     bool isSeen = false;
     const std::ptrdiff_t inBlocks = count - count % 4;
     for (std::ptrdiff_t i = 0; i < inBlocks; i += 4)
-        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 4, group);
+        isSeen |= blendBlock<HasLeast>(rgba, transmittance, i, 4, group);
     for (std::ptrdiff_t i = inBlocks; i < count; ++i)
-        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 1, group);
+        isSeen |= blendBlock<HasLeast>(rgba, transmittance, i, 1, group);
     return isSeen;
 }
 
@@ -104,15 +114,8 @@ template <bool HasLeast>
 void blendFourPlain(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
                     int layers, double minTransmittance)
 {
-    std::fill_n(rgba, 16, 0.0);
-    std::fill_n(transmittance, 4, 1.0);
-    for (int k = 0; k < layers && !isOpaque(transmittance, 4);) {
-        const int end = nextLook(k, layers);
-        for (int p = 0; p < 4; ++p)
-            blendPixel<HasLeast>(rgba + 4 * p, transmittance[p], minTransmittance, k, end,
-                                 [&](int place) { return colors[orders[place][p]] + 4 * p; });
-        k = end;
-    }
+    blendBlock<HasLeast>(rgba, transmittance, 4, true, layers, minTransmittance,
+                         [&](int k, int p) { return colors[orders[k][p]] + 4 * p; });
 }
 
 // One colour under all pixels, and nothing behind it any more.
@@ -134,9 +137,9 @@ inline void takeNearestPlain(float* nearest, int count, const float* color, cons
 
 // `levels` and a layer under them, both 8 bits a channel, become the nearest levels of what is seen, up to 255. That is
 // exact if `levels` are those of one layer, or of none: another layer behind would need the fractions.
-inline void blendLevelsPlain(std::uint8_t* levels, int begin, int end, const std::uint8_t* layer)
+inline void blendLevelsPlain(std::uint8_t* levels, int count, const std::uint8_t* layer)
 {
-    for (int i = 4 * begin; i < 4 * end; i += 4) {
+    for (int i = 0; i < 4 * count; i += 4) {
         const int through = 255 - levels[i + 3];
         for (int c = i; c < i + 4; ++c) {
             const int product = through * layer[c] + 128;
@@ -292,7 +295,7 @@ DFB_AVX2 bool blendGroupAvx2(double* rgba, double* transmittance, int count, con
         isSeen |= !block.isOpaque();
     }
     for (std::ptrdiff_t i = inBlocks; i < count; ++i)
-        isSeen |= blendBlock<HasLeast>(rgba + 4 * i, transmittance + i, i, 1, group);
+        isSeen |= blendBlock<HasLeast>(rgba, transmittance, i, 1, group);
     return isSeen;
 }
 
@@ -334,7 +337,7 @@ DFB_AVX2 inline void blendLevelsAvx2(std::uint8_t* levels, int count, const std:
         }
         _mm256_storeu_si256(to, _mm256_adds_epu8(front, _mm256_packus_epi16(seen[0], seen[1])));
     }
-    blendLevelsPlain(levels, i, count, layer);
+    blendLevelsPlain(levels + 4 * i, count - i, layer + 4 * i);
 }
 
 #endif
@@ -376,13 +379,7 @@ inline void takeNearest(float* nearest, int count, const float* color, const flo
 
 inline void blendLevels(std::uint8_t* levels, int count, const std::uint8_t* layer)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2()) {
-        blendLevelsAvx2(levels, count, layer);
-        return;
-    }
-#endif
-    blendLevelsPlain(levels, 0, count, layer);
+    DFB_FASTEST(blendLevelsPlain, blendLevelsAvx2, levels, count, layer);
 }
 
 } // namespace detail

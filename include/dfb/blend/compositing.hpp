@@ -366,49 +366,37 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
     detail::blend(row, x, 0, count, layers, order);
 }
 
-namespace detail {
-
-// Sorts and blends, beginning with layers in `order`: the better that is, the sooner it is done. All have a depth.
-inline void sortAndBlendFrom(CompositeRow& row, int x, int count, const std::vector<Layer>& layers,
-                             std::vector<int>& order)
-{
-    const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(SortNetwork::mostLayers)
-                         && !layers.front().aux && row.rgbaLow.empty();
-    // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
-    for (int begin = 0; begin < count;) {
-        int end = firstOutOfOrder(layers, order, begin, count);
-        if (inFours && end < count && end < begin + 4) {
-            begin = std::min(begin, count - 4);
-            sortAndBlendFour(row, x, begin, layers, order);
-            begin += 4;
-            continue;
-        }
-        if (end == begin) {
-            sortAt(begin, layers, order);
-            end = firstOutOfOrder(layers, order, begin + 1, count);
-        }
-        blend(row, x, begin, end, layers, order);
-        begin = end;
-    }
-}
-
-} // namespace detail
-
 // Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to
 // back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
-// without depth makes all depths count as equal. `order` is scratch space; with `orderIsKept`, which is quicker, it
-// holds the order that the last call left.
-inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order,
-                         bool orderIsKept = false)
+// without depth makes all depths count as equal. `order` is scratch space, empty or as the last call left it: it begins
+// with that order, and the better that is, the sooner it is done.
+inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     if (layers.size() == 1
         || std::any_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth == nullptr; })) {
         blendInOrder(row, x, count, layers, order);
         return;
     }
-    if (!orderIsKept || order.size() != layers.size())
+    if (order.size() != layers.size())
         detail::resetOrder(order, layers.size());
-    detail::sortAndBlendFrom(row, x, count, layers, order);
+    const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(detail::SortNetwork::mostLayers)
+                         && !layers.front().aux && row.rgbaLow.empty();
+    // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
+    for (int begin = 0; begin < count;) {
+        int end = detail::firstOutOfOrder(layers, order, begin, count);
+        if (inFours && end < count && end < begin + 4) {
+            begin = std::min(begin, count - 4);
+            detail::sortAndBlendFour(row, x, begin, layers, order);
+            begin += 4;
+            continue;
+        }
+        if (end == begin) {
+            detail::sortAt(begin, layers, order);
+            end = detail::firstOutOfOrder(layers, order, begin + 1, count);
+        }
+        detail::blend(row, x, begin, end, layers, order);
+        begin = end;
+    }
 }
 
 namespace detail {

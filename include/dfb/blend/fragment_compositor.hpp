@@ -82,38 +82,20 @@ public:
     void nextRow(detail::NearestBytes& row, int width)
     {
         row.reset(width);
-        ByteRow r;
-        for (FragmentCursor& cursor : cursors_) {
-            if (!cursor.nextBytes(r))
-                continue;
-            detail::ByteLayer layer{r.bytes, r.depth, r.depthLimit};
-            std::uint64_t nan = 0;
-            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
-                nan += detail::keepNearestBytes(row.depth.data() + span->x, row.bytes.data() + 4 * span->x, span->count,
-                                                layer);
-                layer.bytes += 4 * static_cast<std::ptrdiff_t>(span->count);
-                layer.depth += span->count;
-            }
-            cursor.countNanDepths(nan);
-            cursor.advance(r);
-        }
+        forEachByteSpan([&](const Span& span, const detail::ByteLayer& layer) {
+            return detail::keepNearestBytes(row.depth.data() + span.x, row.bytes.data() + 4 * span.x, span.count,
+                                            layer);
+        });
     }
 
     // Blends the next row of all fragments, of which there are two at most, and which keep their bytes, into `levels`,
     // which are 0.
     void nextRow(std::uint8_t* levels)
     {
-        ByteRow r;
-        for (FragmentCursor& cursor : cursors_) {
-            if (!cursor.nextBytes(r))
-                continue;
-            const auto* layer = reinterpret_cast<const std::uint8_t*>(r.bytes);
-            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
-                detail::blendLevels(levels + 4 * span->x, span->count, layer);
-                layer += 4 * static_cast<std::ptrdiff_t>(span->count);
-            }
-            cursor.advance(r);
-        }
+        forEachByteSpan([&](const Span& span, const detail::ByteLayer& layer) {
+            detail::blendLevels(levels + 4 * span.x, span.count, reinterpret_cast<const std::uint8_t*>(layer.bytes));
+            return std::uint64_t{0};
+        });
     }
 
     // Where there is anything in a row.
@@ -134,6 +116,27 @@ private:
         while (rowPixels_.size() <= cursor)
             rowPixels_.push_back(std::make_unique<detail::RowPixels>());
         return rowPixels_[cursor].get();
+    }
+
+    // Calls f(span, layer) for each span of the next row of all fragments, which keep their bytes; it returns how many
+    // depths are NaN.
+    template <class F>
+    void forEachByteSpan(const F& f)
+    {
+        ByteRow r;
+        for (FragmentCursor& cursor : cursors_) {
+            if (!cursor.nextBytes(r))
+                continue;
+            detail::ByteLayer layer{r.bytes, r.depth, r.depthLimit};
+            std::uint64_t nan = 0;
+            for (const Span* span = r.spans; span != r.spans + r.spanCount; ++span) {
+                nan += f(*span, layer);
+                layer.bytes += 4 * static_cast<std::ptrdiff_t>(span->count);
+                layer.depth += layer.depth ? span->count : 0;
+            }
+            cursor.countNanDepths(nan);
+            cursor.advance(r);
+        }
     }
 
     static void clearGap(CompositeRow& row, int begin, int end, bool isBetweenRuns = false)
@@ -307,7 +310,7 @@ private:
     void composite(CompositeRow& row, int x, int count)
     {
         switch (rule_) {
-        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_, true); break;
+        case BlendRule::SortByDepth: sortAndBlend(row, x, count, layers_, order_); break;
         case BlendRule::InOrder: blendInOrder(row, x, count, layers_, order_); break;
         case BlendRule::Nearest: keepNearest(row, x, count, layers_); break;
         }

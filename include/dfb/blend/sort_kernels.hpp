@@ -234,12 +234,12 @@ struct ByteLayer {
     float depthLimit; // at this depth or beyond a pixel is empty
 };
 
-// Takes pixels [begin, end) of a layer where they are nearer, as they are; a depth of -0 becomes 0. `depth` and `bytes`
-// are of the nearest so far. Returns how many depths are NaN: these pixels are empty.
-inline std::uint64_t keepBytesPlain(float* depth, std::byte* bytes, int begin, int end, const ByteLayer& layer)
+// Takes pixels of a layer where they are nearer, as they are; a depth of -0 becomes 0. `depth` and `bytes` are of the
+// nearest so far. Returns how many depths are NaN: these pixels are empty.
+inline std::uint64_t keepBytesPlain(float* depth, std::byte* bytes, int count, const ByteLayer& layer)
 {
     std::uint64_t nan = 0;
-    for (int i = begin; i < end; ++i) {
+    for (int i = 0; i < count; ++i) {
         const float its = layer.depth[i];
         nan += its != its;
         if (its < depth[i] && its < layer.depthLimit) {
@@ -267,17 +267,14 @@ DFB_AVX2 inline std::uint64_t keepBytesAvx2(float* depth, std::byte* bytes, int 
         for (int bits = _mm256_movemask_ps(_mm256_cmp_ps(its, its, _CMP_UNORD_Q)); bits != 0; bits &= bits - 1)
             ++nan;
     }
-    return nan + keepBytesPlain(depth, bytes, i, count, layer);
+    const ByteLayer rest{layer.bytes + 4 * i, layer.depth + i, layer.depthLimit};
+    return nan + keepBytesPlain(depth + i, bytes + 4 * i, count - i, rest);
 }
 #endif
 
 inline std::uint64_t keepNearestBytes(float* depth, std::byte* bytes, int count, const ByteLayer& layer)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return keepBytesAvx2(depth, bytes, count, layer);
-#endif
-    return keepBytesPlain(depth, bytes, 0, count, layer);
+    return DFB_FASTEST(keepBytesPlain, keepBytesAvx2, depth, bytes, count, layer);
 }
 
 } // namespace detail

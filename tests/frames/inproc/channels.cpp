@@ -161,10 +161,10 @@ struct Damaged : Blend {
         Blend::finish(out);
         const auto width = static_cast<std::size_t>(out.width());
         const auto copyOf = [](const auto* from, std::size_t count) { return std::vector(from, from + count); };
-        const auto rgba = reinterpret_cast<const float*>(out.colorRow(0));
+        const auto rgba = reinterpret_cast<const float*>(dfb::testing::rowOf(out, dfb::detail::Color, 0));
         const std::vector<double> color(rgba, rgba + 4 * width);
-        auto depth = copyOf(out.depthRow(0), width);
-        const dfb::AuxRow row = out.auxRow(0);
+        auto depth = copyOf(dfb::testing::depthRowOf(out, 0), width);
+        const dfb::AuxRow row = dfb::testing::auxRowOf(out, 0);
         auto normal = copyOf(row.normal, 3 * width), albedo = copyOf(row.albedo, 3 * width),
              position = copyOf(row.position, 3 * width);
         auto primitive = copyOf(row.primitiveId, width), instance = copyOf(row.instanceId, width);

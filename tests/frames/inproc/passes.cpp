@@ -52,7 +52,7 @@ public:
     {
         {
             const std::lock_guard<std::mutex> lock(places->mutex);
-            places->finished.emplace_back(tile_, out.colorRow(0));
+            places->finished.emplace_back(tile_, out.planes().at[dfb::detail::Color]);
         }
         Base::finish(out);
     }

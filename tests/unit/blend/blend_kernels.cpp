@@ -155,7 +155,7 @@ TEST_CASE("A layer of levels under another is rounded to the nearest, by hand as
         for (std::size_t i = 0; i < exact.size(); ++i)
             exact[i] = static_cast<std::uint8_t>(
                 std::min(255.0, std::round(front[i] + (255 - alpha) / 255.0 * static_cast<double>(behind[i]))));
-        d::blendLevelsPlain(plain.data(), 0, width, behind.data());
+        d::blendLevelsPlain(plain.data(), width, behind.data());
         d::blendLevels(fast.data(), width, behind.data());
         REQUIRE(plain == exact);
         REQUIRE(fast == exact);
@@ -297,10 +297,12 @@ TEST_CASE("Layers that are sorted are what over() makes of them one by one, pixe
         row.clear(0, x);
         expected = row;
         expected.clear(0, x + width);
-        dfb::sortAndBlend(row, x, width, stack.layers, scratch, round % 4 < 2); // from other layers, mostly
+        if (round % 4 >= 2)
+            scratch.clear(); // else it is from other layers, mostly
+        dfb::sortAndBlend(row, x, width, stack.layers, scratch);
         if (round % 4 == 0) {
             std::shuffle(scratch.begin(), scratch.end(), random);
-            dfb::sortAndBlend(row, x, width, stack.layers, scratch, true);
+            dfb::sortAndBlend(row, x, width, stack.layers, scratch);
         }
         std::vector<std::size_t> order(stack.layers.size());
         for (int i = 0; i < width; ++i) {

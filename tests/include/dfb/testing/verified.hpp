@@ -23,6 +23,25 @@
 
 namespace dfb::testing {
 
+// Row y of a channel of a finished tile, as it is stored; null if the channel is not wanted.
+inline const std::byte* rowOf(const FinishedTile& out, std::size_t channel, int y)
+{
+    const std::byte* first = out.planes().at[channel];
+    const std::size_t pixelBytes =
+        channel == detail::Color ? bytesPerPixel(out.format()) : 4 * detail::channelWords[channel];
+    return first ? first + static_cast<std::size_t>(y) * out.stride() * pixelBytes : nullptr;
+}
+inline const float* depthRowOf(const FinishedTile& out, int y)
+{
+    return detail::floatsOf(rowOf(out, detail::Depth, y));
+}
+inline AuxRow auxRowOf(const FinishedTile& out, int y)
+{
+    return {detail::floatsOf(rowOf(out, detail::Normal, y)), detail::floatsOf(rowOf(out, detail::Albedo, y)),
+            detail::floatsOf(rowOf(out, detail::Position, y)), detail::idsOf(rowOf(out, detail::PrimitiveId, y)),
+            detail::idsOf(rowOf(out, detail::InstanceId, y))};
+}
+
 // Collects over tiles. From any thread.
 class Verification {
 public:
@@ -161,7 +180,7 @@ private:
 
     static void addPixel(ErrorReport& report, const FinishedTile& out, int y, std::size_t x, const Pixel& exact)
     {
-        const std::byte* row = out.colorRow(y);
+        const std::byte* row = rowOf(out, detail::Color, y);
         for (std::size_t c = 0; row && c < 4; ++c) {
             if (out.format() == OutputFormat::RGBA32F) {
                 float value = 0;
@@ -177,8 +196,8 @@ private:
 
     static void addOthers(ErrorReport& report, const FinishedTile& out, int y, std::size_t x, const Pixel& exact)
     {
-        const AuxRow row = out.auxRow(y);
-        if (const float* depth = out.depthRow(y))
+        const AuxRow row = auxRowOf(out, y);
+        if (const float* depth = depthRowOf(out, y))
             report.addOther(depth[x] != exact.depth);
         for (std::size_t c = 0; c < 3; ++c) {
             if (row.normal)
