@@ -51,7 +51,7 @@ inline constexpr std::uint32_t noId = 0xffffffffu;
 namespace detail {
 
 inline constexpr int channelCount = 8;
-inline constexpr int channelWords[channelCount] = {4, 1, 3, 3, 3, 1, 1, 1}; // of 4 bytes
+inline constexpr std::size_t channelWords[channelCount] = {4, 1, 3, 3, 3, 1, 1, 1}; // of 4 bytes
 inline constexpr const char* channelNames[channelCount] = {"colour",   "depth",        "normal",      "albedo",
                                                            "position", "primitive id", "instance id", "far depth"};
 enum Channel : std::size_t { Color, Depth, Normal, Albedo, Position, PrimitiveId, InstanceId, Far };
@@ -68,7 +68,7 @@ struct BasicPlanes {
     {
         for (std::size_t c = 0; c < channelCount; ++c)
             if (at[c])
-                at[c] += 4 * pixels * static_cast<std::size_t>(channelWords[c]);
+                at[c] += 4 * pixels * channelWords[c];
     }
     BasicPlanes from(std::size_t pixels) const noexcept
     {
@@ -87,6 +87,19 @@ inline const std::uint32_t* idsOf(const std::byte* plane) noexcept
     return reinterpret_cast<const std::uint32_t*>(plane);
 }
 inline std::uint32_t* idsOf(std::byte* plane) noexcept { return reinterpret_cast<std::uint32_t*>(plane); }
+
+// Whether alpha is 1 in all pixels of a colour plane, which has a byte a channel or floats; rows are `stride` pixels
+// apart. Looks at no more of them than it must.
+inline bool isOpaque(const std::byte* color, bool hasBytes, int width, int height, std::ptrdiff_t stride) noexcept
+{
+    for (int y = 0; y < height; ++y)
+        for (int x = 0; x < width; ++x) {
+            const std::ptrdiff_t alpha = 4 * (y * stride + x) + 3;
+            if (hasBytes ? color[alpha] != std::byte{255} : floatsOf(color)[alpha] != 1.0f)
+                return false;
+        }
+    return true;
+}
 
 } // namespace detail
 

@@ -98,12 +98,8 @@ public:
             return parts_.inPlace.isOpaque(header_.region.width(), header_.region.height());
         if (parts_.encoding != FragmentEncoding::Dense && parts_.encoding != FragmentEncoding::Constant)
             return false;
-        const std::size_t count = storedPixels();
-        std::size_t i = 0;
-        while (i < count
-               && (parts_.bytes ? parts_.bytes[4 * i + 3] == std::byte{255} : parts_.color[4 * i + 3] == 1.0f))
-            ++i;
-        return i == count;
+        const auto* color = parts_.bytes ? parts_.bytes : reinterpret_cast<const std::byte*>(parts_.color);
+        return detail::isOpaque(color, parts_.bytes != nullptr, static_cast<int>(storedPixels()), 1, 0);
     }
 
     // Calls f(x, y, rgba, depth) for each active pixel, row by row. x and y count from the tile's upper left corner,

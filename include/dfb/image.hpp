@@ -168,9 +168,8 @@ public:
         if (format == OutputFormat::None)
             return;
         std::array<std::size_t, detail::channelCount> bytes{}; // of a pixel
-        bytes[detail::Color] = bytesPerPixel(format);
-        for (std::size_t c = detail::Depth; c < detail::channelCount; ++c)
-            bytes[c] = detail::hasChannel(channels, c) ? 4 * static_cast<std::size_t>(detail::channelWords[c]) : 0;
+        for (std::size_t c = 0; c < detail::channelCount; ++c)
+            bytes[c] = detail::hasChannel(channels | colorChannel, c) ? pixelBytes(c) : 0;
         try {
             for (std::size_t c = 0; c < detail::channelCount; ++c)
                 if (bytes[c] > 0)
@@ -225,14 +224,14 @@ public:
     {
         for (std::size_t c = 0; c < detail::channelCount; ++c)
             if (!planes_[c].empty())
-                use(planes_[c].data(), planeBytes(c));
+                use(planes_[c].data(), pixelCount() * pixelBytes(c));
     }
     template <class Use>
     void forEachPlane(const Use& use)
     {
         for (std::size_t c = 0; c < detail::channelCount; ++c)
             if (!planes_[c].empty())
-                use(planes_[c].data(), planeBytes(c));
+                use(planes_[c].data(), pixelCount() * pixelBytes(c));
     }
 
     // Gives its memory away; there is nothing in it then.
@@ -242,11 +241,9 @@ public:
     detail::Planes planesAt(std::size_t first) noexcept
     {
         detail::Planes planes;
-        for (std::size_t c = detail::Depth; c < detail::channelCount; ++c)
+        for (std::size_t c = 0; c < detail::channelCount; ++c)
             if (!planes_[c].empty())
-                planes.at[c] = planes_[c].data() + 4 * first * static_cast<std::size_t>(detail::channelWords[c]);
-        if (!empty())
-            planes.at[detail::Color] = bytes() + first * bytesPerPixel(format_);
+                planes.at[c] = planes_[c].data() + first * pixelBytes(c);
         return planes;
     }
 
@@ -259,10 +256,9 @@ private:
                                     "after a frame that ended well)");
     }
 
-    std::size_t planeBytes(std::size_t c) const noexcept
+    std::size_t pixelBytes(std::size_t c) const noexcept
     {
-        const std::size_t words = 4 * static_cast<std::size_t>(detail::channelWords[c]);
-        return pixelCount() * (c == detail::Color ? bytesPerPixel(format_) : words);
+        return c == detail::Color ? bytesPerPixel(format_) : 4 * detail::channelWords[c];
     }
 
     const std::byte* plane(detail::Channel channel, const char* what) const

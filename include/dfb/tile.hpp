@@ -9,6 +9,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
+#include <iterator>
 #include <limits>
 #include <type_traits>
 #include <vector>
@@ -64,101 +65,80 @@ private:
 namespace detail {
 
 // The arrays of a tile, each there if the tile has the channel.
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct DepthPlane {
     float depth[PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct NormalPlane {
     float normal[3 * PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct AlbedoPlane {
     float albedo[3 * PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct PositionPlane {
     float position[3 * PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct PrimitiveIdPlane {
     std::uint32_t primitiveId[PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct InstanceIdPlane {
     std::uint32_t instanceId[PixelCount];
 };
-template <bool Present, int PixelCount>
+template <int PixelCount>
 struct FarPlane {
     float farDepth[PixelCount];
 };
-template <int PixelCount>
-struct DepthPlane<false, PixelCount> {
+template <Channel Which>
+struct NoPlane {
 };
-template <int PixelCount>
-struct NormalPlane<false, PixelCount> {
-};
-template <int PixelCount>
-struct AlbedoPlane<false, PixelCount> {
-};
-template <int PixelCount>
-struct PositionPlane<false, PixelCount> {
-};
-template <int PixelCount>
-struct PrimitiveIdPlane<false, PixelCount> {
-};
-template <int PixelCount>
-struct InstanceIdPlane<false, PixelCount> {
-};
-template <int PixelCount>
-struct FarPlane<false, PixelCount> {
-};
+template <ChannelMask Channels, Channel Which, class Plane>
+using PlaneIf = std::conditional_t<hasChannel(Channels, Which), Plane, NoPlane<Which>>;
 
 template <ChannelMask Channels, int PixelCount>
-struct TilePlanes : DepthPlane<hasChannel(Channels, Depth), PixelCount>,
-                    NormalPlane<hasChannel(Channels, Normal), PixelCount>,
-                    AlbedoPlane<hasChannel(Channels, Albedo), PixelCount>,
-                    PositionPlane<hasChannel(Channels, Position), PixelCount>,
-                    PrimitiveIdPlane<hasChannel(Channels, PrimitiveId), PixelCount>,
-                    InstanceIdPlane<hasChannel(Channels, InstanceId), PixelCount>,
-                    FarPlane<hasChannel(Channels, Far), PixelCount> {
+struct TilePlanes : PlaneIf<Channels, Depth, DepthPlane<PixelCount>>,
+                    PlaneIf<Channels, Normal, NormalPlane<PixelCount>>,
+                    PlaneIf<Channels, Albedo, AlbedoPlane<PixelCount>>,
+                    PlaneIf<Channels, Position, PositionPlane<PixelCount>>,
+                    PlaneIf<Channels, PrimitiveId, PrimitiveIdPlane<PixelCount>>,
+                    PlaneIf<Channels, InstanceId, InstanceIdPlane<PixelCount>>,
+                    PlaneIf<Channels, Far, FarPlane<PixelCount>> {
     float color[4 * PixelCount];
+
+    // Calls f(channel, array) for each array that there is.
+    template <class Self, class F>
+    static void forEachPlane(Self& self, const F& f) noexcept
+    {
+        f(Color, self.color);
+        if constexpr (hasChannel(Channels, Depth))
+            f(Depth, self.depth);
+        if constexpr (hasChannel(Channels, Normal))
+            f(Normal, self.normal);
+        if constexpr (hasChannel(Channels, Albedo))
+            f(Albedo, self.albedo);
+        if constexpr (hasChannel(Channels, Position))
+            f(Position, self.position);
+        if constexpr (hasChannel(Channels, PrimitiveId))
+            f(PrimitiveId, self.primitiveId);
+        if constexpr (hasChannel(Channels, InstanceId))
+            f(InstanceId, self.instanceId);
+        if constexpr (hasChannel(Channels, Far))
+            f(Far, self.farDepth);
+    }
 
     ConstPlanes planes() const noexcept
     {
         ConstPlanes p;
-        const auto set = [&p](Channel channel, const void* data) {
-            p.at[channel] = static_cast<const std::byte*>(data);
-        };
-        set(Color, color);
-        if constexpr (hasChannel(Channels, Depth))
-            set(Depth, this->depth);
-        if constexpr (hasChannel(Channels, Normal))
-            set(Normal, this->normal);
-        if constexpr (hasChannel(Channels, Albedo))
-            set(Albedo, this->albedo);
-        if constexpr (hasChannel(Channels, Position))
-            set(Position, this->position);
-        if constexpr (hasChannel(Channels, PrimitiveId))
-            set(PrimitiveId, this->primitiveId);
-        if constexpr (hasChannel(Channels, InstanceId))
-            set(InstanceId, this->instanceId);
-        if constexpr (hasChannel(Channels, Far))
-            set(Far, this->farDepth);
+        forEachPlane(*this, [&p](Channel channel, const auto& values) {
+            p.at[channel] = reinterpret_cast<const std::byte*>(values);
+        });
         return p;
     }
 };
-
-// Whether isOpaqueAt(i) holds for all pixels of the region. Looks at no more of them than it must.
-template <class IsOpaqueAt>
-bool isOpaque(const Region& region, std::ptrdiff_t stride, const IsOpaqueAt& isOpaqueAt) noexcept
-{
-    for (int y = 0; y < region.height(); ++y)
-        for (int x = 0; x < region.width(); ++x)
-            if (!isOpaqueAt(y * stride + x))
-                return false;
-    return true;
-}
 
 } // namespace detail
 
@@ -180,32 +160,20 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     // All pixels: nothing here (all 0, depth +infinity, no id). Channels that are not in `which` are left as they are.
     void clear(ChannelMask which = Channels)
     {
-        const auto has = [which](ChannelMask channel) { return (which & channel) != 0; };
-        constexpr std::size_t count = static_cast<std::size_t>(Size) * Size;
-        const float infinity = std::numeric_limits<float>::infinity();
-        std::memset(color, 0, sizeof color);
-        (void)has;
-        if constexpr (hasDepth)
-            if (has(depthChannel))
-                std::fill_n(this->depth, count, infinity);
-        if constexpr ((Channels & normalChannel) != 0)
-            if (has(normalChannel))
-                std::memset(this->normal, 0, sizeof this->normal);
-        if constexpr ((Channels & albedoChannel) != 0)
-            if (has(albedoChannel))
-                std::memset(this->albedo, 0, sizeof this->albedo);
-        if constexpr ((Channels & positionChannel) != 0)
-            if (has(positionChannel))
-                std::memset(this->position, 0, sizeof this->position);
-        if constexpr ((Channels & primitiveIdChannel) != 0)
-            if (has(primitiveIdChannel))
-                std::fill_n(this->primitiveId, count, noId);
-        if constexpr ((Channels & instanceIdChannel) != 0)
-            if (has(instanceIdChannel))
-                std::fill_n(this->instanceId, count, noId);
-        if constexpr ((Channels & farChannel) != 0)
-            if (has(farChannel))
-                std::fill_n(this->farDepth, count, -infinity); // nobody has said: no farther than the depth
+        this->forEachPlane(*this, [which](detail::Channel channel, auto& values) {
+            const float infinity = std::numeric_limits<float>::infinity();
+            if (channel != detail::Color && !detail::hasChannel(which, channel))
+                return;
+            if constexpr (std::is_same_v<decltype(values[0]), std::uint32_t&>)
+                std::fill(std::begin(values), std::end(values), noId);
+            else if (channel == detail::Depth)
+                std::fill(std::begin(values), std::end(values), infinity);
+            else if (channel == detail::Far)
+                std::fill(std::begin(values), std::end(values),
+                          -infinity); // nobody has said: no farther than the depth
+            else
+                std::memset(values, 0, sizeof values);
+        });
     }
 
     // All pixels: one premultiplied RGBA colour at one depth.
@@ -244,7 +212,7 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region.
     bool isOpaque() const noexcept
     {
-        return detail::isOpaque(region, Size, [this](std::ptrdiff_t i) { return color[4 * i + 3] == 1.0f; });
+        return detail::isOpaque(this->planes().at[detail::Color], false, region.width(), region.height(), Size);
     }
 };
 
@@ -288,10 +256,9 @@ struct TileView : TileHeader {
     }
     bool isOpaque() const noexcept
     {
-        if (!(color || color8) || validRegion() != region)
-            return false;
-        return color ? detail::isOpaque(region, stride, [this](std::ptrdiff_t i) { return color[4 * i + 3] == 1.0f; })
-                     : detail::isOpaque(region, stride, [this](std::ptrdiff_t i) { return color8[4 * i + 3] == 255; });
+        const std::byte* pixels = planes().at[detail::Color];
+        return pixels && validRegion() == region
+               && detail::isOpaque(pixels, !color, region.width(), region.height(), stride);
     }
 };
 
@@ -316,12 +283,7 @@ struct InputPixels : TileHeader {
     // Bytes of a pixel in a channel.
     std::size_t pixelBytes(std::size_t channel) const noexcept
     {
-        return channel == Color && hasBytes ? 4 : 4 * static_cast<std::size_t>(channelWords[channel]);
-    }
-    // The colour of a pixel, counted from the first of the region.
-    const std::byte* colorAt(int x, int y) const noexcept
-    {
-        return at.at[Color] + static_cast<std::ptrdiff_t>(pixelBytes(Color)) * (y * stride + x);
+        return channel == Color && hasBytes ? 4 : 4 * channelWords[channel];
     }
 
     ChannelMask channels;

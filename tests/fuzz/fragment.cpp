@@ -100,7 +100,7 @@ std::unique_ptr<Tile> tileOf(const dfb::Fragment& fragment)
                     if (!d::hasChannel(fragment.channels(), c))
                         continue;
                     fuzz::require(from.at[c] != nullptr, "a channel of the mask is there");
-                    const std::size_t bytes = 4 * static_cast<std::size_t>(d::channelWords[c]);
+                    const std::size_t bytes = 4 * d::channelWords[c];
                     auto* to = const_cast<std::byte*>(planes.at[c]) + bytes * static_cast<std::size_t>(y * side + x);
                     std::memcpy(to, from.at[c] + bytes * k, bytes);
                 }
@@ -138,8 +138,7 @@ bool areAlike(const Tile& a, const Tile& b, dfb::ChannelMask channels, bool byDe
     for (int y = 0; y < a.region.height(); ++y)
         for (int x = 0; x < a.region.width(); ++x)
             for (std::size_t c = 0; c < d::channelCount; ++c) {
-                const std::size_t words = static_cast<std::size_t>(d::channelWords[c]),
-                                  at = 4 * words * static_cast<std::size_t>(y * side + x);
+                const std::size_t words = d::channelWords[c], at = 4 * words * static_cast<std::size_t>(y * side + x);
                 if ((isActive(a, x, y, byDepth) || isActive(b, x, y, byDepth)) && d::hasChannel(channels, c)
                     && !areAlike(as.at[c] + at, bs.at[c] + at, words))
                     return false;

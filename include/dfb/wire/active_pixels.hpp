@@ -128,28 +128,26 @@ DFB_AVX2 std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahea
 }
 #endif
 
+template <bool Copies>
+std::uint64_t findActivePixelsPlain(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
+{
+    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
+    if (Copies && !copyAndCheckColors(rgba, count, out))
+        isGood = false;
+    return findActivePixels(Copies ? out : rgba, count);
+}
+
 // `ahead`: where to load as many pixels from, meanwhile.
 inline std::uint64_t activePixelBits(const float* rgba, const float* ahead, int count)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
     bool isGood = true;
-    if (cpuHasAvx2())
-        return findActivePixelsAvx2<false>(rgba, ahead, count, nullptr, isGood);
-#endif
-    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
-    return findActivePixels(rgba, count);
+    return DFB_FASTEST(findActivePixelsPlain<false>, findActivePixelsAvx2<false>, rgba, ahead, count, nullptr, isGood);
 }
 
 // Does so and copies them all, in one pass. Sets `isGood` to false where copyAndCheckColors() would return it.
 inline std::uint64_t copyAndFindActivePixels(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
 {
-#if defined(DFB_HAS_AVX2_CLONES)
-    if (cpuHasAvx2())
-        return findActivePixelsAvx2<true>(rgba, ahead, count, out, isGood);
-#endif
-    prefetch(reinterpret_cast<const std::byte*>(ahead), 4 * sizeof(float) * static_cast<std::size_t>(count));
-    isGood = copyAndCheckColors(rgba, count, out) && isGood;
-    return findActivePixels(out, count);
+    return DFB_FASTEST(findActivePixelsPlain<true>, findActivePixelsAvx2<true>, rgba, ahead, count, out, isGood);
 }
 
 // Finds the active ones of pixels with 8 bits a channel.
@@ -328,22 +326,19 @@ DFB_AVX2 inline bool copyAndCheckDepthsAvx2(const float* depth, int count, float
 inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t channel, std::ptrdiff_t first, int count,
                          std::byte* out)
 {
-    const bool fast = cpuHasAvx2();
     if (channel == Color && hasBytes) {
         std::memcpy(out, planes.at[Color] + 4 * first, 4 * static_cast<std::size_t>(count));
         return true;
     }
     if (channel == Color) {
         const float* rgba = floatsOf(planes.at[Color]) + 4 * first;
-        return fast ? copyAndCheckColorsAvx2(rgba, count, floatsOf(out))
-                    : copyAndCheckColors(rgba, count, floatsOf(out));
+        return DFB_FASTEST(copyAndCheckColors, copyAndCheckColorsAvx2, rgba, count, floatsOf(out));
     }
     if (channel == Depth) {
         const float* depth = floatsOf(planes.at[Depth]) + first;
-        return fast ? copyAndCheckDepthsAvx2(depth, count, floatsOf(out))
-                    : copyAndCheckDepths(depth, count, floatsOf(out));
+        return DFB_FASTEST(copyAndCheckDepths, copyAndCheckDepthsAvx2, depth, count, floatsOf(out));
     }
-    const std::ptrdiff_t bytes = 4 * channelWords[channel];
+    const auto bytes = static_cast<std::ptrdiff_t>(4 * channelWords[channel]);
     std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));
     return true;
 }
@@ -476,15 +471,8 @@ struct PixelsInPlace {
     // Whether alpha is 1 in all pixels of a region of this size.
     bool isOpaque(int width, int height) const noexcept
     {
-        if (valid != Region{0, 0, width, height} || activity.depthLimit < std::numeric_limits<float>::infinity())
-            return false;
-        for (int y = 0; y < height; ++y)
-            for (int x = 0; x < width; ++x) {
-                const std::ptrdiff_t at = 4 * (y * stride + x) + 3;
-                if (activity.hasBytes ? color[at] != std::byte{255} : floatsOf(color)[at] != 1.0f)
-                    return false;
-            }
-        return true;
+        return valid == Region{0, 0, width, height} && !(activity.depthLimit < std::numeric_limits<float>::infinity())
+               && detail::isOpaque(color, activity.hasBytes, width, height, stride);
     }
 };
 
