@@ -214,19 +214,6 @@ struct PlaceInMemory {
 };
 static_assert(sizeof(PlaceInMemory) == 40 && std::is_trivially_copyable_v<PlaceInMemory>);
 
-// The pixels of a tile that are to be read where they lie. `channels`: that travel, of colour and depth.
-inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels, bool byDepth)
-{
-    PixelsInPlace p;
-    p.color = tile.planes().at[Color];
-    p.depth = hasChannel(channels, Depth) ? floatsOf(tile.planes().at[Depth]) : nullptr;
-    p.stride = tile.stride;
-    const int x0 = tile.region.x0, y0 = tile.region.y0;
-    p.valid = {tile.valid.x0 - x0, tile.valid.y0 - y0, tile.valid.x1 - x0, tile.valid.y1 - y0};
-    p.activity = {byDepth, tile.hasBytes, tile.depthLimit};
-    return p;
-}
-
 // The bytes from the first to the last valid pixel of a plane whose region begins at `first`.
 struct ByteRange {
     std::int64_t begin = 0, end = 0;
@@ -391,11 +378,32 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
     return parts;
 }
 
-// The rest of decodeFragment(), of a tile and a pass that there are.
-inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const FragmentHeader& h, const TileHeader& header,
-                              const Codec* codec, const WireCoder& coder, const SharedBytes& sharedBytes,
-                              FaultCounts* faults)
+// Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
+// decompressed form). `passesOf(tile)`: how many passes the tile has. `faults` gets those that show while the fragment
+// is read, if it is read in place. Throws Error (MalformedMessage).
+inline Fragment decodeFragment(
+    MemoryPool& pool, Buffer&& message, const TileLayout& layout, const FunctionRef<int(int)>& passesOf,
+    const Codec* codec, const WireCoder& coder,
+    const SharedBytes& sharedBytes = [](std::int64_t, std::int64_t) -> const std::byte* { return nullptr; },
+    FaultCounts* faults = nullptr)
 {
+    if (message.size() < fragmentPrefix)
+        failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
+    const auto h = loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader));
+    if (h.tile < 0 || h.tile >= layout.tileCount())
+        failMalformed("tile index outside the image", layout.tileCount() - 1, h.tile);
+    if (const int passes = passesOf(h.tile); h.pass < 0 || h.pass >= passes)
+        failMalformed("pass outside the tile's", passes - 1, h.pass);
+    TileHeader header;
+    header.frame = loadAs<MessageHeader>(message.data()).number;
+    header.tile = h.tile;
+    header.region = layout.region(h.tile);
+    header.pass = h.pass;
+    header.generation = h.generation;
+    header.children = h.children;
+    header.source = h.source;
+    header.part = h.part;
+
     if (!(h.channels & colorChannel) || (h.channels & ~allChannels))
         failMalformed("unknown set of channels", colorChannel, h.channels);
     if (h.colorFormat > WireFormat::Bytes)
@@ -435,42 +443,6 @@ inline Fragment decodeChecked(MemoryPool& pool, Buffer&& message, const Fragment
     parts.aux = body.planes;
     parts.aux.at[Color] = parts.aux.at[Depth] = nullptr;
     return Fragment(header, std::move(message), parts);
-}
-
-// Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
-// decompressed form). `passesOf(tile)`: how many passes the tile has. `faults` gets those that show while the fragment
-// is read, if it is read in place. Throws Error (MalformedMessage).
-template <class PassesOf>
-Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
-                        const Codec* codec, const WireCoder& coder, const SharedBytes& sharedBytes, FaultCounts* faults)
-{
-    if (message.size() < fragmentPrefix)
-        failMalformed("shorter than a fragment's header", fragmentPrefix, static_cast<std::int64_t>(message.size()));
-    const auto h = loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader));
-    if (h.tile < 0 || h.tile >= layout.tileCount())
-        failMalformed("tile index outside the image", layout.tileCount() - 1, h.tile);
-    if (const int passes = passesOf(h.tile); h.pass < 0 || h.pass >= passes)
-        failMalformed("pass outside the tile's", passes - 1, h.pass);
-    TileHeader header;
-    header.frame = loadAs<MessageHeader>(message.data()).number;
-    header.tile = h.tile;
-    header.region = layout.region(h.tile);
-    header.pass = h.pass;
-    header.generation = h.generation;
-    header.children = h.children;
-    header.source = h.source;
-    header.part = h.part;
-    return decodeChecked(pool, std::move(message), h, header, codec, coder, sharedBytes, faults);
-}
-
-// Does so where no sender shares memory.
-template <class PassesOf>
-Fragment decodeFragment(MemoryPool& pool, Buffer&& message, const TileLayout& layout, const PassesOf& passesOf,
-                        const Codec* codec, const WireCoder& coder)
-{
-    return decodeFragment(
-        pool, std::move(message), layout, passesOf, codec, coder,
-        [](std::int64_t, std::int64_t) -> const std::byte* { return nullptr; }, nullptr);
 }
 
 } // namespace detail

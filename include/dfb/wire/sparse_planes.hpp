@@ -7,7 +7,7 @@
 //   Constant:  planes: one pixel
 //   Empty:     nothing
 // The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ..., each
-// from a multiple of 4 on. A body that is split has its planes as PlaneFilter leaves them.
+// from a multiple of 4 on. A body that is split has its planes as splitPlane() leaves them.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -62,80 +62,50 @@ static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseSh
 // in the lower ones. Each word becomes its difference to the word of the pixel before, coded so that small differences
 // of either sign have zeros at the top. Then all first bytes are stored, then all second bytes, and so on. A codec that
 // looks for repetitions finds few in the plain bytes of floats.
-class PlaneFilter {
-public:
-    // `byteCount` bytes of pixels that have `words` words of `wordBytes` (1, 2 or 4) each; a rest that is no whole
-    // pixel is copied.
-    static void split(const std::byte* in, std::size_t byteCount, std::size_t wordBytes, std::size_t words,
-                      std::byte* out)
-    {
-        byWord(wordBytes, [&](auto zero) { splitWords(zero, in, byteCount, words, out); });
-    }
-    // The inverse.
-    static void join(const std::byte* in, std::size_t byteCount, std::size_t wordBytes, std::size_t words,
-                     std::byte* out)
-    {
-        byWord(wordBytes, [&](auto zero) { joinWords(zero, in, byteCount, words, out); });
-    }
-
-private:
-    template <class Call>
-    static void byWord(std::size_t wordBytes, const Call& call)
-    {
-        if (wordBytes == 4)
-            call(std::uint32_t{0});
-        else if (wordBytes == 2)
-            call(std::uint16_t{0});
-        else
-            call(std::uint8_t{0});
-    }
-
-    template <class Word>
-    static void splitWords(Word, const std::byte* in, std::size_t byteCount, std::size_t words, std::byte* out)
-    {
-        constexpr std::size_t size = sizeof(Word);
-        constexpr int top = 8 * static_cast<int>(size) - 1;
-        const std::size_t pixels = byteCount / (size * words), count = pixels * words;
-        for (std::size_t w = 0; w < words; ++w) {
-            Word before = 0;
-            std::byte* to = out + w * pixels;
-            for (std::size_t i = 0; i < pixels; ++i) {
-                Word word = 0;
-                std::memcpy(&word, in + (i * words + w) * size, size);
-                const auto difference = static_cast<Word>(word - before);
-                const auto folded =
-                    static_cast<Word>(static_cast<Word>(difference << 1)
-                                      ^ static_cast<Word>(difference >> top ? Word(~Word{0}) : Word{0}));
-                for (std::size_t b = 0; b < size; ++b)
-                    to[b * count + i] = static_cast<std::byte>(folded >> (8 * b));
-                before = word;
-            }
+//
+// Of `pixels` pixels that have `words` words each.
+template <class Word>
+void splitPlane(const std::byte* in, std::size_t pixels, std::size_t words, std::byte* out)
+{
+    constexpr std::size_t size = sizeof(Word);
+    constexpr int top = 8 * static_cast<int>(size) - 1;
+    const std::size_t count = pixels * words;
+    for (std::size_t w = 0; w < words; ++w) {
+        Word before = 0;
+        std::byte* to = out + w * pixels;
+        for (std::size_t i = 0; i < pixels; ++i) {
+            Word word = 0;
+            std::memcpy(&word, in + (i * words + w) * size, size);
+            const auto difference = static_cast<Word>(word - before);
+            const auto folded = static_cast<Word>(static_cast<Word>(difference << 1)
+                                                  ^ static_cast<Word>(difference >> top ? Word(~Word{0}) : Word{0}));
+            for (std::size_t b = 0; b < size; ++b)
+                to[b * count + i] = static_cast<std::byte>(folded >> (8 * b));
+            before = word;
         }
-        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
     }
-
-    template <class Word>
-    static void joinWords(Word, const std::byte* in, std::size_t byteCount, std::size_t words, std::byte* out)
-    {
-        constexpr std::size_t size = sizeof(Word);
-        const std::size_t pixels = byteCount / (size * words), count = pixels * words;
-        for (std::size_t w = 0; w < words; ++w) {
-            Word before = 0;
-            const std::byte* from = in + w * pixels;
-            for (std::size_t i = 0; i < pixels; ++i) {
-                Word folded = 0;
-                for (std::size_t b = 0; b < size; ++b)
-                    folded = static_cast<Word>(folded
-                                               | static_cast<Word>(static_cast<Word>(from[b * count + i]) << (8 * b)));
-                const auto difference = static_cast<Word>(static_cast<Word>(folded >> 1)
-                                                          ^ static_cast<Word>(folded & 1 ? Word(~Word{0}) : Word{0}));
-                before = static_cast<Word>(before + difference);
-                std::memcpy(out + (i * words + w) * size, &before, size);
-            }
+}
+// The inverse.
+template <class Word>
+void joinPlane(const std::byte* in, std::size_t pixels, std::size_t words, std::byte* out)
+{
+    constexpr std::size_t size = sizeof(Word);
+    const std::size_t count = pixels * words;
+    for (std::size_t w = 0; w < words; ++w) {
+        Word before = 0;
+        const std::byte* from = in + w * pixels;
+        for (std::size_t i = 0; i < pixels; ++i) {
+            Word folded = 0;
+            for (std::size_t b = 0; b < size; ++b)
+                folded =
+                    static_cast<Word>(folded | static_cast<Word>(static_cast<Word>(from[b * count + i]) << (8 * b)));
+            const auto difference = static_cast<Word>(static_cast<Word>(folded >> 1)
+                                                      ^ static_cast<Word>(folded & 1 ? Word(~Word{0}) : Word{0}));
+            before = static_cast<Word>(before + difference);
+            std::memcpy(out + (i * words + w) * size, &before, size);
         }
-        std::copy_n(in + count * size, byteCount - count * size, out + count * size);
     }
-};
+}
 
 // The bytes of a pixel in each channel; none in those that do not travel.
 class PlaneFormat {
@@ -149,7 +119,7 @@ public:
             }
     }
     std::size_t pixelBytes() const noexcept { return pixelBytes_; } // a multiple of 4, as all are
-    std::size_t pixelBytes(std::size_t channel) const noexcept { return wordBytes_[channel] * wordsOf(channel); }
+    std::size_t pixelBytes(std::size_t channel) const noexcept { return wordBytes_[channel] * channelWords[channel]; }
     std::size_t bodyBytes(const SparseShape& shape) const noexcept
     {
         return pixelBytes_ * shape.stored() + shape.tableBytes();
@@ -178,20 +148,24 @@ public:
 
     void split(const SparseShape& shape, const std::byte* in, std::byte* out) const
     {
-        transform(shape, in, out, PlaneFilter::split);
+        transform(shape, in, out, [](auto word, auto... plane) { splitPlane<decltype(word)>(plane...); });
     }
     void join(const SparseShape& shape, const std::byte* in, std::byte* out) const
     {
-        transform(shape, in, out, PlaneFilter::join);
+        transform(shape, in, out, [](auto word, auto... plane) { joinPlane<decltype(word)>(plane...); });
     }
 
 private:
-    static std::size_t wordsOf(std::size_t channel) { return static_cast<std::size_t>(channelWords[channel]); }
     template <class Transform>
     void transform(const SparseShape& shape, const std::byte* in, std::byte* out, const Transform& call) const
     {
-        const std::size_t end = forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t bytes) {
-            call(in + at, bytes, wordBytes_[c], wordsOf(c), out + at);
+        const std::size_t end = forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t) {
+            if (wordBytes_[c] == 4)
+                call(std::uint32_t{}, in + at, shape.stored(), channelWords[c], out + at);
+            else if (wordBytes_[c] == 2)
+                call(std::uint16_t{}, in + at, shape.stored(), channelWords[c], out + at);
+            else
+                call(std::uint8_t{}, in + at, shape.stored(), channelWords[c], out + at);
         });
         std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
     }
@@ -266,6 +240,19 @@ inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& sha
     return body;
 }
 
+// The pixels of a tile where they lie. `channels`: that travel, of colour and depth.
+inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels, bool byDepth)
+{
+    PixelsInPlace p;
+    p.color = tile.planes().at[Color];
+    p.depth = hasChannel(channels, Depth) ? floatsOf(tile.planes().at[Depth]) : nullptr;
+    p.stride = tile.stride;
+    const int x0 = tile.region.x0, y0 = tile.region.y0;
+    p.valid = {tile.valid.x0 - x0, tile.valid.y0 - y0, tile.valid.x1 - x0, tile.valid.y1 - y0};
+    p.activity = {byDepth, tile.hasBytes, tile.depthLimit};
+    return p;
+}
+
 // The active pixels of an input. One per thread, to be used again and again. A pixel of colour 0 and alpha 0
 // contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does. By depth, a pixel
 // contributes if its depth is below +infinity, and only then.
@@ -292,8 +279,7 @@ public:
         for (std::size_t c = Depth; c < channelCount; ++c)
             if (hasChannel(channels, c)) {
                 const bool isOwn = c != Depth || !depths;
-                planes_[c].resize(
-                    std::max(planes_[c].size(), isOwn ? most * static_cast<std::size_t>(channelWords[c]) : 0));
+                planes_[c].resize(std::max(planes_[c].size(), isOwn ? most * channelWords[c] : 0));
                 auto* to = reinterpret_cast<std::byte*>(isOwn ? planes_[c].data() : depths);
                 targets[targetCount++] = {c, to};
                 result.at[c] = to;
@@ -321,20 +307,14 @@ private:
     {
         clear();
         nanDepths_ = 0;
-        const ConstPlanes& planes = tile.planes();
-        const float* depths = floatsOf(planes.at[Depth]);
-        const Activity activity{byDepth, tile.hasBytes, tile.depthLimit};
-        const Region valid = tile.valid;
-        const int x0 = valid.x0 - tile.region.x0, width = planes.at[Color] ? valid.width() : 0;
-        const int yEnd = width > 0 ? valid.y1 - tile.region.y0 : 0;
-        const auto at = [&](int x, int y) {
-            return RowPlace{tile.colorAt(x, y), depths ? depths + y * tile.stride + x : nullptr};
-        };
-        for (int y = valid.y0 - tile.region.y0; y < yEnd; ++y) {
-            const int ahead = rowAhead(y, yEnd, width);
+        const PixelsInPlace its = pixelsInPlace(tile, depthChannel, byDepth);
+        const Region& valid = its.valid;
+        const int yEnd = its.color && valid.width() > 0 ? valid.y1 : 0;
+        for (int y = valid.y0; y < yEnd; ++y) {
+            const int ahead = rowAhead(y, yEnd, valid.width());
             findRow(
-                y, x0, x0 + width,
-                [&](int x, int count) { return activity.bits(at(x, y), at(x, ahead), count, nanDepths_); },
+                y, valid.x0, valid.x1,
+                [&](int x, int count) { return its.activity.bits(its.at(x, y), its.at(x, ahead), count, nanDepths_); },
                 [&](Span span) { f(y * tile.stride + span.x, static_cast<int>(span.count)); });
         }
         endRows();

@@ -125,16 +125,20 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
 TEST_CASE("Planes that were split come back", "[wire]")
 {
     std::mt19937 random(9);
-    for (const std::size_t wordBytes : {1u, 2u, 4u})
+    const auto check = [&](auto word) {
         for (const std::size_t words : {1u, 3u, 4u})
-            for (const std::size_t byteCount : {0u, 4u, 12u, 48u, 100u, 4096u}) {
-                std::vector<std::byte> in(byteCount), split(byteCount), out(byteCount);
+            for (const std::size_t pixels : {0u, 1u, 3u, 4u, 25u, 1024u}) {
+                std::vector<std::byte> in(pixels * words * sizeof word), split(in), out(in);
                 for (std::byte& byte : in)
                     byte = static_cast<std::byte>(random() % (random() % 2 ? 256 : 3));
-                dfb::detail::PlaneFilter::split(in.data(), byteCount, wordBytes, words, split.data());
-                dfb::detail::PlaneFilter::join(split.data(), byteCount, wordBytes, words, out.data());
+                d::splitPlane<decltype(word)>(in.data(), pixels, words, split.data());
+                d::joinPlane<decltype(word)>(split.data(), pixels, words, out.data());
                 CHECK(out == in);
             }
+    };
+    check(std::uint8_t{});
+    check(std::uint16_t{});
+    check(std::uint32_t{});
 }
 
 TEST_CASE("Active pixels come back at their places, in each format of planes, split or not", "[wire]")
