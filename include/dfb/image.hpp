@@ -77,21 +77,12 @@ DFB_INLINE void toFloats(const Real* values, int count, float* out) noexcept
     for (int i = 0; i < count; ++i)
         out[i] = static_cast<float>(values[i]);
 }
-template <class Real>
-DFB_AVX2 inline void toFloatsAvx2(const Real* values, int count, float* out) noexcept
-{
-    toFloats(values, count, out);
-}
 
 // A float -0 becomes 0.
 DFB_INLINE void copyFloats(const float* values, int count, float* out) noexcept
 {
     for (int i = 0; i < count; ++i)
         out[i] = values[i] + 0.0f;
-}
-DFB_AVX2 inline void copyFloatsAvx2(const float* values, int count, float* out) noexcept
-{
-    copyFloats(values, count, out);
 }
 
 // A pixel as four floats; a float -0 becomes 0.
@@ -144,14 +135,9 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
     case OutputFormat::None: break;
     case OutputFormat::RGBA8: return detail::pixelsToLevels<false>(rgba, count, bytes);
     case OutputFormat::SRGBA8: return detail::pixelsToLevels<true>(rgba, count, bytes);
-    case OutputFormat::RGBA32F: {
-        auto* floats = reinterpret_cast<float*>(out);
-        if (detail::cpuHasAvx2())
-            detail::toFloatsAvx2(rgba, 4 * count, floats);
-        else
-            detail::toFloats(rgba, 4 * count, floats);
+    case OutputFormat::RGBA32F:
+        detail::fastest<detail::toFloats<Real>>(rgba, 4 * count, reinterpret_cast<float*>(out));
         break;
-    }
     }
     return 0;
 }

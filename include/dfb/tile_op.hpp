@@ -167,8 +167,7 @@ public:
         }
         float* out = detail::floatsOf(color);
         const int stored = isPastCache_ ? 4 * detail::streamPixels(rgba, count, out) : 0;
-        (detail::cpuHasAvx2() ? detail::copyFloatsAvx2 : detail::copyFloats)(rgba + stored, 4 * count - stored,
-                                                                             out + stored);
+        detail::fastest<detail::copyFloats>(rgba + stored, 4 * count - stored, out + stored);
     }
     // Sets pixels [x, x + count) of row y to colours that are given as they are stored, bytesPerPixel(format()) bytes
     // each, and to these depths, which may be null if the image has none.

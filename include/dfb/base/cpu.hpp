@@ -2,8 +2,11 @@
 // results are the same, bit for bit. DFB_AVX2_F16C and cpuHasF16c() are the same where halves are converted.
 //
 //   DFB_INLINE void body(...) { ... }
-//   DFB_AVX2 inline void bodyAvx2(...) { body(...); }
-//   cpuHasAvx2() ? bodyAvx2(...) : body(...);
+//   fastest<body>(...);
+//
+// Where the loop for AVX2 is written by hand:
+//
+//   DFB_FASTEST(body, bodyAvx2, ...);
 #pragma once
 
 #include <dfb/version.hpp>
@@ -59,6 +62,18 @@ inline bool cpuHasAvx2() noexcept
 #else
     return false;
 #endif
+}
+
+// Calls Body, which is DFB_INLINE, as it is compiled for AVX2 where the processor has that.
+template <auto Body, class... Arguments>
+DFB_AVX2 inline auto withAvx2(Arguments... arguments) noexcept
+{
+    return Body(arguments...);
+}
+template <auto Body, class... Arguments>
+inline auto fastest(Arguments... arguments) noexcept
+{
+    return DFB_FASTEST(Body, withAvx2<Body>, arguments...);
 }
 
 // Whether there is AVX2, and F16C as well: conversion of halves, which all such processors have, but not all

@@ -1,6 +1,6 @@
 // The kernels of blending: layers under pixels, in double, and two layers of levels in integers. Each is there in plain
-// C++ and, for processors that have it, by hand for AVX2; the two give the same bits, as products and sums are the same
-// and rounded one by one.
+// C++ and, for processors that have it, for AVX2, mostly by hand; the two give the same bits, as products and sums are
+// the same and rounded one by one.
 //
 // A pixel that nothing comes through any more is blended like the others, unless its whole block is opaque: then the
 // layers behind are left out. That is checked after the first layer and every fourth from there. So an infinity or a
@@ -127,7 +127,7 @@ inline void blendConstantPlain(double* rgba, const double* transmittance, int co
 }
 
 // The depths of a layer where its alpha counts, if they are nearer.
-inline void takeNearestPlain(float* nearest, int count, const float* color, const float* depth)
+DFB_INLINE void takeNearestPlain(float* nearest, int count, const float* color, const float* depth)
 {
     for (int i = 0; i < count; ++i) {
         const bool isNearer = color[4 * i + 3] > 0.0f && depth[i] < nearest[i];
@@ -182,20 +182,6 @@ DFB_AVX2 inline void blendConstantAvx2(double* rgba, const double* transmittance
         const __m256d added = _mm256_mul_pd(_mm256_broadcast_sd(transmittance + i), c);
         _mm256_storeu_pd(rgba + 4 * i, _mm256_add_pd(_mm256_loadu_pd(rgba + 4 * i), added));
     }
-}
-
-DFB_AVX2 inline void takeNearestAvx2(float* nearest, int count, const float* color, const float* depth)
-{
-    const std::ptrdiff_t inBlocks = count - count % 4;
-    for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
-        const float* c = color + 4 * i;
-        const __m128 ab = _mm_unpackhi_ps(_mm_loadu_ps(c), _mm_loadu_ps(c + 4)); // blue, blue, alpha, alpha
-        const __m128 cd = _mm_unpackhi_ps(_mm_loadu_ps(c + 8), _mm_loadu_ps(c + 12));
-        const __m128 alpha = _mm_movehl_ps(cd, ab), d = _mm_loadu_ps(depth + i), so = _mm_loadu_ps(nearest + i);
-        const __m128 isNearer = _mm_and_ps(_mm_cmpgt_ps(alpha, _mm_setzero_ps()), _mm_cmplt_ps(d, so));
-        _mm_storeu_ps(nearest + i, _mm_blendv_ps(so, d, isNearer));
-    }
-    takeNearestPlain(nearest + inBlocks, count % 4, color + 4 * inBlocks, depth + inBlocks);
 }
 
 // A pixel is one register. Its transmittance is another, four times.
@@ -374,7 +360,7 @@ inline void blendConstant(double* rgba, const double* transmittance, int count, 
 
 inline void takeNearest(float* nearest, int count, const float* color, const float* depth)
 {
-    DFB_FASTEST(takeNearestPlain, takeNearestAvx2, nearest, count, color, depth);
+    fastest<takeNearestPlain>(nearest, count, color, depth);
 }
 
 inline void blendLevels(std::uint8_t* levels, int count, const std::uint8_t* layer)

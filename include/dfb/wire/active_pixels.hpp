@@ -316,10 +316,6 @@ DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
     }
     return isNan == 0;
 }
-DFB_AVX2 inline bool copyAndCheckDepthsAvx2(const float* depth, int count, float* out)
-{
-    return copyAndCheckDepths(depth, count, out);
-}
 
 // Copies `count` pixels of a channel, from place `first` of its plane on, as they travel; `hasBytes`: the colour has 8
 // bits a channel. False if a colour is not finite, an alpha not within [0, 1], or a depth NaN.
@@ -336,7 +332,7 @@ inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t c
     }
     if (channel == Depth) {
         const float* depth = floatsOf(planes.at[Depth]) + first;
-        return DFB_FASTEST(copyAndCheckDepths, copyAndCheckDepthsAvx2, depth, count, floatsOf(out));
+        return fastest<copyAndCheckDepths>(depth, count, floatsOf(out));
     }
     const auto bytes = static_cast<std::ptrdiff_t>(4 * channelWords[channel]);
     std::memcpy(out, planes.at[channel] + bytes * first, static_cast<std::size_t>(bytes * count));

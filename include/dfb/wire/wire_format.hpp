@@ -122,13 +122,9 @@ DFB_INLINE void decodeBytes(const std::byte* in, std::size_t count, float* rgba)
     for (std::size_t i = 0; i < 4 * count; ++i)
         rgba[i] = static_cast<float>(static_cast<std::uint8_t>(in[i])) / 255.0f;
 }
-DFB_AVX2 inline void decodeBytesAvx2(const std::byte* in, std::size_t count, float* rgba) noexcept
-{
-    decodeBytes(in, count, rgba);
-}
 inline void bytesToFloats(const std::byte* in, std::size_t count, float* rgba) noexcept
 {
-    cpuHasAvx2() ? decodeBytesAvx2(in, count, rgba) : decodeBytes(in, count, rgba);
+    fastest<decodeBytes>(in, count, rgba);
 }
 
 // Whether all pixels have 0 <= alpha <= 1 and 0 <= color <= maxColor * alpha. No branch, so that it can be vectorized.
