@@ -367,7 +367,7 @@ public:
         std::string error;
         try {
             if (fb_.isDisplayRank())
-                view_ = std::make_unique<example::LiveView>("in_situ", *options.live, true);
+                view_ = example::LiveView::listen("in_situ", *options.live, true);
         } catch (const std::runtime_error& e) {
             error = e.what();
         }

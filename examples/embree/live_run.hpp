@@ -46,7 +46,7 @@ public:
         const Interrupt interrupt;
         const auto listen = [&] {
             if (fb_.isDisplayRank())
-                view_ = std::make_unique<LiveView>(titleOf(o_.scene), *o_.live, false);
+                view_ = LiveView::listen(titleOf(o_.scene), *o_.live, false);
         };
         if (!onAllRanks(fb_, listen) || !onAllRanks(fb_, [&] { load(); }))
             return exitFailed;

@@ -145,9 +145,7 @@ std::uint64_t wholeNumber(const httplib::Request& request, const char* name, std
     return std::stoull(text);
 }
 
-} // namespace
-
-class LiveView::Server {
+class Server final : public LiveView {
 public:
     Server(const std::string& title, int port, bool hasSteps) : title_(title), hasSteps_(hasSteps)
     {
@@ -172,7 +170,7 @@ public:
             std::this_thread::yield();
     }
 
-    ~Server()
+    ~Server() override
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
@@ -184,9 +182,9 @@ public:
         listener_.join();
     }
 
-    const std::string& url() const { return url_; }
+    const std::string& url() const override { return url_; }
 
-    void open(const LiveScene& scene, const LiveWishes& home)
+    void open(const LiveScene& scene, const LiveWishes& home) override
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         scene_ = scene;
@@ -195,13 +193,13 @@ public:
         home_ = home.camera;
     }
 
-    LiveWishes wishes() const
+    LiveWishes wishes() const override
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         return current();
     }
 
-    LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const
+    LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const override
     {
         const auto until = std::chrono::steady_clock::now() + std::min<std::chrono::milliseconds>(atMost, longest);
         std::unique_lock<std::mutex> lock(mutex_);
@@ -215,12 +213,13 @@ public:
         }
     }
 
-    bool hasMoved(std::uint64_t look) const
+    bool hasMoved(std::uint64_t look) const override
     {
         return ends_ || Interrupt::happened() || (look != anyLook && look_ != look);
     }
 
-    void whileWatching(std::uint64_t look, const std::function<void()>& onMove, const std::function<void()>& work)
+    void whileWatching(std::uint64_t look, const std::function<void()>& onMove,
+                       const std::function<void()>& work) override
     {
         struct Watch {
             Server& server;
@@ -240,7 +239,8 @@ public:
         work();
     }
 
-    void show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report, LivePicture picture)
+    void show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report,
+              LivePicture picture) override
     {
         const std::uint64_t number = shown_ ? shown_->number + 1 : 1; // only this thread changes it
         auto next = std::make_shared<const Shown>(number, rgba, width, height, report, std::move(picture));
@@ -567,28 +567,11 @@ private:
     std::thread listener_;
 };
 
-LiveView::LiveView(const std::string& title, int port, bool hasSteps)
-    : server_(std::make_unique<Server>(title, port, hasSteps))
-{
-}
-LiveView::~LiveView() = default;
+} // namespace
 
-const std::string& LiveView::url() const { return server_->url(); }
-void LiveView::open(const LiveScene& scene, const LiveWishes& home) { server_->open(scene, home); }
-LiveWishes LiveView::wishes() const { return server_->wishes(); }
-LiveWishes LiveView::waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const
+std::unique_ptr<LiveView> LiveView::listen(const std::string& title, int port, bool hasSteps)
 {
-    return server_->waitForChange(number, atMost);
-}
-bool LiveView::hasMoved(std::uint64_t look) const { return server_->hasMoved(look); }
-void LiveView::whileWatching(std::uint64_t look, const std::function<void()>& onMove, const std::function<void()>& work)
-{
-    server_->whileWatching(look, onMove, work);
-}
-void LiveView::show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report,
-                    LivePicture picture)
-{
-    server_->show(rgba, width, height, report, std::move(picture));
+    return std::make_unique<Server>(title, port, hasSteps);
 }
 
 } // namespace example

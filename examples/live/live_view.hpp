@@ -70,37 +70,37 @@ public:
     // Begins to listen. `port` 0: any port that is free; -1: the default port, or any if that is taken. `title` is
     // shown on the page; `hasSteps`: there is a simulation that can be paused. Throws std::runtime_error if the port
     // cannot be had, or if this program was built without what a live view needs.
-    LiveView(const std::string& title, int port, bool hasSteps);
-    // Tells the viewers that the job has ended. Waits until their requests are answered, two seconds at most.
-    ~LiveView();
+    static std::unique_ptr<LiveView> listen(const std::string& title, int port, bool hasSteps);
+
+    LiveView() = default;
     LiveView(const LiveView&) = delete;
     LiveView& operator=(const LiveView&) = delete;
+    // Tells the viewers that the job has ended. Waits until their requests are answered, two seconds at most.
+    virtual ~LiveView() = default;
 
     // For a browser on this machine.
-    const std::string& url() const;
+    virtual const std::string& url() const = 0;
 
     // Viewers may have wishes from now on; `home` is what is shown until they have.
-    void open(const LiveScene& scene, const LiveWishes& home);
+    virtual void open(const LiveScene& scene, const LiveWishes& home) = 0;
 
     // Returns their wishes of this moment. Any thread.
-    LiveWishes wishes() const;
+    virtual LiveWishes wishes() const = 0;
     // Waits until they want something else than at `number`, or the job is to end, or for `atMost`.
-    LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const;
+    virtual LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const = 0;
 
     // Whether camera or size have changed since `look`, or the job is to end. Cheap. Any thread.
-    bool hasMoved(std::uint64_t look) const;
+    virtual bool hasMoved(std::uint64_t look) const = 0;
     static constexpr std::uint64_t anyLook = ~std::uint64_t{0}; // for those two: only whether the job is to end
     // Runs `work`. If hasMoved() becomes true meanwhile, or is, `onMove` is called once, by any thread, unless it is
     // for a signal, for which work() must look itself.
-    void whileWatching(std::uint64_t look, const std::function<void()>& onMove, const std::function<void()>& work);
+    virtual void whileWatching(std::uint64_t look, const std::function<void()>& onMove,
+                               const std::function<void()>& work) = 0;
 
     // Shows 8-bit RGBA pixels, whose alpha is left out, and what the report says of them. Copies both; waits for no
     // viewer. By one thread.
-    void show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report, LivePicture picture);
-
-private:
-    class Server;
-    std::unique_ptr<Server> server_;
+    virtual void show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report,
+                      LivePicture picture) = 0;
 };
 
 // The tiles of a framebuffer, for the picture.

@@ -50,7 +50,7 @@ std::vector<std::uint8_t> pixelsOf(int width, int height, int shade)
 
 // A view that listens on any port, with a scene.
 struct Fixture {
-    explicit Fixture(bool hasSteps = true) : view("a title", 0, hasSteps)
+    explicit Fixture(bool hasSteps = true) : made(example::LiveView::listen("a title", 0, hasSteps)), view(*made)
     {
         example::LiveScene scene;
         scene.mostSamples = 64;
@@ -93,7 +93,8 @@ struct Fixture {
         view.show(pixelsOf(width, height, shade).data(), width, height, {}, picture);
     }
 
-    example::LiveView view;
+    std::unique_ptr<example::LiveView> made;
+    example::LiveView& view;
     int port = 0;
     std::string token;
 };
@@ -163,7 +164,7 @@ TEST_CASE("a live view listens on the loopback address alone, with a new token e
     CHECK(one.port != other.port);
     std::string why;
     try {
-        example::LiveView("second", one.port, false);
+        example::LiveView::listen("second", one.port, false);
     } catch (const std::runtime_error& e) {
         why = e.what();
     }
