@@ -18,6 +18,7 @@
 #include <string>
 #include <type_traits>
 #include <utility>
+#include <variant>
 #include <vector>
 
 namespace {
@@ -169,56 +170,9 @@ struct Scene {
     void* user;
 };
 
-// ---- pictures of bricks
-
-// A framebuffer of any operation. The members are collective.
-class BrickPicture {
-public:
-    virtual ~BrickPicture() = default;
-    virtual dfb::FrameReport render(const Scene& scene, const dfb::MatrixCamera& camera,
-                                    const dfb::FrameConfig& frame) = 0;
-    // In place of render(), on a rank that cannot: fails the picture on all ranks.
-    virtual dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame) = 0;
-    virtual const dfb::Image& image() const = 0;
-    virtual dfb::Image imageOnAllRanks() = 0;
-};
-
-template <class TileOp>
-class BrickPictureOf final : public BrickPicture {
-public:
-    BrickPictureOf(std::shared_ptr<dfb::Connection> connection, dfb::FrameBufferConfig config)
-        : fb_(std::move(connection), std::move(config))
-    {
-    }
-
-    dfb::FrameReport render(const Scene& scene, const dfb::MatrixCamera& camera, const dfb::FrameConfig& frame) override
-    {
-        dfb::DataParallelLoop loop(fb_, scene.world);
-        return loop.render(
-            camera, [&](const dfb::Brick& brick, auto& tile) { scene(brick, tile, fb_.layout()); }, frame);
-    }
-    dfb::FrameReport fail(const std::exception_ptr& why, dfb::FrameConfig frame) override
-    {
-        frame.declared = true; // as in the loop that the other ranks are in
-        auto open = fb_.begin(frame);
-        open.abort(why);
-        return open.end();
-    }
-    const dfb::Image& image() const override { return fb_.image(); }
-    dfb::Image imageOnAllRanks() override { return fb_.imageOnAllRanks(); }
-
-private:
-    dfb::DistributedFrameBuffer<TileOp> fb_;
-};
-
-std::unique_ptr<BrickPicture> makeBrickPicture(dfb::ImageBlend blend,
-                                               const std::shared_ptr<dfb::Connection>& connection,
-                                               const dfb::FrameBufferConfig& config)
-{
-    if (blend == dfb::ImageBlend::Nearest)
-        return std::make_unique<BrickPictureOf<dfb::DepthComposite>>(connection, config);
-    return std::make_unique<BrickPictureOf<dfb::AlphaBlend>>(connection, config);
-}
+// A framebuffer for pictures of bricks. Calls of its members are collective.
+using BrickPicture =
+    std::variant<dfb::DistributedFrameBuffer<dfb::AlphaBlend>, dfb::DistributedFrameBuffer<dfb::DepthComposite>>;
 
 } // namespace
 
@@ -261,7 +215,9 @@ struct dfb_framebuffer {
     {
         if (!everywhere.empty())
             return everywhere;
-        return showsBricks ? bricks->image() : images->image();
+        if (!showsBricks)
+            return images->image();
+        return std::visit([](const auto& framebuffer) -> const dfb::Image& { return framebuffer.image(); }, *bricks);
     }
 
     std::shared_ptr<dfb::Connection> connection;
@@ -269,7 +225,7 @@ struct dfb_framebuffer {
     dfb::FrameBufferConfig frameBufferConfig;
     dfb::FrameConfig frame;
     std::unique_ptr<dfb::ImageCompositor> images;
-    std::unique_ptr<BrickPicture> bricks;
+    std::optional<BrickPicture> bricks;
     bool showsBricks = false; // the last picture
     dfb::Image everywhere;    // the last picture, if this rank has asked for a copy
     std::optional<dfb::FrameReport> report;
@@ -426,8 +382,10 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
     return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
         if (fb.blend == dfb::ImageBlend::InOrder)
             refuse("bricks are blended by depth, not in an order of the ranks");
-        if (!fb.bricks)
-            fb.bricks = makeBrickPicture(fb.blend, fb.connection, fb.frameBufferConfig);
+        if (!fb.bricks && fb.blend == dfb::ImageBlend::Nearest)
+            fb.bricks.emplace(std::in_place_index<1>, fb.connection, fb.frameBufferConfig);
+        else if (!fb.bricks)
+            fb.bricks.emplace(std::in_place_index<0>, fb.connection, fb.frameBufferConfig);
         newPicture(fb, true);
         std::optional<Scene> scene;
         std::optional<dfb::MatrixCamera> camera;
@@ -438,7 +396,20 @@ int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count,
         } catch (...) {
             wrong = std::current_exception();
         }
-        fb.report = wrong ? fb.bricks->fail(wrong, fb.frame) : fb.bricks->render(*scene, *camera, fb.frame);
+        const auto makePicture = [&](auto& bricksOfAll) {
+            if (!wrong)
+                return dfb::DataParallelLoop(bricksOfAll, scene->world)
+                    .render(
+                        *camera,
+                        [&](const dfb::Brick& brick, auto& tile) { (*scene)(brick, tile, bricksOfAll.layout()); },
+                        fb.frame);
+            dfb::FrameConfig frame = fb.frame;
+            frame.declared = true; // as in the loop that the other ranks are in
+            auto open = bricksOfAll.begin(frame);
+            open.abort(wrong);
+            return open.end();
+        };
+        fb.report = std::visit(makePicture, *fb.bricks);
     });
 }
 
@@ -463,7 +434,8 @@ const float* dfb_image_depth(const dfb_framebuffer* framebuffer)
 int dfb_image_on_all_ranks(dfb_framebuffer* framebuffer)
 {
     return inFramebuffer(framebuffer, [](dfb_framebuffer& fb) {
-        fb.everywhere = fb.showsBricks ? fb.bricks->imageOnAllRanks() : fb.images->imageOnAllRanks();
+        fb.everywhere = fb.showsBricks ? std::visit([](auto& bricks) { return bricks.imageOnAllRanks(); }, *fb.bricks)
+                                       : fb.images->imageOnAllRanks();
     });
 }
 
