@@ -63,14 +63,12 @@ MPI_Comm mpiOf(IceTCommunicator communicator)
 
 extern "C" IceTCommunicator icetCreateMPICommunicator(MPI_Comm comm)
 {
-    return guarded(
-        "icetCreateMPICommunicator", [&] { return make(comm); }, IceTCommunicator{});
+    return guarded("icetCreateMPICommunicator", [&] { return make(comm); });
 }
 
 extern "C" void icetDestroyMPICommunicator(IceTCommunicator communicator)
 {
-    guarded(
-        "icetDestroyMPICommunicator", [&] { return mpiOf(communicator), destroy(communicator), 0; }, 0);
+    guarded("icetDestroyMPICommunicator", [&] { mpiOf(communicator), destroy(communicator); });
 }
 
 } // namespace dfb_icet

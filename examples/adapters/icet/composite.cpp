@@ -329,7 +329,7 @@ extern "C" IceTImage icetCompositeImage(const IceTVoid* color, const IceTVoid* d
         };
         return makeFrame(context, {projection, modelview, background}, {true, &limits, input});
     };
-    return guarded("icetCompositeImage", composite, IceTImage{nullptr});
+    return guarded("icetCompositeImage", composite);
 }
 
 } // namespace dfb_icet

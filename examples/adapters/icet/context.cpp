@@ -48,8 +48,7 @@ void requireThere(IceTContext context)
 int closeAll(MPI_Comm, int, void*, void*)
 {
     for (const IceTContext context : contexts)
-        guarded(
-            "MPI_Finalize", [&] { return context->close(), 0; }, 0);
+        guarded("MPI_Finalize", [&] { context->close(); });
     return MPI_SUCCESS;
 }
 
@@ -131,44 +130,37 @@ std::chrono::milliseconds timeLimit()
 
 extern "C" IceTContext icetCreateContext(IceTCommunicator communicator)
 {
-    return guarded(
-        "icetCreateContext", [&] { return current = new IceTContextStruct(mpiOf(communicator)); }, IceTContext{});
+    return guarded("icetCreateContext", [&] { return current = new IceTContextStruct(mpiOf(communicator)); });
 }
 
 extern "C" void icetDestroyContext(IceTContext context)
 {
-    const auto destroy = [&] {
+    guarded("icetDestroyContext", [&] {
         requireThere(context);
         if (context == current)
             current = nullptr;
         delete context;
-        return 0;
-    };
-    guarded("icetDestroyContext", destroy, 0);
+    });
 }
 
 extern "C" IceTContext icetGetContext() { return current; }
 
 extern "C" void icetSetContext(IceTContext context)
 {
-    const auto set = [&] {
+    guarded("icetSetContext", [&] {
         if (context)
             requireThere(context);
         current = context;
-        return 0;
-    };
-    guarded("icetSetContext", set, 0);
+    });
 }
 
 extern "C" void icetCopyState(IceTContext to, const IceTContext from)
 {
-    const auto copy = [&] {
+    guarded("icetCopyState", [&] {
         requireThere(to);
         requireThere(from);
         to->settings = from->settings;
-        return 0;
-    };
-    guarded("icetCopyState", copy, 0);
+    });
 }
 
 extern "C" void icetDataReplicationGroupColor(IceTInt color)

@@ -117,11 +117,10 @@ private:
 extern "C" IceTImage icetDrawFrame(const IceTDouble* projection, const IceTDouble* modelview,
                                    const IceTFloat* background)
 {
-    const auto draw = [&] {
+    return guarded("icetDrawFrame", [&] {
         IceTContextStruct& context = currentContext();
         return makeFrame(context, {projection, modelview, background}, {false, nullptr, Renderer(context)});
-    };
-    return guarded("icetDrawFrame", draw, IceTImage{nullptr});
+    });
 }
 
 } // namespace dfb_icet

@@ -6,7 +6,6 @@
 #include <exception>
 #include <stdexcept>
 #include <string>
-#include <utility>
 
 struct IceTContextStruct;
 
@@ -27,9 +26,9 @@ void sayDebug(const std::string& text);
 // The context that calls work on. Throws Error if there is none.
 IceTContextStruct& currentContext();
 
-// Returns what body() does. No exception leaves an IceT function: it becomes an IceT error, and `fallback` is returned.
-template <class Body, class Result = decltype(std::declval<Body>()())>
-Result guarded(const char* function, Body&& body, Result fallback)
+// Returns what body() does. No exception leaves an IceT function: it becomes an IceT error, and 0 or null is returned.
+template <class Body>
+auto guarded(const char* function, const Body& body) -> decltype(body())
 {
     try {
         return body();
@@ -38,15 +37,14 @@ Result guarded(const char* function, Body&& body, Result fallback)
     } catch (...) {
         raiseError(function, Error(ICET_INVALID_OPERATION, "an exception of an unknown type"));
     }
-    return fallback;
+    return decltype(body())();
 }
 
 // Calls body(context) with the current context in this way.
 template <class Body>
-void inContext(const char* function, Body&& body)
+void inContext(const char* function, const Body& body)
 {
-    guarded(
-        function, [&] { return body(currentContext()), 0; }, 0);
+    guarded(function, [&] { body(currentContext()); });
 }
 
 } // namespace dfb_icet

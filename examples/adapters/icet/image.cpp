@@ -156,61 +156,50 @@ IceTSizeType icetImageGetNumPixels(const IceTImage image)
 
 IceTUByte* icetImageGetColorub(IceTImage image)
 {
-    const auto find = [&] { return static_cast<IceTUByte*>(withBytes(image).writableColor()); };
-    return guarded("icetImageGetColorub", find, static_cast<IceTUByte*>(nullptr));
+    return guarded("icetImageGetColorub", [&] { return static_cast<IceTUByte*>(withBytes(image).writableColor()); });
 }
 IceTUInt* icetImageGetColorui(IceTImage image)
 {
-    const auto find = [&] { return static_cast<IceTUInt*>(withBytes(image).writableColor()); };
-    return guarded("icetImageGetColorui", find, static_cast<IceTUInt*>(nullptr));
+    return guarded("icetImageGetColorui", [&] { return static_cast<IceTUInt*>(withBytes(image).writableColor()); });
 }
 IceTFloat* icetImageGetColorf(IceTImage image)
 {
-    const auto find = [&] { return static_cast<IceTFloat*>(withFloats(image).writableColor()); };
-    return guarded("icetImageGetColorf", find, static_cast<IceTFloat*>(nullptr));
+    return guarded("icetImageGetColorf", [&] { return static_cast<IceTFloat*>(withFloats(image).writableColor()); });
 }
 IceTFloat* icetImageGetDepthf(IceTImage image)
 {
-    const auto find = [&] { return const_cast<IceTFloat*>(withDepth(image).depth); };
-    return guarded("icetImageGetDepthf", find, static_cast<IceTFloat*>(nullptr));
+    return guarded("icetImageGetDepthf", [&] { return const_cast<IceTFloat*>(withDepth(image).depth); });
 }
 
 const IceTUByte* icetImageGetColorcub(const IceTImage image)
 {
-    const auto find = [&] { return static_cast<const IceTUByte*>(withBytes(image).color); };
-    return guarded("icetImageGetColorcub", find, static_cast<const IceTUByte*>(nullptr));
+    return guarded("icetImageGetColorcub", [&] { return static_cast<const IceTUByte*>(withBytes(image).color); });
 }
 const IceTFloat* icetImageGetColorcf(const IceTImage image)
 {
-    const auto find = [&] { return static_cast<const IceTFloat*>(withFloats(image).color); };
-    return guarded("icetImageGetColorcf", find, static_cast<const IceTFloat*>(nullptr));
+    return guarded("icetImageGetColorcf", [&] { return static_cast<const IceTFloat*>(withFloats(image).color); });
 }
 const IceTFloat* icetImageGetDepthcf(const IceTImage image)
 {
-    const auto find = [&] { return withDepth(image).depth; };
-    return guarded("icetImageGetDepthcf", find, static_cast<const IceTFloat*>(nullptr));
+    return guarded("icetImageGetDepthcf", [&] { return withDepth(image).depth; });
 }
 
 void icetImageCopyColorub(const IceTImage image, IceTUByte* out, IceTEnum format)
 {
-    guarded(
-        "icetImageCopyColorub", [&] { return copyBytes(image, out, format), 0; }, 0);
+    guarded("icetImageCopyColorub", [&] { copyBytes(image, out, format); });
 }
 void icetImageCopyColorf(const IceTImage image, IceTFloat* out, IceTEnum format)
 {
-    guarded(
-        "icetImageCopyColorf", [&] { return copyFloats(image, out, format), 0; }, 0);
+    guarded("icetImageCopyColorf", [&] { copyFloats(image, out, format); });
 }
 void icetImageCopyDepthf(const IceTImage image, IceTFloat* out, IceTEnum format)
 {
-    const auto copy = [&] {
+    guarded("icetImageCopyDepthf", [&] {
         if (format != ICET_IMAGE_DEPTH_FLOAT)
             throw Error(ICET_INVALID_ENUM, "the depth format is not of type float");
         const Image& from = withDepth(image);
         std::memcpy(out, from.depth, sizeof(float) * from.pixelCount());
-        return 0;
-    };
-    guarded("icetImageCopyDepthf", copy, 0);
+    });
 }
 }
 

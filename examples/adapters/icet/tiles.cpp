@@ -73,12 +73,11 @@ extern "C" void icetResetTiles()
 
 extern "C" int icetAddTile(IceTInt x, IceTInt y, IceTSizeType width, IceTSizeType height, int displayRank)
 {
-    return guarded(
-        "icetAddTile",
-        [&] {
-            return addTile(currentContext(), {{x, y, width, height}, displayRank});
-        },
-        -1);
+    int index = -1;
+    inContext("icetAddTile", [&](IceTContextStruct& context) {
+        index = addTile(context, {{x, y, width, height}, displayRank});
+    });
+    return index;
 }
 
 extern "C" void icetPhysicalRenderSize(IceTInt width, IceTInt height)
