@@ -10,7 +10,9 @@
 #include <dfb/image.hpp>
 
 #include <pybind11/pybind11.h>
+#include <pybind11/stl.h>
 
+#include <array>
 #include <memory>
 #include <optional>
 #include <string>
@@ -58,19 +60,17 @@ public:
     {
         const Use use(*this);
         const bool hasArrays = views_->any();
-        const Number newWidth(width), newHeight(height);
+        py::detail::make_caster<std::array<int, 2>> size;
+        std::array<int, 2> to{1, 1}; // is refused on all ranks if there is a veto
         if (hasArrays)
             veto_.set("there are arrays of the image, so it cannot get another size: delete them, or take copies");
-        else if (!newWidth.isOne || !newHeight.isOne)
+        else if (size.load(py::make_tuple(width, height), true))
+            to = py::detail::cast_op<std::array<int, 2>>(size);
+        else
             veto_.set("the new size is " + shown(width) + " x " + shown(height) + ": it must be two ints");
         const std::string vetoed = veto_.text();
         try {
-            withoutGil(*Cause::make(), [&] {
-                if (vetoed.empty())
-                    object_->resize(newWidth.value, newHeight.value);
-                else
-                    object_->resize(1, 1); // is refused on all ranks
-            });
+            withoutGil(*Cause::make(), [&] { object_->resize(to[0], to[1]); });
         } catch (py::error_already_set& error) {
             veto_.clear();
             if (!hasArrays)
@@ -127,18 +127,6 @@ protected:
 
     private:
         Collective& owner_;
-    };
-
-    struct Number {
-        bool isOne = false;
-        int value = 0;
-
-        explicit Number(const py::object& from)
-        {
-            py::detail::make_caster<int> caster;
-            isOne = caster.load(from, true);
-            value = isOne ? py::detail::cast_op<int>(caster) : 0;
-        }
     };
 
     Object& object() const

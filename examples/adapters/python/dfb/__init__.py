@@ -11,6 +11,7 @@ An object takes one call at a time.
 
 import atexit
 import itertools
+import operator
 import sys
 import warnings
 
@@ -101,6 +102,10 @@ def _ranks_of(comm):
     return mpi._addressof(comm)
 
 
+def _of_impl(name, doc):
+    return property(operator.attrgetter("_impl." + name), doc=doc)
+
+
 class _Collective:
     """What both classes have."""
 
@@ -109,35 +114,16 @@ class _Collective:
         self._impl = make(_ranks_of(comm), settings)
         _open[self._number] = self._impl, comm
 
-    @property
-    def rank(self):
-        """This rank."""
-        return self._impl.rank
-
-    @property
-    def size(self):
-        """How many ranks there are."""
-        return self._impl.size
-
-    @property
-    def width(self):
-        """The picture's width in pixels."""
-        return self._impl.width
-
-    @property
-    def height(self):
-        """The picture's height in pixels."""
-        return self._impl.height
+    rank = _of_impl("rank", "This rank.")
+    size = _of_impl("size", "How many ranks there are.")
+    width = _of_impl("width", "The picture's width in pixels.")
+    height = _of_impl("height", "The picture's height in pixels.")
+    closed = _of_impl("closed", "Whether close() has been called.")
 
     @property
     def is_display_rank(self):
         """Whether this rank gets the picture."""
         return self._impl.rank == self._impl.display_rank
-
-    @property
-    def closed(self):
-        """Whether close() has been called."""
-        return self._impl.closed
 
     @property
     def image(self):
