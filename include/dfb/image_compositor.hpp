@@ -246,29 +246,6 @@ private:
     int step_; // pixels
 };
 
-// Lets the calling thread do the work of `threads` and of the connection's progress thread. Nothing without `threads`.
-class OneThread {
-public:
-    OneThread(ThreadExecutor* threads, Connection& connection) : threads_(threads)
-    {
-        if (!threads)
-            return;
-        threads->rest(true);
-        standIn_.emplace(connection);
-    }
-    OneThread(const OneThread&) = delete;
-    OneThread& operator=(const OneThread&) = delete;
-    ~OneThread()
-    {
-        if (threads_)
-            threads_->rest(false);
-    }
-
-private:
-    ThreadExecutor* threads_;
-    std::optional<Connection::StandIn> standIn_;
-};
-
 // The part of an input image that is in one tile, as a view of pixels that a framebuffer takes.
 class InputTile {
 public:
@@ -468,8 +445,14 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image, int place, const FrameConfig& frame)
 {
-    // On one processor the thread that waits here anyway does it all.
-    const detail::OneThread alone(oneThread_.get(), *connection_);
+    // On one processor the thread that waits here anyway does it all, also the work of the progress thread.
+    std::optional<Connection::StandIn> standIn;
+    const auto wake = [](ThreadExecutor* threads) { threads->rest(false); };
+    const std::unique_ptr<ThreadExecutor, decltype(wake)> resting(oneThread_.get(), wake);
+    if (resting) {
+        resting->rest(true);
+        standIn.emplace(*connection_);
+    }
     InputImage staying = image;
     staying.staysUntilEnd = true;
     start(staying, place, frame);
