@@ -129,8 +129,7 @@ public:
     // Where all rays begin, if they do.
     std::optional<Vec3> commonEye() const
     {
-        return std::holds_alternative<dfb::PerspectiveCamera>(camera_) ? std::optional<Vec3>(pinhole_.eye())
-                                                                       : std::nullopt;
+        return std::holds_alternative<dfb::PerspectiveCamera>(camera_) ? pinhole_.commonEye() : std::nullopt;
     }
 
     // The ray through a point of the image, in pixels; its direction is 0 where the camera sees nothing.

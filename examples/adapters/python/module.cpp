@@ -9,7 +9,6 @@
 #include <pybind11/pybind11.h>
 #include <pybind11/stl.h>
 
-#include <algorithm>
 #include <array>
 #include <exception>
 #include <memory>
@@ -38,10 +37,7 @@ std::array<float, 16> columnsOf(const py::object& matrix, const char* name)
 dfb::MatrixCamera matrixCamera(const py::object& view, const py::object& projection)
 {
     const auto v = columnsOf(view, "view"), p = columnsOf(projection, "projection");
-    float viewColumns[16], projectionColumns[16];
-    std::copy(v.begin(), v.end(), viewColumns);
-    std::copy(p.begin(), p.end(), projectionColumns);
-    return dfb::MatrixCamera(viewColumns, projectionColumns);
+    return dfb::MatrixCamera(v.data(), p.data());
 }
 
 template <class Camera>

@@ -10,6 +10,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -22,8 +24,8 @@ DFB_NAMESPACE_BEGIN
 // lowest row to its uppermost in y. The far plane cuts nothing off, the near plane only orthographic rays.
 class MatrixCamera {
 public:
-    // Throws InvalidArgument if a number is not finite or the matrices make no image.
-    MatrixCamera(const float (&view)[16], const float (&projection)[16])
+    // Each has 16 numbers. Throws InvalidArgument if one is not finite or the matrices make no image.
+    MatrixCamera(const float* view, const float* projection)
     {
         for (int r = 0; r < 4; ++r) {
             double row[4] = {};
@@ -55,6 +57,18 @@ public:
 
     // Where all rays begin. Of no use for an orthographic camera.
     Vec3 eye() const noexcept { return detail::vecOf(eye_); }
+    // See dfb/render/visibility.hpp.
+    std::optional<Vec3> commonEye() const
+    {
+        if (!isOrthographic_)
+            return eye();
+        const auto from = [](float direction) {
+            using Limits = std::numeric_limits<float>;
+            return direction == 0 ? Limits::quiet_NaN() : std::copysign(Limits::infinity(), -direction);
+        };
+        const Vec3 d = ray(0, 0, 1, 1).direction;
+        return Vec3{from(d.x), from(d.y), from(d.z)};
+    }
 
     // The ray through a point of the image. It begins at the eye, or for an orthographic camera at the near plane.
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
@@ -74,31 +88,17 @@ public:
                               * std::max(detail::length(rows_[0].normal) * width,
                                          detail::length(rows_[1].normal) * height); // per unit, times w
         const double unit = isOrthographic_ ? 1 : detail::length(w.normal);         // w at distance 1
-        std::vector<PixelPoint> points;
-        points.reserve(8);
-        int behind = 0;
-        bool near = false;
-        double margin = 0;
-        for (int corner = 0; corner < 8; ++corner) {
-            const detail::Point3 p = detail::cornerOf(bounds, corner), d = p - eye_;
-            // Renderers' rays and points are floats: see projectBox().
-            const double rounding =
-                isOrthographic_ ? 0 : 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) * unit;
+        return detail::footprintOf(bounds, width, height, [&](const detail::Point3& p) {
+            const detail::Point3 d = p - eye_;
             const double depth = w.at(p);
-            behind += depth < -rounding;
-            near = near || depth <= rounding;
-            if (near)
-                continue;
-            points.push_back({0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)});
             const double way = isOrthographic_ ? std::fabs(nearPlane().at(p)) / detail::length(nearPlane().normal) : 0;
             const double largest = detail::length(p) + detail::length(eye_) + 2 * way;
-            margin = std::max(margin, 0.125 + 5e-7 * largest * pixels / depth);
-        }
-        if (behind == 8)
-            return {};
-        if (near)
-            return Footprint::whole(width, height);
-        return Footprint(std::move(points), margin, width, height);
+            return detail::SeenCorner{
+                depth,
+                isOrthographic_ ? 0 : 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) * unit,
+                {0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)},
+                5e-7 * largest * pixels / depth};
+        });
     }
 
 private:
@@ -137,8 +137,8 @@ public:
     // Looks along `view`, of any length. Throws InvalidArgument if no camera can be so.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
-        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
-          radius_(static_cast<double>(apertureRadius)), focus_(static_cast<double>(focusDistance))
+        : pose_(detail::poseOf(eye, view, up, fovY)), radius_(static_cast<double>(apertureRadius)),
+          focus_(static_cast<double>(focusDistance))
     {
         if (!(radius_ >= 0) || !(focus_ > 0))
             detail::failArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
@@ -146,27 +146,20 @@ public:
 
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
     {
-        const double scale = 2 * tan_ / height;
-        const detail::Point3 sharp =
-            focus_ * (pose_.forward + (x - 0.5 * width) * scale * pose_.right + (0.5 * height - y) * scale * pose_.up);
+        const detail::Point3 sharp = focus_ * pose_.through(x, y, width, height);
         const double r = radius_ * std::sqrt(sample.lensU), angle = 2 * detail::pi * sample.lensV;
         const detail::Point3 onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
         return {detail::vecOf(pose_.eye + onLens), detail::vecOf(detail::normalized(sharp - onLens))};
     }
 
-    // Seen from a point of the lens at most `radius` off its middle, a point at depth z is off by at most
-    // radius |1/z - 1/focus| in the plane at distance 1, so each corner's image lies in a square around that from the
-    // middle. The hull of all these squares holds the image of the box from every point of the lens.
     Footprint project(const Box3& bounds, int width, int height) const
     {
-        const double scale = 0.5 * height / tan_;
-        return detail::projectBox(bounds, pose_, scale, width, height, 0,
-                                  [&](double depth) { return scale * radius_ * std::fabs(1 / depth - 1 / focus_); });
+        return detail::projectBox(bounds, pose_, width, height, 0, radius_, focus_);
     }
 
 private:
     detail::Pose pose_;
-    double tan_, radius_, focus_;
+    double radius_, focus_;
 };
 
 // Two eyes side by side: the left half of the image is the left one's, the right half the right one's. They are
@@ -175,8 +168,8 @@ class StereoCamera {
 public:
     // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument if no camera can be so.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
-        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)),
-          separation_(static_cast<double>(separation)), convergence_(static_cast<double>(convergence))
+        : pose_(detail::poseOf(eye, view, up, fovY)), separation_(static_cast<double>(separation)),
+          convergence_(static_cast<double>(convergence))
     {
         if (!(separation_ >= 0) || !(convergence_ > 0))
             detail::failArgument("eyes are 0 or more apart and converge at a distance above 0");
@@ -185,7 +178,7 @@ public:
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
     {
         const bool right = x >= 0.5 * width;
-        const double scale = 2 * tan_ / height, offset = right ? 0.5 * separation_ : -0.5 * separation_;
+        const double scale = 2 * pose_.tangent / height, offset = right ? 0.5 * separation_ : -0.5 * separation_;
         const double u = (x - (right ? 0.75 : 0.25) * width) * scale, v = (0.5 * height - y) * scale;
         const detail::Point3 aside = offset * pose_.right;
         const detail::Point3 to = convergence_ * (pose_.forward + u * pose_.right + v * pose_.up);
@@ -195,22 +188,21 @@ public:
     // One per eye, each in its half.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {
-        const double scale = 0.5 * height / tan_;
+        const double scale = 0.5 * height / pose_.tangent;
         std::vector<Footprint> both;
         for (const double side : {-1.0, 1.0}) {
             detail::Pose pose = pose_;
             const double offset = 0.5 * side * separation_;
             pose.eye = pose_.eye + offset * pose_.right;
-            both.push_back(detail::projectBox(bounds, pose, scale, width, height,
-                                              side * 0.25 * width + scale * offset / convergence_,
-                                              [](double) { return 0.0; }));
+            both.push_back(
+                detail::projectBox(bounds, pose, width, height, side * 0.25 * width + scale * offset / convergence_));
         }
         return both;
     }
 
 private:
     detail::Pose pose_;
-    double tan_, separation_, convergence_;
+    double separation_, convergence_;
 };
 
 // An equidistant fisheye for domes: a circle as large as fits into the image, its middle along the view, its border
@@ -277,8 +269,8 @@ public:
     // can be so, for an axis of length 0, and for more than a full turn.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
-        : pose_(detail::poseOf(eye, view, up)), tan_(detail::tanHalf(fovY)), center_(detail::pointOf(center)),
-          axis_(detail::pointOf(axis)), angle_(static_cast<double>(degrees) * detail::pi / 180)
+        : pose_(detail::poseOf(eye, view, up, fovY)), center_(detail::pointOf(center)), axis_(detail::pointOf(axis)),
+          angle_(static_cast<double>(degrees) * detail::pi / 180)
     {
         if (!(detail::length(axis_) > 0) || !(std::fabs(angle_) <= 2 * detail::pi))
             detail::failArgument("the camera turns around an axis, by a full turn at most");
@@ -288,10 +280,7 @@ public:
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
     {
         const detail::Pose pose = at(sample.time);
-        const double scale = 2 * tan_ / height;
-        const detail::Point3 d =
-            pose.forward + (x - 0.5 * width) * scale * pose.right + (0.5 * height - y) * scale * pose.up;
-        return {detail::vecOf(pose.eye), detail::vecOf(detail::normalized(d))};
+        return {detail::vecOf(pose.eye), detail::vecOf(detail::normalized(pose.through(x, y, width, height)))};
     }
 
     // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho
@@ -306,7 +295,7 @@ public:
         const Box3 padded{bounds.lower - Vec3{pad, pad, pad}, bounds.upper + Vec3{pad, pad, pad}};
         std::vector<Footprint> all;
         for (int i = 0; i < parts; ++i)
-            all.push_back(detail::projectBox(padded, at((i + 0.5) / parts), 0.5 * height / tan_, width, height));
+            all.push_back(detail::projectBox(padded, at((i + 0.5) / parts), width, height));
         return all;
     }
 
@@ -320,11 +309,10 @@ private:
     {
         const double angle = angle_ * time;
         return {center_ + turned(pose_.eye - center_, angle), turned(pose_.forward, angle), turned(pose_.right, angle),
-                turned(pose_.up, angle)};
+                turned(pose_.up, angle), pose_.tangent};
     }
 
     detail::Pose pose_;
-    double tan_;
     detail::Point3 center_, axis_;
     double angle_;
 };

@@ -5,9 +5,10 @@
 // It returns the pixels of a width x height image that the box may cover, for any sample position within a pixel. It
 // must not leave out a pixel; a tile too many only costs a header of 64 bytes. In place of a Region it may return a
 // Footprint, a convex polygon that leaves out tiles in the corners of the rectangle, or a std::vector of either: a
-// stereo camera returns two. A camera of your own may also have
+// stereo camera returns two. A camera may also have
 //   std::optional<Vec3> commonEye() const;
-// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order).
+// the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). Parallel
+// rays come from infinitely far away: its coordinates are +-infinity, or NaN along an axis along which no ray goes.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -18,7 +19,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstddef>
-#include <type_traits>
+#include <optional>
 #include <utility>
 #include <vector>
 
@@ -149,6 +150,14 @@ inline Point3 normalized(const Point3& p) { return (1 / length(p)) * p; }
 // Where the eye is and how it looks; the axes are orthonormal.
 struct Pose {
     Point3 eye, forward, right, up;
+    double tangent = 0; // of half the vertical angle of view
+
+    // From the eye to a point of the image that is 1 away along `forward`.
+    Point3 through(double x, double y, int width, int height) const
+    {
+        const double scale = 2 * tangent / height;
+        return forward + (x - 0.5 * width) * scale * right + (0.5 * height - y) * scale * up;
+    }
 };
 
 // Throws InvalidArgument if the view or `up` are none.
@@ -165,23 +174,31 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
     return pose;
 }
 
-inline double tanHalf(float fovY)
+// Throws so, too, for an angle of view that is not in (0, 180) degrees.
+inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
 {
+    Pose pose = poseOf(eye, view, up);
     if (!(fovY > 0 && fovY < 180))
         failArgument("the camera's angle of view must be in (0, 180) degrees");
-    return std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
+    pose.tangent = std::tan(0.5 * static_cast<double>(fovY) * pi / 180);
+    return pose;
 }
 
-// The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, and that has `pixelsPerUnit`
-// at distance 1. Of a box that reaches behind the eye: the whole image. `blur(depth)`: by how many pixels a point at
-// that distance along the view may be off to any side; it must be largest at one of the ends of the box's interval.
+// A corner of a box as a camera sees it.
+struct SeenCorner {
+    double depth, rounding; // a depth below its rounding may have either sign
+    PixelPoint at;
+    double margin, blur = 0; // blur: by how many pixels it may be off to any side
+};
+
+// The footprint of a box, of which `see(point)` returns the SeenCorners. Of a box that reaches behind the eye: the
+// whole image; of one that is behind it altogether: nothing.
 //
 // The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the
 // rounding of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels
 // is less than 1/100) and for points some units of the last place of the coordinates.
-template <class Blur>
-Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit, int width, int height, double shiftX,
-                     const Blur& blur)
+template <class See>
+Footprint footprintOf(const Box3& bounds, int width, int height, const See& see)
 {
     std::vector<PixelPoint> points;
     points.reserve(32);
@@ -189,24 +206,19 @@ Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit,
     bool near = false;
     double margin = 0;
     for (int corner = 0; corner < 8; ++corner) {
-        const Point3 p = cornerOf(bounds, corner), d = p - pose.eye;
-        // The axes are rounded to float: a depth below that rounding may have either sign.
-        const double depth = dot(d, pose.forward);
-        const double rounding = 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z));
-        behind += depth < -rounding;
-        near = near || depth <= rounding;
+        const SeenCorner seen = see(cornerOf(bounds, corner));
+        behind += seen.depth < -seen.rounding;
+        near = near || seen.depth <= seen.rounding;
         if (near)
             continue;
-        const double x = 0.5 * width + shiftX + pixelsPerUnit * dot(d, pose.right) / depth;
-        const double y = 0.5 * height - pixelsPerUnit * dot(d, pose.up) / depth;
-        const double b = blur(depth);
+        const auto& [x, y] = seen.at;
+        const double b = seen.blur;
         if (b > 0)
             for (int side = 0; side < 4; ++side)
                 points.push_back({x + (side & 1 ? b : -b), y + (side & 2 ? b : -b)});
         else
-            points.push_back({x, y});
-        const double largest = length(p) + length(pose.eye);
-        margin = std::max(margin, 0.125 + 5e-7 * largest / depth * pixelsPerUnit);
+            points.push_back(seen.at);
+        margin = std::max(margin, 0.125 + seen.margin);
     }
     if (behind == 8)
         return {};
@@ -215,9 +227,25 @@ Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit,
     return Footprint(std::move(points), margin, width, height);
 }
 
-inline Footprint projectBox(const Box3& bounds, const Pose& pose, double pixelsPerUnit, int width, int height)
+// Of a pinhole whose image has its middle at width / 2 + shiftX, or of a lens.
+//
+// Seen from a point of the lens at most `lensRadius` off its middle, a point at depth z is off by at most
+// lensRadius |1/z - 1/focusDistance| in the plane at distance 1, so each corner's image lies in a square around that
+// from the middle. The hull of all these squares holds the image of the box from every point of the lens.
+inline Footprint projectBox(const Box3& bounds, const Pose& pose, int width, int height, double shiftX = 0,
+                            double lensRadius = 0, double focusDistance = 1)
 {
-    return projectBox(bounds, pose, pixelsPerUnit, width, height, 0, [](double) { return 0.0; });
+    const double pixelsPerUnit = 0.5 * height / pose.tangent; // at distance 1
+    return footprintOf(bounds, width, height, [&](const Point3& p) {
+        const Point3 d = p - pose.eye;
+        const double depth = dot(d, pose.forward);
+        return SeenCorner{depth,
+                          1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)), // the axes are rounded to float
+                          {0.5 * width + shiftX + pixelsPerUnit * dot(d, pose.right) / depth,
+                           0.5 * height - pixelsPerUnit * dot(d, pose.up) / depth},
+                          5e-7 * (length(p) + length(pose.eye)) / depth * pixelsPerUnit,
+                          pixelsPerUnit * lensRadius * std::fabs(1 / depth - 1 / focusDistance)};
+    });
 }
 
 } // namespace detail
@@ -238,17 +266,18 @@ public:
     // Looks from `eye` to `target`; `fovY` is the vertical angle of view in degrees. Throws InvalidArgument if the two
     // coincide, `up` is along the view, or the angle is not in (0, 180).
     PerspectiveCamera(const Vec3& eye, const Vec3& target, const Vec3& up, float fovY)
-        : PerspectiveCamera(detail::poseOf(eye, target - eye, up), fovY)
+        : PerspectiveCamera(detail::poseOf(eye, target - eye, up, fovY))
     {
     }
 
     // Looks along `view`, of any length: also where the eye is so far from the origin that no target near it is exact.
     static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
     {
-        return PerspectiveCamera(detail::poseOf(eye, view, up), fovY);
+        return PerspectiveCamera(detail::poseOf(eye, view, up, fovY));
     }
 
     Vec3 eye() const noexcept { return detail::vecOf(pose_.eye); }
+    std::optional<Vec3> commonEye() const noexcept { return eye(); } // see the top of this file
 
     // The axes of the camera: unit vectors at right angles to each other.
     Vec3 forward() const noexcept { return detail::vecOf(pose_.forward); }
@@ -258,9 +287,7 @@ public:
     // The unit direction from the eye through point (x, y) of the image, in pixels; pixel centres are at .5.
     Vec3 direction(double x, double y, int width, int height) const
     {
-        const double scale = 2 * tan_ / height;
-        return detail::vecOf(detail::normalized(pose_.forward + (x - 0.5 * width) * scale * pose_.right
-                                                + (0.5 * height - y) * scale * pose_.up));
+        return detail::vecOf(detail::normalized(pose_.through(x, y, width, height)));
     }
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
     {
@@ -270,14 +297,13 @@ public:
     // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
     Footprint project(const Box3& bounds, int width, int height) const
     {
-        return detail::projectBox(bounds, pose_, 0.5 * height / tan_, width, height);
+        return detail::projectBox(bounds, pose_, width, height);
     }
 
 private:
-    PerspectiveCamera(const detail::Pose& pose, float fovY) : pose_(pose), tan_(detail::tanHalf(fovY)) {}
+    explicit PerspectiveCamera(const detail::Pose& pose) : pose_(pose) {}
 
     detail::Pose pose_;
-    double tan_;
 };
 
 // A brick, by its place in bricks() of a World or a SharedWorld, and a tile that it may project to.
