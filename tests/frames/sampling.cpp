@@ -288,7 +288,7 @@ struct Adaptive {
         const std::int64_t tiles = fb.allReduce({rendered.load()}, NoisyFrameBuffer<Transport>::Reduce::Sum).front();
         result.expect(tiles * 256 == sampler.samplesTaken(), "tiles were rendered for nothing");
         result.expect(sampler.samplesTaken() + sampler.samplesSaved()
-                          == static_cast<std::int64_t>(s.width) * s.height * sampler.samplesOf(27),
+                          == static_cast<std::int64_t>(s.width) * s.height * sampler.next().samples->at(27).first,
                       "samples saved");
         if (fb.isDisplayRank())
             result.hash = dfb::testing::hashOf(fb.image().rgba32f(), 16 * fb.image().pixelCount());
@@ -332,9 +332,9 @@ struct DarkCorners {
             const dfb::Region r = fb.layout().region(tile);
             // The error that was promised is that of the block of 8x8 pixels that has the corner.
             const double error = s.error(fb.image(), {r.x0 + 8, r.y0 + 8, r.x1, r.y1});
-            result.expect(error <= 1.6 * maxError, "tile " + std::to_string(tile) + " is off by "
-                                                       + std::to_string(error) + " after "
-                                                       + std::to_string(sampler.samplesOf(tile)));
+            result.expect(error <= 1.6 * maxError,
+                          "tile " + std::to_string(tile) + " is off by " + std::to_string(error) + " after "
+                              + std::to_string(sampler.next().samples->at(static_cast<std::size_t>(tile)).first));
         }
         return result;
     }

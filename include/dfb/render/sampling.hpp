@@ -108,8 +108,6 @@ public:
             all += most * pixelsOf(t);
         return all - samplesTaken();
     }
-    // Of one tile.
-    int samplesOf(int tile) const { return taken_[static_cast<std::size_t>(tile)]; }
 
 private:
     static constexpr double untouched = -1; // nothing projects to the tile
