@@ -152,7 +152,7 @@ public:
         for (const dfb::PerspectiveCamera& camera : orbitOf(viewCount, grid_.size(), 1.9f)) {
             MarchedView view{camera, {}};
             for (const int brick : dfb::visibilityOrder(*shared_, camera.eye()))
-                view.order.push_back(static_cast<int>(shared_->bricks()[static_cast<std::size_t>(brick)].brick.id));
+                view.order.push_back(static_cast<int>(shared_->bricks()[static_cast<std::size_t>(brick)].id));
             views_.push_back(std::move(view));
         }
     }

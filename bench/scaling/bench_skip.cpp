@@ -275,7 +275,7 @@ OrbitTiles orbitAround(int width, int height, double renderUs)
                 bool isHidden = false;
                 const dfb::Region region = fb.layout().region(t);
                 for (const int b : order) {
-                    const dfb::Box3& box = world.bricks()[static_cast<std::size_t>(b)].brick.bounds;
+                    const dfb::Box3& box = world.bricks()[static_cast<std::size_t>(b)].bounds;
                     if (!camera.project(box, width, height).meets(region))
                         continue;
                     ++tiles.all;

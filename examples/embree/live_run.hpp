@@ -82,7 +82,7 @@ private:
         scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
         o_.view = withoutEye(scene_->info.focus, scene_->view);
         settings_ = renderSettings(o_);
-        world_ = worldOf(*scene_, settings_);
+        world_ = worldOf(*scene_);
         params_.maxLayers = static_cast<int>(scene_->bounds.size());
         const std::array<float, 3> behind = o_.background.value_or(std::array<float, 3>{0, 0, 0});
         params_.background = {behind[0], behind[1], behind[2], 1};

@@ -110,7 +110,7 @@ private:
     void prepare(ProgressLine& progress)
     {
         work_.settings = renderSettings(o_);
-        work_.world = worldOf(*work_.scene, work_.settings);
+        work_.world = worldOf(*work_.scene);
         if (o_.mode != Mode::Image)
             work_.shared.emplace(*fb_, work_.world);
         work_.tileDone = [this, &progress](std::int64_t work) {

@@ -107,13 +107,11 @@ inline dfb::NetworkConfig networkOf(const Options& o)
     return options;
 }
 
-inline dfb::World worldOf(const RankScene& scene, const RenderSettings& settings)
+inline dfb::World worldOf(const RankScene& scene)
 {
     dfb::World world;
-    const float ghosts = ghostReach(scene.info, settings);
-    const auto box = [](const Box& b) { return dfb::Box3{b.lo, b.hi}; };
     for (const std::uint32_t id : scene.brickIds)
-        world.add({id, box(scene.bounds[id]), box(scene.bounds[id].padded(ghosts))});
+        world.add({id, {scene.bounds[id].lo, scene.bounds[id].hi}});
     return world;
 }
 

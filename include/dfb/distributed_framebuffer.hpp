@@ -211,10 +211,10 @@ public:
 
         // Calls render(tile) for each pass of each of these tiles, after start(). render(tile) calls setTile(tile).
         // Threads, waiting and exceptions as above.
-        template <class Render>
+        template <class WorkerTile = Tile, class Render>
         void forEachTile(const std::vector<int>& tiles, const Render& render)
         {
-            forEachTile(static_cast<std::int64_t>(tiles.size()), [&](std::int64_t i, Tile& tile) {
+            forEachTile<WorkerTile>(static_cast<std::int64_t>(tiles.size()), [&](std::int64_t i, WorkerTile& tile) {
                 const int index = tiles[static_cast<std::size_t>(i)];
                 for (int pass = 0; pass < samples(index).count && !failed(); ++pass) {
                     start(tile, index, pass);

@@ -44,7 +44,7 @@ dfb::FrameReport render(FrameBuffer& fb, Loop loop, const scene::Scene& s, const
         tile.pass = pass;
     };
     const auto renderFirst = [&](auto& tile) { renderBrick(s.bricks.front(), tile); };
-    dfb::RoundRobinBricks inTurn{true};
+    scene::PassesInTurn inTurn;
     switch (loop) {
     case Loop::ImageOwned: return dfb::ImageParallelLoop(fb).render(renderFirst, params);
     case Loop::ImageRoundRobin:

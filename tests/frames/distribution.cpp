@@ -73,14 +73,15 @@ struct Mixed {
                                                     + std::to_string(3 * pairs));
                 rendered.clear();
             };
-            for (const bool share : {false, true}) {
-                dfb::RoundRobinBricks owner{share};
+            const auto inTurn = [&](auto dealer) {
                 const auto report =
-                    dfb::MixedParallelLoop(fb, world, owner).render(scene::FlatCamera(), render, paramsOf(s));
+                    dfb::MixedParallelLoop(fb, world, dealer).render(scene::FlatCamera(), render, paramsOf(s));
                 result.expect(report.figures.empty(), "costs that nobody wants");
                 check(report, name + ", round robin");
                 renderedOnce(name + ", round robin");
-            }
+            };
+            inTurn(dfb::RoundRobinBricks());
+            inTurn(scene::PassesInTurn());
             dfb::MeasuredCostBricks owner;
             dfb::MixedParallelLoop loop(fb, world, owner);
             for (int frame = 0; frame < 3; ++frame) {
@@ -253,8 +254,8 @@ struct Ordered {
         std::map<std::uint32_t, BrickImage> images;
         for (const dfb::SharedBrick& b : world.bricks())
             for (std::size_t i = 0; i < stride * 61; ++i)
-                if (BrickImage& image = images[b.brick.id]; i % stride < 97)
-                    shade(b.brick, static_cast<int>(i % stride), static_cast<int>(i / stride), &image.rgba[4 * i],
+                if (BrickImage& image = images[b.id]; i % stride < 97)
+                    shade(b, static_cast<int>(i % stride), static_cast<int>(i / stride), &image.rgba[4 * i],
                           image.depth[i]);
         const auto findBrick = dfb::inPlace([&](const dfb::Brick& b, auto& view) {
             const std::size_t first =
@@ -266,7 +267,7 @@ struct Ordered {
         dfb::FrameConfig params;
         params.passes = 2;
         params.background = {0.1f, 0.2f, 0.3f, 1};
-        dfb::RoundRobinBricks owner{copies > 1};
+        scene::PassesInTurn owner;
         const auto frame = [&](const auto& brickSource) {
             if constexpr (way == Way::InOrder)
                 return dfb::OrderedLoop(fb, world, owner)

@@ -48,7 +48,7 @@ struct Hidden {
         const dfb::SharedWorld world(fb, mine);
         std::vector<int> order(6);
         for (std::size_t place = 0; place < 6; ++place)
-            order[world.bricks()[place].brick.id] = static_cast<int>(place);
+            order[world.bricks()[place].id] = static_cast<int>(place);
         dfb::RoundRobinBricks owner;
         dfb::OrderedLoop loop(fb, world, owner);
         std::atomic<int> rendered{0};

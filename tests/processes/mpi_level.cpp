@@ -196,12 +196,14 @@ void smallPool()
     std::vector<int> mine;
     for (int tile = fb.rank(); tile < fb.layout().tileCount(); tile += fb.size())
         mine.push_back(tile);
-    dfb::ImageParallelLoop loop(fb, mine);
     for (int frame = 0; frame < 3; ++frame) {
-        loop.render([&](auto& tile) {
+        auto open = fb.begin();
+        open.forEachTile(mine, [&](auto& tile) {
             tile.fill({0, greenOf(frame) / 255.0f, blueOf(tile.tile) / 255.0f, 1});
             fb.poll();
+            open.setTile(tile);
         });
+        open.end();
         if (fb.isDisplayRank())
             checkImage(fb.image(), fb.layout(), frame, "a small pool");
     }

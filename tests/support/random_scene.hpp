@@ -142,10 +142,18 @@ enum class Loop {
     Listing3,   // by hand, as in the paper: the owner sends a background tile that announces the bricks
     Declared,   // DataParallelLoop
     ImageOwned, // ImageParallelLoop of owned tiles; the scene has one brick
-    ImageDealt  // ImageParallelLoop of tiles dealt out otherwise
+    ImageDealt  // the same of tiles dealt out otherwise
 };
 
 inline bool isDataParallel(Loop loop) { return loop == Loop::Listing3 || loop == Loop::Declared; }
+
+// A tile-brick owner: deals the tiles of a brick, and their passes, in turn to the ranks that hold it.
+struct PassesInTurn {
+    int operator()(const dfb::SharedBrick& brick, int tile, int pass) const
+    {
+        return brick.ranks[(brick.id + static_cast<std::size_t>(tile + pass)) % brick.ranks.size()];
+    }
+};
 
 // Listing 3 of the paper.
 template <class FrameBuffer>
@@ -190,7 +198,14 @@ dfb::FrameReport renderLoop(FrameBuffer& fb, const Scene& s, Loop loop, int deal
         for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
             if ((tile + tile / 5 + deal) % fb.size() == fb.rank())
                 tiles.push_back(tile);
-        return dfb::ImageParallelLoop(fb, tiles).render(render, paramsOf(s));
+        auto params = paramsOf(s);
+        params.maxLayers = 1;
+        auto frame = fb.begin(params);
+        frame.forEachTile(tiles, [&](auto& tile) {
+            render(tile);
+            frame.setTile(tile);
+        });
+        return frame.end();
     }
     case Loop::Declared: break;
     }

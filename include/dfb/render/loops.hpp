@@ -53,6 +53,12 @@ struct TileOf<FrameBuffer, InPlace<Find>> {
 template <class FrameBuffer, class Render>
 using TileFor = typename TileOf<FrameBuffer, Render>::Type;
 
+// A pass of an item, such as a pair of brick and tile.
+struct Job {
+    std::size_t item = 0;
+    int pass = 0;
+};
+
 // A job for each pass of each of some items, numbered item by item.
 class PassJobs {
 public:
@@ -60,41 +66,22 @@ public:
     template <class PassesOf>
     void find(std::size_t itemCount, const PassesOf& passesOf)
     {
-        count_ = 0;
-        passes_ = itemCount > 0 ? passesOf(0) : 1;
-        firstJob_.clear();
-        bool alike = true;
-        for (std::size_t i = 0; i < itemCount; ++i) {
-            const int passes = passesOf(i);
-            alike = alike && passes == passes_;
-            count_ += passes;
-        }
-        if (alike)
-            return;
-        firstJob_.resize(itemCount + 1);
+        firstJob_.assign(1, 0);
         for (std::size_t i = 0; i < itemCount; ++i)
-            firstJob_[i + 1] = firstJob_[i] + passesOf(i);
+            firstJob_.push_back(firstJob_.back() + passesOf(i));
     }
 
-    std::int64_t count() const noexcept { return count_; }
+    std::int64_t count() const noexcept { return firstJob_.back(); }
 
-    struct Job {
-        std::size_t item = 0;
-        int pass = 0;
-    };
     Job at(std::int64_t job) const
     {
-        if (firstJob_.empty())
-            return {static_cast<std::size_t>(job / passes_), static_cast<int>(job % passes_)};
         const auto next = std::upper_bound(firstJob_.begin(), firstJob_.end(), job);
         const auto item = static_cast<std::size_t>(next - firstJob_.begin()) - 1;
         return {item, static_cast<int>(job - firstJob_[item])};
     }
 
 private:
-    int passes_ = 1; // of the first item
-    std::int64_t count_ = 0;
-    std::vector<std::int64_t> firstJob_; // of each item, unless all have equally many passes
+    std::vector<std::int64_t> firstJob_{0}; // of each item; then their number
 };
 
 } // namespace detail
@@ -136,9 +123,6 @@ public:
     {
     }
 
-    // Gives this rank these tiles, in this order. The lists of all ranks must have each tile of the image once.
-    ImageParallelLoop(FrameBuffer& fb, std::vector<int> tiles) : fb_(fb), tiles_(std::move(tiles)) {}
-
     // Begins a frame, renders this rank's share, and returns the frame: call end(). renderTile(tile) writes the pixels
     // of tile.region into the cleared tile. Several threads call it at once, for each pass with its own tile.pass and
     // tile.sample. Waits for its share, with WorkDistribution::Dynamic also for other ranks. Throws what
@@ -153,7 +137,7 @@ public:
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
             const bool hasList = distribution_ == WorkDistribution::Owned;
-            const std::vector<int>& tiles = tiles_ ? *tiles_ : frame.ownedTiles();
+            const std::vector<int>& tiles = frame.ownedTiles();
             const auto tileOf = [&](std::size_t item) { return hasList ? tiles[item] : static_cast<int>(item); };
             jobs_.find(hasList ? tiles.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
                        [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
@@ -197,8 +181,7 @@ public:
 
 private:
     FrameBuffer& fb_;
-    WorkDistribution distribution_ = WorkDistribution::Owned;
-    std::optional<std::vector<int>> tiles_; // that this rank renders, if it was told
+    WorkDistribution distribution_;
     detail::PassJobs jobs_;
 };
 
@@ -208,19 +191,19 @@ namespace detail {
 // the camera has to come out of the frame, on all ranks.
 class FromWorld {
 public:
+    // `isOrdered`: inputs come in an order that the loop was given, without depth.
     template <class FrameBuffer, class Camera>
-    void set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera)
+    void set(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
+             bool isOrdered = false)
     {
-        guarded([&] {
-            order_.template set<FrameBuffer>(config, world, camera);
-            findOwners(config, fb, world, camera, !config.order);
-        });
-    }
-    // Leaves the order alone: inputs have no depth.
-    template <class FrameBuffer, class Camera>
-    void setOwners(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera)
-    {
-        guarded([&] { findOwners(config, fb, world, camera, false); });
+        failure_ = nullptr;
+        try {
+            if (!isOrdered)
+                order_.template set<FrameBuffer>(config, world, camera);
+            findOwners(config, fb, world, camera, !isOrdered && !config.order);
+        } catch (...) {
+            failure_ = std::current_exception();
+        }
     }
 
     // Within the frame: throws what the camera has thrown before.
@@ -231,17 +214,6 @@ public:
     }
 
 private:
-    template <class F>
-    void guarded(const F& f)
-    {
-        failure_ = nullptr;
-        try {
-            f();
-        } catch (...) {
-            failure_ = std::current_exception();
-        }
-    }
-
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
     // `hasDepth`: inputs have.
     template <class FrameBuffer, class Camera>
@@ -258,7 +230,7 @@ private:
         owners_->start(layout);
         for (const SharedBrick& b : world.bricks())
             forEachTile(
-                camera.project(b.brick.bounds, layout.width(), layout.height()), layout,
+                camera.project(b.bounds, layout.width(), layout.height()), layout,
                 [&](int tile, const Region& pixels) { owners_->add(tile, pixels, b.ranks.data(), b.ranks.size()); });
         config.owners = owners_->find(fb.config(), hasDepth, [&](int tile) { return fb.tileOwner(tile); });
     }
@@ -278,13 +250,13 @@ public:
     {
         frame.guard([&] {
             fromWorld.rethrow();
-            findVisibleTiles(world, camera, fb.layout(), pairs_);
-            findInputs(world, pairs_, inputs_);
+            pairs_ = visibleTiles(world, camera, fb.layout(), std::move(pairs_));
+            inputs_ = inputsOf(world, pairs_, std::move(inputs_));
             frame.declare(inputs_);
             jobs_.find(pairs_.size(), [&](std::size_t i) { return frame.samples(pairs_[i].tile).count; });
             frame.template forEachTile<TileFor<FrameBuffer, Render>>(jobs_.count(), [&](std::int64_t i, auto& tile) {
                 const auto [item, pass] = jobs_.at(i);
-                const Brick& brick = world.bricks()[static_cast<std::size_t>(pairs_[item].brick)];
+                const Brick& brick = brickOf(world, pairs_[item]);
                 frame.start(tile, pairs_[item].tile, pass);
                 tile.generation = 1;
                 tile.source = brick.id;

@@ -30,17 +30,13 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper), or with `sharePasses` the
-// passes of its tiles. Tiles are mixed first: in their own order, ranks would get whole columns of some images, and
-// neighbours cost alike.
+// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper). Tiles are mixed first: in
+// their own order, ranks would get whole columns of some images, and neighbours cost alike.
 struct RoundRobinBricks {
-    bool sharePasses = false;
-
-    int operator()(const SharedBrick& brick, int tile, int pass) const
+    int operator()(const SharedBrick& brick, int tile, int /*pass*/) const
     {
         const std::uint32_t mixed = static_cast<std::uint32_t>(tile) * 0x9e3779b1u >> 16;
-        const std::size_t turn = brick.brick.id + mixed + static_cast<std::size_t>(sharePasses ? pass : 0);
-        return brick.ranks[turn % brick.ranks.size()];
+        return brick.ranks[(brick.id + mixed) % brick.ranks.size()];
     }
 };
 
@@ -73,7 +69,7 @@ public:
         std::vector<Job> jobs;
         int rankCount = 1;
         for (std::size_t p = 0; p < pairs.size(); ++p) {
-            rankCount = std::max(rankCount, ranksOf(world, pairs[p]).back() + 1);
+            rankCount = std::max(rankCount, detail::brickOf(world, pairs[p]).ranks.back() + 1);
             for (int pass = 0; pass < passes[p]; ++pass)
                 jobs.push_back({pairCosts[p] / passes[p], p, pass, 0});
         }
@@ -84,7 +80,7 @@ public:
         std::vector<double> load(static_cast<std::size_t>(rankCount), 0.0);
         const auto loadOf = [&](int rank) -> double& { return load[static_cast<std::size_t>(rank)]; };
         const auto least = [&](const Job& job) {
-            const std::vector<int>& ranks = ranksOf(world, pairs[job.pair]);
+            const std::vector<int>& ranks = detail::brickOf(world, pairs[job.pair]).ranks;
             return *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return loadOf(a) < loadOf(b); });
         };
         for (Job& job : jobs) {
@@ -106,25 +102,20 @@ public:
         }
         table_.clear();
         for (std::size_t p = 0; p < pairs.size(); ++p)
-            table_[keyOf(idOf(world, pairs[p]), pairs[p].tile)].resize(static_cast<std::size_t>(passes[p]));
+            table_[keyOf(world, pairs[p])].resize(static_cast<std::size_t>(passes[p]));
         for (const Job& job : jobs)
-            table_[keyOf(idOf(world, pairs[job.pair]), pairs[job.pair].tile)][static_cast<std::size_t>(job.pass)] =
-                job.rank;
+            table_[keyOf(world, pairs[job.pair])][static_cast<std::size_t>(job.pass)] = job.rank;
     }
 
     int operator()(const SharedBrick& brick, int tile, int pass) const
     {
-        return table_.at(keyOf(brick.brick.id, tile))[static_cast<std::size_t>(pass)];
+        return table_.at(keyOf(brick.id, tile))[static_cast<std::size_t>(pass)];
     }
 
 private:
-    static const std::vector<int>& ranksOf(const SharedWorld& world, const BrickInTile& pair)
+    static std::uint64_t keyOf(const SharedWorld& world, const BrickInTile& pair)
     {
-        return world.bricks()[static_cast<std::size_t>(pair.brick)].ranks;
-    }
-    static std::uint32_t idOf(const SharedWorld& world, const BrickInTile& pair)
-    {
-        return world.bricks()[static_cast<std::size_t>(pair.brick)].brick.id;
+        return keyOf(detail::brickOf(world, pair).id, pair.tile);
     }
 
     std::vector<double> estimate(const SharedWorld& world, const std::vector<BrickInTile>& pairs) const
@@ -136,14 +127,14 @@ private:
         std::vector<Mean> ofBrick(world.bricks().size());
         Mean ofAll;
         for (const BrickInTile& pair : pairs)
-            if (const auto known = costs_.find(keyOf(idOf(world, pair), pair.tile)); known != costs_.end())
+            if (const auto known = costs_.find(keyOf(world, pair)); known != costs_.end())
                 for (Mean* mean : {&ofBrick[static_cast<std::size_t>(pair.brick)], &ofAll}) {
                     mean->sum += known->second;
                     ++mean->count;
                 }
         std::vector<double> costs;
         for (const BrickInTile& pair : pairs) {
-            const auto known = costs_.find(keyOf(idOf(world, pair), pair.tile));
+            const auto known = costs_.find(keyOf(world, pair));
             const Mean& brick = ofBrick[static_cast<std::size_t>(pair.brick)];
             costs.push_back(known != costs_.end() ? known->second
                             : brick.count > 0     ? brick.sum / static_cast<double>(brick.count)
@@ -163,17 +154,12 @@ DFB_DETECTS(has_plan_v,
             std::declval<T&>().plan(std::declval<const SharedWorld&>(), std::declval<const std::vector<BrickInTile>&>(),
                                     std::declval<const std::vector<int>&>()));
 
-struct MixedJob {
-    std::size_t pair = 0;
-    int pass = 0;
-};
-
 // The jobs of a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs;
-    std::vector<int> passes;    // of each pair
-    std::vector<MixedJob> jobs; // of this rank
-    std::vector<int> perTile;   // pairs
+    std::vector<int> passes;  // of each pair
+    std::vector<Job> jobs;    // of this rank, for pairs
+    std::vector<int> perTile; // pairs
 
     // The most bricks that meet in a tile.
     int mostPerTile(int tileCount)
@@ -195,13 +181,13 @@ struct MixedWork {
             owner.plan(world, pairs, passes);
         jobs.clear();
         for (std::size_t p = 0; p < pairs.size(); ++p) {
-            const SharedBrick& brick = world.bricks()[static_cast<std::size_t>(pairs[p].brick)];
+            const SharedBrick& brick = brickOf(world, pairs[p]);
             for (int pass = 0; pass < passes[p]; ++pass) {
                 const int rank = owner(brick, pairs[p].tile, pass);
                 if (!std::binary_search(brick.ranks.begin(), brick.ranks.end(), rank))
                     detail::failArgument(
                         "the tile-brick owner gives tile %d of brick %u to rank %d, which does not hold it",
-                        pairs[p].tile, brick.brick.id, rank);
+                        pairs[p].tile, brick.id, rank);
                 if (rank == world.rank())
                     jobs.push_back({p, pass});
             }
@@ -219,7 +205,7 @@ struct OrderedWork : MixedWork {
         hider;                  // of each tile: the brick of this rank that hid others in the last frame, or -1
     std::vector<int> announced; // of each tile: the brick that may hide others in this frame, or -1
     std::mutex undecidedMutex;
-    std::vector<MixedJob> undecided; // that another rank may hide
+    std::vector<Job> undecided; // that another rank may hide
 
     // Throws InvalidArgument.
     void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
@@ -249,16 +235,16 @@ struct OrderedWork : MixedWork {
                 empty.push_back(tile);
     }
 
-    int generationOf(const MixedJob& job) const
+    int generationOf(const Job& job) const
     {
-        return static_cast<int>(job.pair) - firstPair[static_cast<std::size_t>(pairs[job.pair].tile)];
+        return static_cast<int>(job.item) - firstPair[static_cast<std::size_t>(pairs[job.item].tile)];
     }
 
     // Begins with the tiles of which this rank has the front, so that others hear soon which inputs are hidden. Not for
     // images that hide nothing: their tiles would be complete later.
     void renderFrontsFirst()
     {
-        std::stable_partition(jobs.begin(), jobs.end(), [this](const MixedJob& job) { return generationOf(job) == 0; });
+        std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
     }
 
     // Tells the ranks behind them of this rank's inputs that hid others in the last frame: they are likely to do so
@@ -271,8 +257,8 @@ struct OrderedWork : MixedWork {
             std::fill(hider.begin(), hider.end(), -1);
         }
         announced.assign(hider.size(), -1);
-        for (const MixedJob& job : jobs) {
-            const BrickInTile& pair = pairs[job.pair];
+        for (const Job& job : jobs) {
+            const BrickInTile& pair = pairs[job.item];
             const auto tile = static_cast<std::size_t>(pair.tile);
             if (hider[tile] != pair.brick || !frame.opaqueHides(pair.tile))
                 continue;
@@ -284,12 +270,12 @@ struct OrderedWork : MixedWork {
 
     // Calls f(generation, rank) for the ranks that render something behind a job; `generation`: the first one behind.
     template <class Owner, class F>
-    void forEachRankBehind(const SharedWorld& world, const MixedJob& job, Owner& owner, const F& f) const
+    void forEachRankBehind(const SharedWorld& world, const Job& job, Owner& owner, const F& f) const
     {
-        const int tile = pairs[job.pair].tile;
+        const int tile = pairs[job.item].tile;
         std::vector<int> told;
-        for (std::size_t p = job.pair + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
-            const int rank = owner(world.bricks()[static_cast<std::size_t>(pairs[p].brick)], tile, 0);
+        for (std::size_t p = job.item + 1; p < pairs.size() && pairs[p].tile == tile; ++p) {
+            const int rank = owner(brickOf(world, pairs[p]), tile, 0);
             if (std::find(told.begin(), told.end(), rank) != told.end())
                 continue;
             f(generationOf(job) + 1, rank);
@@ -342,22 +328,21 @@ public:
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
             fromWorld_.rethrow();
-            detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
+            work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findJobs(frame, world_, owner_);
             // The first rank that holds the brick declares the tile, also if another one renders it.
             inputs_.clear();
             for (const BrickInTile& pair : work_.pairs)
-                if (const SharedBrick& b = world_.bricks()[static_cast<std::size_t>(pair.brick)];
-                    b.ranks.front() == fb_.rank())
-                    inputs_.push_back({pair.tile, b.brick.id, 0});
+                if (const SharedBrick& b = detail::brickOf(world_, pair); b.ranks.front() == fb_.rank())
+                    inputs_.push_back({pair.tile, b.id, 0});
             frame.declare(inputs_);
             const auto count = static_cast<std::int64_t>(work_.jobs.size());
             frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
                 count, [&](std::int64_t i, auto& tile) {
-                    const detail::MixedJob& job = work_.jobs[static_cast<std::size_t>(i)];
-                    const BrickInTile& pair = work_.pairs[job.pair];
-                    const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+                    const detail::Job& job = work_.jobs[static_cast<std::size_t>(i)];
+                    const BrickInTile& pair = work_.pairs[job.item];
+                    const Brick& brick = detail::brickOf(world_, pair);
                     frame.start(tile, pair.tile, job.pass);
                     tile.generation = 1;
                     tile.source = brick.id;
@@ -408,24 +393,17 @@ public:
                                                     const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
-        fromWorld_.setOwners(params, fb_, world_, camera);
+        fromWorld_.set(params, fb_, world_, camera, true);
         auto frame = fb_.begin(params, tileData, pixelData);
         frame.guard([&] {
             fromWorld_.rethrow();
-            detail::findVisibleTiles(world_, camera, fb_.layout(), work_.pairs);
+            work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             work_.sortFrontToBack(world_, order);
             work_.findJobs(frame, world_, owner_);
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findEmpty(fb_.layout().tileCount(), frame.ownedTiles());
-            const auto emptyCount = static_cast<std::int64_t>(work_.empty.size());
-            frame.template forEachTile<detail::TileFor<FrameBuffer, RenderBrick>>(
-                emptyCount, [&](std::int64_t i, auto& tile) {
-                    const int index = work_.empty[static_cast<std::size_t>(i)];
-                    for (int pass = 0; pass < frame.samples(index).count; ++pass) {
-                        frame.start(tile, index, pass);
-                        frame.setTile(tile);
-                    }
-                });
+            frame.template forEachTile<typename FrameBuffer::TileView>(work_.empty,
+                                                                       [&](const auto& tile) { frame.setTile(tile); });
             if (work_.anyHidden.exchange(false))
                 work_.renderFrontsFirst();
             work_.announceHiders(frame, world_, fb_.layout().tileCount(), owner_);
@@ -460,8 +438,8 @@ private:
     void renderUndecided(typename FrameBuffer::Frame& frame, const RenderBrick& renderBrick)
     {
         auto& undecided = work_.undecided;
-        const auto isUndecided = [&](const detail::MixedJob& job) {
-            return frame.isUndecided(work_.pairs[job.pair].tile, work_.generationOf(job));
+        const auto isUndecided = [&](const detail::Job& job) {
+            return frame.isUndecided(work_.pairs[job.item].tile, work_.generationOf(job));
         };
         for (bool mayWait = true; !undecided.empty() && !frame.failed();) {
             const auto decided =
@@ -478,12 +456,12 @@ private:
     }
 
     template <class RenderBrick, class Tile>
-    void renderJob(typename FrameBuffer::Frame& frame, const detail::MixedJob& job, const RenderBrick& renderBrick,
+    void renderJob(typename FrameBuffer::Frame& frame, const detail::Job& job, const RenderBrick& renderBrick,
                    Tile& tile, bool mayWait)
     {
         const std::vector<BrickInTile>& pairs = work_.pairs;
-        const BrickInTile& pair = pairs[job.pair];
-        const Brick& brick = world_.bricks()[static_cast<std::size_t>(pair.brick)].brick;
+        const BrickInTile& pair = pairs[job.item];
+        const Brick& brick = detail::brickOf(world_, pair);
         const int generation = work_.generationOf(job);
         if (frame.isHidden(pair.tile, generation)) {
             work_.anyHidden = true;
@@ -496,7 +474,7 @@ private:
         }
         frame.start(tile, pair.tile, job.pass);
         tile.generation = generation;
-        tile.children = job.pair + 1 < pairs.size() && pairs[job.pair + 1].tile == pair.tile;
+        tile.children = job.item + 1 < pairs.size() && pairs[job.item + 1].tile == pair.tile;
         tile.source = brick.id;
         detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
         frame.setTile(tile);
@@ -505,9 +483,9 @@ private:
     }
 
     // Tells the ranks behind an input that it hides theirs, or does not, if they wait for that.
-    void tellBehind(typename FrameBuffer::Frame& frame, const detail::MixedJob& job, bool hides)
+    void tellBehind(typename FrameBuffer::Frame& frame, const detail::Job& job, bool hides)
     {
-        const BrickInTile& pair = work_.pairs[job.pair];
+        const BrickInTile& pair = work_.pairs[job.item];
         const auto tile = static_cast<std::size_t>(pair.tile);
         const bool isAwaited = work_.announced[tile] == pair.brick;
         if (hides) {

@@ -8,11 +8,9 @@
 #include <dfb/tile.hpp>
 
 #include <algorithm>
-#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
-#include <limits>
 #include <memory>
 #include <optional>
 #include <type_traits>
@@ -22,8 +20,7 @@
 DFB_NAMESPACE_BEGIN
 
 // The id and bounds of a brick of any rank, and the ranks that hold it, ascending.
-struct SharedBrick {
-    Brick brick;
+struct SharedBrick : Brick {
     std::vector<int> ranks;
 };
 
@@ -37,40 +34,35 @@ public:
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {
-        std::vector<std::byte> mine(world.bricks().size() * sizeof(Record));
-        for (std::size_t i = 0; i < world.bricks().size(); ++i) {
-            const Record record{world.bricks()[i].id, world.bricks()[i].bounds};
-            std::memcpy(mine.data() + i * sizeof record, &record, sizeof record);
-        }
-        const std::vector<std::vector<std::byte>> all = fb.allGather(mine);
-        std::vector<std::pair<Record, int>> held;
+        static_assert(std::is_trivially_copyable_v<Brick>);
+        const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
+        const std::vector<std::vector<std::byte>> all =
+            fb.allGather({first, first + world.bricks().size() * sizeof(Brick)});
+        std::vector<std::pair<Brick, int>> held;
         for (std::size_t rank = 0; rank < all.size(); ++rank) {
-            if (all[rank].size() % sizeof(Record) != 0)
+            if (all[rank].size() % sizeof(Brick) != 0)
                 detail::failArgument("the bricks of rank %zu have %zu bytes", rank, all[rank].size());
-            for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Record)) {
-                Record record;
-                std::memcpy(&record, all[rank].data() + at, sizeof record);
-                if (!detail::isBox(record.bounds))
-                    detail::failArgument("the bounds of brick %u of rank %zu are not a box", record.id, rank);
-                held.emplace_back(record, static_cast<int>(rank));
+            for (std::size_t at = 0; at < all[rank].size(); at += sizeof(Brick)) {
+                Brick brick;
+                std::memcpy(&brick, all[rank].data() + at, sizeof brick);
+                if (!detail::isBox(brick.bounds))
+                    detail::failArgument("the bounds of brick %u of rank %zu are not a box", brick.id, rank);
+                held.emplace_back(brick, static_cast<int>(rank));
             }
         }
         std::sort(held.begin(), held.end(), [](const auto& a, const auto& b) {
             return a.first.id != b.first.id ? a.first.id < b.first.id : a.second < b.second;
         });
-        for (const auto& [record, rank] : held) {
-            if (bricks_.empty() || bricks_.back().brick.id != record.id) {
-                SharedBrick shared;
-                shared.brick.id = record.id;
-                shared.brick.bounds = record.bounds;
-                bricks_.push_back(std::move(shared));
-            }
-            if (std::memcmp(&bricks_.back().brick.bounds, &record.bounds, sizeof record.bounds) != 0)
-                detail::failArgument("brick %u has other bounds on rank %d than on rank %d", record.id, rank,
-                                     bricks_.back().ranks.front());
-            if (!bricks_.back().ranks.empty() && bricks_.back().ranks.back() == rank)
-                detail::failArgument("brick %u comes twice from rank %d", record.id, rank);
-            bricks_.back().ranks.push_back(rank);
+        for (const auto& [brick, rank] : held) {
+            if (bricks_.empty() || bricks_.back().id != brick.id)
+                bricks_.push_back({brick, {}});
+            SharedBrick& shared = bricks_.back();
+            if (std::memcmp(&shared.bounds, &brick.bounds, sizeof brick.bounds) != 0)
+                detail::failArgument("brick %u has other bounds on rank %d than on rank %d", brick.id, rank,
+                                     shared.ranks.front());
+            if (!shared.ranks.empty() && shared.ranks.back() == rank)
+                detail::failArgument("brick %u comes twice from rank %d", brick.id, rank);
+            shared.ranks.push_back(rank);
         }
     }
 
@@ -81,56 +73,23 @@ public:
     int rank() const noexcept { return rank_; }
 
 private:
-    struct Record {
-        std::uint32_t id = 0;
-        Box3 bounds;
-    };
-
     int rank_;
     std::vector<SharedBrick> bricks_;
 };
 
 namespace detail {
 
-// Where all rays of a camera begin: in its eye. Or, with parallel rays, infinitely far away, along the axes along which
-// they go.
-struct RayOrigin {
-    Vec3 eye;
-    bool isAcross[3] = {false, false, false}; // axes along which no ray goes: none crosses a plane between boxes there
-};
-inline RayOrigin rayOrigin(const PerspectiveCamera& camera) { return {camera.eye()}; }
-inline RayOrigin rayOrigin(const MatrixCamera& camera)
-{
-    if (!camera.isOrthographic())
-        return {camera.eye()};
-    const Vec3 d = camera.ray(0, 0, 1, 1).direction;
-    const auto from = [](float direction) { return std::copysign(std::numeric_limits<float>::infinity(), -direction); };
-    return {{from(d.x), from(d.y), from(d.z)}, {d.x == 0, d.y == 0, d.z == 0}};
-}
-
 DFB_DETECTS(has_common_eye_v, std::declval<const T&>().commonEye());
-
-// Of any camera; nullopt if it has no such origin, or does not say.
-template <class Camera>
-std::optional<RayOrigin> originOf(const Camera& camera)
-{
-    if constexpr (std::is_same_v<Camera, PerspectiveCamera> || std::is_same_v<Camera, MatrixCamera>)
-        return rayOrigin(camera);
-    else if constexpr (has_common_eye_v<Camera>)
-        if (const std::optional<Vec3> eye = camera.commonEye())
-            return RayOrigin{*eye};
-    return std::nullopt;
-}
 
 // Finds the order of bricks. Keeps its memory.
 class FrontToBack {
 public:
     // Returns null, or why there is no order.
-    const char* find(const SharedWorld& world, const RayOrigin& origin)
+    const char* find(const SharedWorld& world, const Vec3& eye)
     {
         const auto& bricks = world.bricks();
         const auto compare = [&](std::size_t a, std::size_t b) {
-            return before(bricks[a].brick.bounds, bricks[b].brick.bounds, origin);
+            return before(bricks[a].bounds, bricks[b].bounds, eye);
         };
         order_.clear();
         inFront_.assign(bricks.size(), 0);
@@ -162,24 +121,24 @@ private:
     enum class Before { Either, First, Second, Overlaps };
 
     // A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
-    static Before before(const Box3& a, const Box3& b, const RayOrigin& origin)
+    // Either is right if no ray crosses it: the eye's coordinate is then NaN, and no comparison holds.
+    static Before before(const Box3& a, const Box3& b, const Vec3& eye)
     {
         bool apart = false, first = false, second = false;
-        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e, bool isAcross) {
+        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
             if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
                 apart = true;
-                first = first || isAcross || e <= bLower;
-                second = second || isAcross || e >= aUpper;
+                first = first || !(e > bLower);
+                second = second || !(e < aUpper);
             } else if (bUpper <= aLower) {
                 apart = true;
-                first = first || isAcross || e >= bUpper;
-                second = second || isAcross || e <= aLower;
+                first = first || !(e < bUpper);
+                second = second || !(e > aLower);
             }
         };
-        const Vec3& eye = origin.eye;
-        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x, origin.isAcross[0]);
-        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y, origin.isAcross[1]);
-        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z, origin.isAcross[2]);
+        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
+        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
+        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
         if (!apart)
             return Before::Overlaps;
         return first == second ? Before::Either : first ? Before::First : Before::Second;
@@ -187,14 +146,6 @@ private:
 
     std::vector<int> order_, inFront_;
 };
-
-inline std::vector<int> visibilityOrder(const SharedWorld& world, const RayOrigin& origin)
-{
-    FrontToBack bricks;
-    if (const char* why = bricks.find(world, origin))
-        failArgument("%s", why);
-    return bricks.order();
-}
 
 // Gives FrameConfig::order to the frames of a loop.
 class BrickOrder {
@@ -204,13 +155,13 @@ public:
     template <class FrameBuffer, class Camera>
     void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
     {
-        if constexpr (FrameBuffer::takesOrder) {
-            const std::optional<RayOrigin> origin = originOf(camera);
-            if (config.order || !origin || world.bricks().size() > 1024 || bricks_.find(world, *origin))
+        if constexpr (FrameBuffer::takesOrder && has_common_eye_v<Camera>) {
+            const std::optional<Vec3> eye = camera.commonEye();
+            if (config.order || !eye || world.bricks().size() > 1024 || bricks_.find(world, *eye))
                 return;
             sources_.clear();
             for (const int brick : bricks_.order())
-                sources_.push_back(world.bricks()[static_cast<std::size_t>(brick)].brick.id);
+                sources_.push_back(world.bricks()[static_cast<std::size_t>(brick)].id);
             if (!order_ || sources_ != last_) {
                 order_ = std::make_shared<const SourceOrder>(sources_);
                 last_ = sources_;
@@ -232,13 +183,16 @@ private:
 // or if there is no such order: three boxes can each be in front of the next.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
 {
-    return detail::visibilityOrder(world, detail::RayOrigin{eye});
+    detail::FrontToBack bricks;
+    if (const char* why = bricks.find(world, eye))
+        detail::failArgument("%s", why);
+    return bricks.order();
 }
 
 // Returns this order for all rays of a camera, also of an orthographic one. Throws likewise.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const MatrixCamera& camera)
 {
-    return detail::visibilityOrder(world, detail::rayOrigin(camera));
+    return visibilityOrder(world, *camera.commonEye());
 }
 
 DFB_NAMESPACE_END

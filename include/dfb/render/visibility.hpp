@@ -341,64 +341,45 @@ void forEachTile(const std::vector<Projection>& projections, const TileLayout& l
         forEachTile(projection, layout, found);
 }
 
-// Of a brick of a World or a SharedWorld.
-template <class AnyBrick>
-const Box3& boundsOf(const AnyBrick& brick) noexcept
+// The brick of a pair, of a World or a SharedWorld.
+template <class AnyWorld>
+const auto& brickOf(const AnyWorld& world, const BrickInTile& pair)
 {
-    if constexpr (std::is_same_v<AnyBrick, Brick>)
-        return brick.bounds;
-    else
-        return brick.brick.bounds;
-}
-
-// visibleTiles() into memory that is there already.
-template <class AnyWorld, class Camera>
-void findVisibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout,
-                      std::vector<BrickInTile>& result)
-{
-    result.clear();
-    for (std::size_t b = 0; b < world.bricks().size(); ++b)
-        forEachTile(camera.project(boundsOf(world.bricks()[b]), layout.width(), layout.height()), layout,
-                    [&](int tile, const Region&) {
-                        result.push_back({static_cast<int>(b), tile});
-                    });
-    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
-    std::sort(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
-    result.erase(
-        std::unique(result.begin(), result.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
-        result.end());
+    return world.bricks()[static_cast<std::size_t>(pair.brick)];
 }
 
 } // namespace detail
 
 // All pairs, tile by tile, so that the inputs of a tile are rendered one after the other. Of a World or a SharedWorld.
+// The result has the memory of `memory`.
 template <class AnyWorld, class Camera>
-std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout)
+std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout,
+                                      std::vector<BrickInTile> memory = {})
 {
-    std::vector<BrickInTile> result;
-    detail::findVisibleTiles(world, camera, layout, result);
-    return result;
+    memory.clear();
+    for (std::size_t b = 0; b < world.bricks().size(); ++b)
+        detail::forEachTile(camera.project(world.bricks()[b].bounds, layout.width(), layout.height()), layout,
+                            [&](int tile, const Region&) {
+                                memory.push_back({static_cast<int>(b), tile});
+                            });
+    const auto key = [](const BrickInTile& p) { return std::make_pair(p.tile, p.brick); };
+    std::sort(memory.begin(), memory.end(), [&](const auto& a, const auto& b) { return key(a) < key(b); });
+    memory.erase(
+        std::unique(memory.begin(), memory.end(), [&](const auto& a, const auto& b) { return key(a) == key(b); }),
+        memory.end());
+    return memory;
 }
 
-namespace detail {
-
-// inputsOf() into memory that is there already.
-inline void findInputs(const World& world, const std::vector<BrickInTile>& pairs, std::vector<TileInput>& result)
+// Returns the inputs that a rank declares if it renders these pairs; the source is the brick's id. The result has the
+// memory of `memory`.
+inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs,
+                                       std::vector<TileInput> memory = {})
 {
-    result.clear();
-    result.reserve(pairs.size());
+    memory.clear();
+    memory.reserve(pairs.size());
     for (const BrickInTile& pair : pairs)
-        result.push_back({pair.tile, world.bricks()[static_cast<std::size_t>(pair.brick)].id, 0});
-}
-
-} // namespace detail
-
-// Returns the inputs that a rank declares if it renders these pairs; the source is the brick's id.
-inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs)
-{
-    std::vector<TileInput> inputs;
-    detail::findInputs(world, pairs, inputs);
-    return inputs;
+        memory.push_back({pair.tile, detail::brickOf(world, pair).id, 0});
+    return memory;
 }
 
 DFB_NAMESPACE_END

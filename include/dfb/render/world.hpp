@@ -6,7 +6,6 @@
 
 #include <cmath>
 #include <cstdint>
-#include <optional>
 #include <unordered_set>
 #include <vector>
 
@@ -52,13 +51,9 @@ inline bool isBox(const Box3& b) noexcept
 struct Brick {
     std::uint32_t id = 0; // the same number means the same data, on any rank; bounds do not matter for that
     Box3 bounds;
-    std::optional<Box3> dataBounds{}; // if they are more than `bounds`
-
-    const Box3& data() const noexcept { return dataBounds ? *dataBounds : bounds; }
 };
 
-// The bricks of this rank; there may be none. Ghost bricks are copies of bricks of other ranks, for secondary rays
-// alone: they are neither projected nor declared nor rendered. While bricks are added, no other thread may use it.
+// The bricks of this rank; there may be none. While bricks are added, no other thread may use it.
 class World {
 public:
     World() = default;
@@ -69,39 +64,21 @@ public:
             add(brick);
     }
 
-    // Throws InvalidArgument for bounds that are not finite or have lower > upper, data bounds that do not hold the
-    // bounds, and an id that this rank has already.
+    // Throws InvalidArgument for bounds that are not finite or have lower > upper, and an id that this rank has
+    // already.
     void add(const Brick& brick)
     {
-        check(brick);
+        if (!detail::isBox(brick.bounds))
+            detail::failArgument("the bounds of brick %u are not a box", brick.id);
+        if (!ids_.insert(brick.id).second)
+            detail::failArgument("brick %u was added twice", brick.id);
         bricks_.push_back(brick);
     }
 
-    // Throws as add() does.
-    void addGhost(const Brick& brick)
-    {
-        check(brick);
-        ghosts_.push_back(brick);
-    }
-
     const std::vector<Brick>& bricks() const noexcept { return bricks_; }
-    const std::vector<Brick>& ghosts() const noexcept { return ghosts_; }
 
 private:
-    void check(const Brick& brick)
-    {
-        const Box3& b = brick.bounds;
-        if (!detail::isBox(b))
-            detail::failArgument("the bounds of brick %u are not a box", brick.id);
-        const Box3& d = brick.data();
-        if (!(d.lower.x <= b.lower.x && d.lower.y <= b.lower.y && d.lower.z <= b.lower.z && d.upper.x >= b.upper.x
-              && d.upper.y >= b.upper.y && d.upper.z >= b.upper.z))
-            detail::failArgument("the data of brick %u do not fill its bounds", brick.id);
-        if (!ids_.insert(brick.id).second)
-            detail::failArgument("brick %u was added twice", brick.id);
-    }
-
-    std::vector<Brick> bricks_, ghosts_;
+    std::vector<Brick> bricks_;
     std::unordered_set<std::uint32_t> ids_;
 };
 

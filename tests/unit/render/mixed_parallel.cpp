@@ -28,7 +28,7 @@ TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
     using Order = std::vector<std::vector<int>>; // tile, brick, pass
     Order order;
     for (const auto& job : work.jobs)
-        order.push_back({work.pairs[job.pair].tile, work.pairs[job.pair].brick, job.pass});
+        order.push_back({work.pairs[job.item].tile, work.pairs[job.item].brick, job.pass});
     CHECK(order
           == Order{{1, 0, 0},
                    {4, 2, 0}, // these two are fronts
