@@ -27,31 +27,30 @@ struct Box {
     double left = std::numeric_limits<double>::infinity(), right = -left, bottom = left, top = -left;
     double nearest = 1, farthest = -1;
 
-    void add(const Vector& clip, const Viewport& wall)
+    void add(const Vector& clip, const Region& wall)
     {
-        const double x = wall.x + wall.width * (clip[0] / clip[3] + 1) / 2;
-        const double y = wall.y + wall.height * (clip[1] / clip[3] + 1) / 2, z = clip[2] / clip[3];
+        const double x = wall.x0 + wall.width() * (clip[0] / clip[3] + 1) / 2;
+        const double y = wall.y0 + wall.height() * (clip[1] / clip[3] + 1) / 2, z = clip[2] / clip[3];
         left = std::fmin(left, x), right = std::fmax(right, x);
         bottom = std::fmin(bottom, y), top = std::fmax(top, y);
         nearest = std::fmin(nearest, z), farthest = std::fmax(farthest, z);
     }
 
     // The pixels of the wall that it touches.
-    Viewport pixels(const Viewport& wall) const
+    Region pixels(const Region& wall) const
     {
-        const auto pixel = [](double value, int first, int count) {
-            return static_cast<int>(std::clamp(value, double(first), double(first) + count));
+        const auto pixel = [](double value, int first, int end) {
+            return static_cast<int>(std::clamp(value, double(first), double(end)));
         };
         if (!(left <= right && bottom <= top))
             return {};
-        const int x0 = pixel(std::floor(left), wall.x, wall.width), x1 = pixel(std::ceil(right), wall.x, wall.width);
-        const int y0 = pixel(std::floor(bottom), wall.y, wall.height), y1 = pixel(std::ceil(top), wall.y, wall.height);
-        return {x0, y0, x1 - x0, y1 - y0};
+        return {pixel(std::floor(left), wall.x0, wall.x1), pixel(std::floor(bottom), wall.y0, wall.y1),
+                pixel(std::ceil(right), wall.x0, wall.x1), pixel(std::ceil(top), wall.y0, wall.y1)};
     }
 };
 
 // Points nearer than the near plane are not seen. The point where an edge goes through that plane is.
-Box project(const std::vector<Vector>& clip, const Viewport& wall)
+Box project(const std::vector<Vector>& clip, const Region& wall)
 {
     const auto before = [](const Vector& v) { return v[2] + v[3]; }; // the near plane: 0 there
     Box box;
@@ -73,7 +72,7 @@ Box project(const std::vector<Vector>& clip, const Viewport& wall)
     return box;
 }
 
-std::vector<int> tilesIn(const Viewport& part, const std::vector<Tile>& tiles)
+std::vector<int> tilesIn(const Region& part, const std::vector<Tile>& tiles)
 {
     std::vector<int> found;
     for (std::size_t i = 0; i < tiles.size(); ++i)
@@ -83,10 +82,12 @@ std::vector<int> tilesIn(const Viewport& part, const std::vector<Tile>& tiles)
 }
 
 // The columns of share `index` of `count`.
-Viewport strip(const Viewport& all, std::size_t index, std::size_t count)
+Region strip(const Region& all, std::size_t index, std::size_t count)
 {
-    const auto edge = [&](std::size_t i) { return static_cast<int>(static_cast<std::size_t>(all.width) * i / count); };
-    return {all.x + edge(index), all.y, edge(index + 1) - edge(index), all.height};
+    const auto edge = [&](std::size_t i) {
+        return static_cast<int>(static_cast<std::size_t>(all.width()) * i / count);
+    };
+    return {all.x0 + edge(index), all.y0, all.x0 + edge(index + 1), all.y1};
 }
 
 // The tile that each rank renders, by rank: a rank that displays one takes it, the others take turns. -1: none.
@@ -135,10 +136,10 @@ void share(const IceTContextStruct& context, Frame& frame)
 
 } // namespace
 
-void findContained(IceTContextStruct& context, const Viewport* limits)
+void findContained(IceTContextStruct& context, const Region* limits)
 {
     Frame& frame = context.frame;
-    const Viewport wall = context.settings.wall();
+    const Region wall = context.settings.wall();
     frame.contained = wall;
     frame.nearest = -1;
     frame.farthest = 1;
@@ -151,8 +152,11 @@ void findContained(IceTContextStruct& context, const Viewport* limits)
         frame.nearest = std::max(-1.0, box.nearest);
         frame.farthest = std::min(1.0, box.farthest);
     }
-    if (limits)
+    if (limits) {
         frame.contained = intersection(frame.contained, *limits);
+        if (frame.contained.empty())
+            frame.contained = {};
+    }
     frame.tiles = tilesIn(frame.contained, context.settings.tiles);
     if (context.replicas.size() > 1)
         share(context, frame);

@@ -148,7 +148,7 @@ std::vector<dfb::ImageCompositor*> picturesOf(IceTContextStruct& context, const 
     context.pictures.newFrame(context.frame.count);
     for (const Tile& tile : context.settings.tiles)
         all.push_back(
-            &context.pictures.find({static_cast<int>(all.size()), tile.viewport.width, tile.viewport.height,
+            &context.pictures.find({static_cast<int>(all.size()), tile.viewport.width(), tile.viewport.height(),
                                     tile.displayRank, plan.format, plan.blend, plan.givesDepth || plan.fillsBackground},
                                    context));
     return all;
@@ -191,11 +191,11 @@ void end(const std::vector<dfb::ImageCompositor*>& pictures, Frame& frame)
 void printStatistics(const IceTContextStruct& context)
 {
     const Frame& frame = context.frame;
-    const Viewport wall = context.settings.wall();
+    const Region wall = context.settings.wall();
     std::fprintf(stderr,
                  "dfb_icet: frame %lld, %dx%d in %zu tiles, %s: rendered %.2f ms, composited %.2f ms, %.3f MB sent, "
                  "%lld of %lld blocks touched\n",
-                 static_cast<long long>(frame.count), wall.width, wall.height, context.settings.tiles.size(),
+                 static_cast<long long>(frame.count), wall.width(), wall.height(), context.settings.tiles.size(),
                  context.settings.mode == ICET_COMPOSITE_MODE_BLEND ? "blended" : "nearest", 1e3 * frame.renderSeconds,
                  1e3 * (frame.totalSeconds - frame.renderSeconds), 1e-6 * static_cast<double>(frame.bytesSent),
                  static_cast<long long>(frame.tilesTouched), static_cast<long long>(frame.tilesTotal));
@@ -247,8 +247,8 @@ dfb::ImageCompositor& Pictures::find(const Key& key, const IceTContextStruct& co
     return *place->compositor;
 }
 
-dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Viewport& memory, const Viewport& part,
-                        const Viewport& tile)
+dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Region& memory, const Region& part,
+                        const Region& tile)
 {
     if (intersection(part, tile).empty())
         return {};
@@ -311,13 +311,13 @@ extern "C" IceTImage icetCompositeImage(const IceTVoid* color, const IceTVoid* d
 {
     const auto composite = [&] {
         IceTContextStruct& context = currentContext();
-        const Viewport wall = context.settings.wall();
-        const Viewport limits = valid ? Viewport{valid[0], valid[1], valid[2], valid[3]} : wall;
+        const Region wall = context.settings.wall();
+        const Region limits = valid ? viewport(valid[0], valid[1], valid[2], valid[3]) : wall;
         Image image;
         image.colorFormat = context.settings.colorFormat;
         image.depthFormat = context.settings.depthFormat;
-        image.width = wall.width;
-        image.height = wall.height;
+        image.width = wall.width();
+        image.height = wall.height();
         image.color = color;
         image.depth = static_cast<const float*>(depth);
         const auto input = [&](int tile) {

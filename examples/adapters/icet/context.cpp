@@ -93,9 +93,9 @@ Settings::Settings()
         enabled[option - ICET_STATE_ENABLE_START] = true;
 }
 
-Viewport Settings::wall() const
+Region Settings::wall() const
 {
-    Viewport all;
+    Region all;
     for (const Tile& tile : tiles)
         all = hull(all, tile.viewport);
     return all;

@@ -18,7 +18,7 @@
 namespace dfb_icet {
 
 struct Tile {
-    Viewport viewport;
+    Region viewport;
     int displayRank = 0;
 };
 
@@ -27,7 +27,7 @@ struct Settings {
     Settings();
 
     bool isEnabled(IceTEnum option) const { return enabled[option - ICET_STATE_ENABLE_START]; }
-    Viewport wall() const; // all tiles
+    Region wall() const; // all tiles
     int tileOf(int displayRank) const;
 
     IceTBitField diagnostics = ICET_DIAG_ALL_NODES | ICET_DIAG_WARNINGS;
@@ -47,7 +47,7 @@ struct Frame {
     bool isPreRendered = false;
     std::array<double, 16> projection{}, modelview{}; // column by column
     std::array<float, 4> background{};
-    Viewport contained;                // the part of the wall that this rank has pixels in
+    Region contained;                  // the part of the wall that this rank has pixels in
     double nearest = 1, farthest = -1; // of the vertices, as normalised depth
     std::vector<int> tiles;            // that `contained` touches
     double renderSeconds = 0, totalSeconds = 0;
@@ -91,7 +91,7 @@ struct View {
 // input of each tile. An exception fails the frame on all ranks.
 struct Source {
     bool isPreRendered = false;
-    const Viewport* limits = nullptr;
+    const Region* limits = nullptr;
     std::function<dfb::InputImage(int tile)> input;
 };
 
@@ -99,11 +99,11 @@ struct Source {
 IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& source);
 
 // Finds Frame::contained and Frame::tiles: where the vertices are on the wall, and within `limits`, if given.
-void findContained(IceTContextStruct& context, const Viewport* limits);
+void findContained(IceTContextStruct& context, const Region* limits);
 
 // The pixels of an image that shows the part `memory` of the wall, of which `part` is valid, as input of a tile.
-dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Viewport& memory, const Viewport& part,
-                        const Viewport& tile);
+dfb::InputImage inputOf(IceTContextStruct& context, const Image& image, const Region& memory, const Region& part,
+                        const Region& tile);
 
 double secondsNow();
 // Set by DFB_ICET_STATS and DFB_ICET_TIMEOUT, which is in seconds; 0: no limit.

@@ -12,28 +12,28 @@ using Matrix = std::array<double, 16>;
 
 // The part of the wall that the client renders for a tile, and what is read of it.
 struct Window {
-    Viewport shown;      // as large as icetPhysicalRenderSize() says
-    Viewport part;       // of the wall: what is read
+    Region shown;        // as large as icetPhysicalRenderSize() says
+    Region part;         // of the wall: what is read
     bool floats = false; // it shows all that this rank has, for all tiles
 };
 
-Window windowFor(const IceTContextStruct& context, const Viewport& tile)
+Window windowFor(const IceTContextStruct& context, const Region& tile)
 {
     const Settings& s = context.settings;
-    const Viewport& all = context.frame.contained;
+    const Region& all = context.frame.contained;
     const int width = s.physicalWidth, height = s.physicalHeight;
-    const bool fits = all.width <= width && all.height <= height;
-    if (s.isEnabled(ICET_FLOATING_VIEWPORT) && fits && !tile.contains(all))
-        return {{all.x, all.y, width, height}, all, true};
-    return {{tile.x, tile.y, width, height}, intersection(tile, all), false};
+    const bool fits = all.width() <= width && all.height() <= height;
+    if (s.isEnabled(ICET_FLOATING_VIEWPORT) && fits && intersection(tile, all) != all)
+        return {viewport(all.x0, all.y0, width, height), all, true};
+    return {viewport(tile.x0, tile.y0, width, height), intersection(tile, all), false};
 }
 
 // `projection` for a window on the wall.
-Matrix project(const Matrix& projection, const Viewport& wall, const Viewport& window)
+Matrix project(const Matrix& projection, const Region& wall, const Region& window)
 {
-    const double scale[2] = {double(wall.width) / window.width, double(wall.height) / window.height};
-    const double offset[2] = {double(wall.width + 2 * (wall.x - window.x) - window.width) / window.width,
-                              double(wall.height + 2 * (wall.y - window.y) - window.height) / window.height};
+    const double scale[2] = {double(wall.width()) / window.width(), double(wall.height()) / window.height()};
+    const double offset[2] = {double(wall.width() + 2 * (wall.x0 - window.x0) - window.width()) / window.width(),
+                              double(wall.height() + 2 * (wall.y0 - window.y0) - window.height()) / window.height()};
     Matrix out = projection;
     for (std::size_t column = 0; column < 4; ++column)
         for (std::size_t row = 0; row < 2; ++row)
@@ -61,7 +61,7 @@ void prepare(IceTContextStruct& context)
 }
 
 // `read`: in the window; empty if its pixels are not wanted.
-void callBack(IceTContextStruct& context, const Viewport& window, const Viewport& read)
+void callBack(IceTContextStruct& context, const Region& window, const Region& read)
 {
     Frame& frame = context.frame;
     if (!context.settings.draw)
@@ -69,7 +69,7 @@ void callBack(IceTContextStruct& context, const Viewport& window, const Viewport
     const bool blends = context.settings.mode == ICET_COMPOSITE_MODE_BLEND;
     const std::array<float, 4> background = blends ? std::array<float, 4>{} : frame.background;
     const Matrix projection = project(frame.projection, context.settings.wall(), window);
-    const IceTInt readback[4] = {read.x, read.y, read.width, read.height};
+    const IceTInt readback[4] = {read.x0, read.y0, read.width(), read.height()};
     const double before = secondsNow();
     context.settings.draw(projection.data(), frame.modelview.data(), background.data(), readback, {&context.rendered});
     frame.renderSeconds += secondsNow() - before;
@@ -83,15 +83,14 @@ public:
     dfb::InputImage operator()(int index)
     {
         const Frame& frame = context_.frame;
-        const Viewport& tile = context_.settings.tiles[static_cast<std::size_t>(index)].viewport;
+        const Region& tile = context_.settings.tiles[static_cast<std::size_t>(index)].viewport;
         const Window window = windowFor(context_, tile);
         if (std::find(frame.tiles.begin(), frame.tiles.end(), index) == frame.tiles.end()) {
             if (context_.settings.isEnabled(ICET_RENDER_EMPTY_IMAGES))
-                render({tile.x, tile.y, window.shown.width, window.shown.height}, {}, false);
+                render(viewport(tile.x0, tile.y0, window.shown.width(), window.shown.height()), {}, false);
             return {};
         }
-        const Viewport read{window.part.x - window.shown.x, window.part.y - window.shown.y, window.part.width,
-                            window.part.height};
+        const Region read = regionIn(window.shown, window.part);
         if (!window.floats || !hasFloated_)
             render(window.shown, read, window.floats);
         dfb::InputImage input = inputOf(context_, context_.rendered, window.shown, window.part, tile);
@@ -101,7 +100,7 @@ public:
     }
 
 private:
-    void render(const Viewport& window, const Viewport& read, bool floats)
+    void render(const Region& window, const Region& read, bool floats)
     {
         prepare(context_);
         callBack(context_, window, read);

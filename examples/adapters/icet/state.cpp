@@ -15,7 +15,7 @@ namespace {
 // The numbers of a state; a double has all of IceT's integers.
 using Values = std::vector<double>;
 
-Values of(const Viewport& v) { return {double(v.x), double(v.y), double(v.width), double(v.height)}; }
+Values of(const Region& v) { return {double(v.x0), double(v.y0), double(v.width()), double(v.height())}; }
 
 template <class Range, class Value>
 Values each(const Range& range, const Value& value)
@@ -56,7 +56,7 @@ Values valuesOfTiles(const Settings& s, IceTEnum name)
 {
     int width = 0, height = 0;
     for (const Tile& tile : s.tiles)
-        width = std::max(width, tile.viewport.width), height = std::max(height, tile.viewport.height);
+        width = std::max(width, tile.viewport.width()), height = std::max(height, tile.viewport.height());
     switch (name) {
     case ICET_NUM_TILES: return {double(s.tiles.size())};
     case ICET_TILE_VIEWPORTS: return each(s.tiles, [](const Tile& tile) { return of(tile.viewport); });
@@ -100,8 +100,8 @@ Values valuesOfSettings(const IceTContextStruct& c, IceTEnum name)
 Values validPixels(const IceTContextStruct& c)
 {
     const int tile = c.frame.count > 0 ? c.settings.tileOf(c.rank()) : -1;
-    const Viewport pixels = tile < 0 ? Viewport{} : c.settings.tiles[static_cast<std::size_t>(tile)].viewport;
-    return {double(tile), double(pixels.width) * pixels.height};
+    const Region pixels = tile < 0 ? Region{} : c.settings.tiles[static_cast<std::size_t>(tile)].viewport;
+    return {double(tile), double(pixels.width()) * pixels.height()};
 }
 
 Values valuesOfFrame(const IceTContextStruct& c, IceTEnum name)

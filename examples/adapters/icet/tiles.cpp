@@ -14,7 +14,7 @@ std::array<int, 2> largestTile(const Settings& settings)
 {
     std::array<int, 2> size{};
     for (const Tile& tile : settings.tiles)
-        size = {std::max(size[0], tile.viewport.width), std::max(size[1], tile.viewport.height)};
+        size = {std::max(size[0], tile.viewport.width()), std::max(size[1], tile.viewport.height())};
     return size;
 }
 
@@ -75,7 +75,7 @@ extern "C" int icetAddTile(IceTInt x, IceTInt y, IceTSizeType width, IceTSizeTyp
 {
     int index = -1;
     inContext("icetAddTile", [&](IceTContextStruct& context) {
-        index = addTile(context, {{x, y, width, height}, displayRank});
+        index = addTile(context, {viewport(x, y, width, height), displayRank});
     });
     return index;
 }

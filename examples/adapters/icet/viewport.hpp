@@ -1,4 +1,4 @@
-// Viewport: a rectangle of pixels as IceT has it, from its lower left corner.
+// Viewports: rectangles of pixels, which IceT has from their lower left corner, as regions of the library.
 #pragma once
 
 #include <dfb/image.hpp>
@@ -7,39 +7,23 @@
 
 namespace dfb_icet {
 
-struct Viewport {
-    int x = 0, y = 0, width = 0, height = 0;
+// Rows count upwards.
+using dfb::Region;
 
-    bool empty() const noexcept { return width <= 0 || height <= 0; }
-    bool contains(const Viewport& other) const noexcept
-    {
-        return other.x >= x && other.y >= y && other.x + other.width <= x + width
-               && other.y + other.height <= y + height;
-    }
-};
-
-// Empty, at 0, if there is none.
-inline Viewport intersection(const Viewport& a, const Viewport& b) noexcept
-{
-    const int x = std::max(a.x, b.x), y = std::max(a.y, b.y);
-    const Viewport both{x, y, std::min(a.x + a.width, b.x + b.width) - x, std::min(a.y + a.height, b.y + b.height) - y};
-    return both.empty() ? Viewport{} : both;
-}
+inline Region viewport(int x, int y, int width, int height) noexcept { return {x, y, x + width, y + height}; }
 
 // The smallest that has both, of which `a` may be empty.
-inline Viewport hull(const Viewport& a, const Viewport& b) noexcept
+inline Region hull(const Region& a, const Region& b) noexcept
 {
     if (a.empty())
         return b;
-    const int x = std::min(a.x, b.x), y = std::min(a.y, b.y);
-    return {x, y, std::max(a.x + a.width, b.x + b.width) - x, std::max(a.y + a.height, b.y + b.height) - y};
+    return {std::min(a.x0, b.x0), std::min(a.y0, b.y0), std::max(a.x1, b.x1), std::max(a.y1, b.y1)};
 }
 
 // `part` as a picture of `tile` has it. Rows of both count upwards, so no picture is turned.
-inline dfb::Region regionIn(const Viewport& tile, const Viewport& part) noexcept
+inline Region regionIn(const Region& tile, const Region& part) noexcept
 {
-    const int x = part.x - tile.x, y = part.y - tile.y;
-    return {x, y, x + part.width, y + part.height};
+    return viewport(part.x0 - tile.x0, part.y0 - tile.y0, part.width(), part.height());
 }
 
 } // namespace dfb_icet
