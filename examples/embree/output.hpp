@@ -1,6 +1,7 @@
 // Output: images and statistics as files. Every function that writes throws std::runtime_error with the file's name.
 #pragma once
 
+#include <dfb/frame.hpp>
 #include <dfb/image.hpp>
 
 #include <algorithm>
@@ -72,17 +73,7 @@ struct RankFrameStats {
 
 struct FrameStats {
     std::vector<RankFrameStats> ranks;
-    std::uint64_t bytesSent = 0; // by all ranks
-    std::uint64_t messagesSent = 0;
-    std::uint64_t tilesTotal = 0;
-    std::uint64_t tilesTouched = 0;
-    std::uint64_t peakMemoryBytes = 0; // of the rank with the most
-    std::uint64_t orderUndefinedPixels = 0;
-    double mergeErrorBound = 0;
-    std::string wireColor; // the format of the colour on its way
-    double wireErrorBound = 0;
-    bool compressed = false;
-    std::int64_t compressedLinks = 0;
+    dfb::FrameReport report;
 };
 
 // Of a rank in the whole run.

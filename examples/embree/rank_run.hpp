@@ -296,7 +296,6 @@ private:
         stats.height = o_.height;
         stats.runMs = runMs_;
         for (std::size_t i = 0; i < reports_.size(); ++i) {
-            const dfb::FrameReport& r = reports_[i];
             FrameStats s;
             for (const auto& n : ofRanks) {
                 const std::int64_t* f = n.data() + 7 + 5 * i;
@@ -304,18 +303,8 @@ private:
                                    static_cast<std::uint64_t>(f[3]),
                                    static_cast<std::uint64_t>(f[4])});
             }
-            s.bytesSent = static_cast<std::uint64_t>(r.bytesSent);
-            s.messagesSent = static_cast<std::uint64_t>(r.messagesSent);
-            s.tilesTotal = static_cast<std::uint64_t>(r.tilesTotal);
-            s.tilesTouched = static_cast<std::uint64_t>(r.tilesTouched);
-            s.peakMemoryBytes = static_cast<std::uint64_t>(r.peakMemoryBytes);
-            s.orderUndefinedPixels = static_cast<std::uint64_t>(r.orderUndefinedPixels);
-            s.mergeErrorBound = r.mergeErrorBound;
-            s.wireColor = dfb::nameOf(r.wireColor);
-            s.wireErrorBound = r.wireErrorBound;
-            s.compressed = r.compressed;
-            s.compressedLinks = r.compressedLinks;
-            stats.frames.push_back(s);
+            s.report = reports_[i];
+            stats.frames.push_back(std::move(s));
         }
         const std::int64_t pixels = static_cast<std::int64_t>(o_.width) * o_.height;
         stats.samplesTaken = static_cast<std::uint64_t>(sampler_ ? sampler_->samplesTaken() : pixels * o_.spp);
@@ -342,11 +331,11 @@ private:
                             / (static_cast<double>(stats.samplesTaken) + static_cast<double>(stats.samplesSaved)),
                         o_.spp);
         if (compositing_ == Compositing::Deep)
-            std::printf("order undefined at %llu pixels; merging changed none by more than %.3g\n",
-                        static_cast<unsigned long long>(last.orderUndefinedPixels), last.mergeErrorBound);
-        if (last.wireErrorBound > 0)
-            std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n", last.wireColor.c_str(),
-                        last.wireErrorBound);
+            std::printf("order undefined at %lld pixels; merging changed none by more than %.3g\n",
+                        static_cast<long long>(last.report.orderUndefinedPixels), last.report.mergeErrorBound);
+        if (last.report.wireErrorBound > 0)
+            std::printf("tiles travelled as %s: no colour or alpha is off by more than %.3g\n",
+                        dfb::nameOf(last.report.wireColor), last.report.wireErrorBound);
         files_.say();
     }
 

@@ -98,11 +98,11 @@ RunStats someStats()
     stats.frames.resize(2);
     stats.frames[0].ranks.resize(3);
     stats.frames[1].ranks = {{{0, 10.25, 1.125, 2}, 5, 600}, {{0, 1, 10.5, 0}, 7, 800}, {{0, 2, 9.25, 0}, 0, 0}};
-    stats.frames[1].bytesSent = 5000000000u;
-    stats.frames[1].messagesSent = 77;
-    stats.frames[1].tilesTotal = 80;
-    stats.frames[1].tilesTouched = 70;
-    stats.frames[1].peakMemoryBytes = 6000000000u;
+    stats.frames[1].report.bytesSent = 5000000000;
+    stats.frames[1].report.messagesSent = 77;
+    stats.frames[1].report.tilesTotal = 80;
+    stats.frames[1].report.tilesTouched = 70;
+    stats.frames[1].report.peakMemoryBytes = 6000000000;
     return stats;
 }
 
