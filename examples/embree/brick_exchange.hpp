@@ -40,18 +40,6 @@ inline void pack(std::uint32_t cell, const BrickSpheres& part, Loaders::Bytes& b
     Loaders::pack(part.primitives, bytes);
 }
 
-// Behind what is there.
-template <class T>
-void unpackBehind(const std::byte*& at, std::vector<T>& all)
-{
-    std::vector<T> more;
-    Loaders::unpack(at, more);
-    if (all.empty())
-        all = std::move(more);
-    else
-        all.insert(all.end(), more.begin(), more.end());
-}
-
 // The part of the object with this geometry: that which is there, or a new one.
 template <class Part, class Object>
 Part& partWith(std::vector<Part>& parts, const std::vector<Object>& objects, std::uint32_t geometry)
@@ -68,11 +56,11 @@ Part& partWith(std::vector<Part>& parts, const std::vector<Object>& objects, std
 inline void unpackMesh(const std::byte*& at, BrickMesh& part)
 {
     const std::size_t vertices = part.mesh.positions.size(), triangles = part.mesh.triangles.size();
-    unpackBehind(at, part.mesh.positions);
-    unpackBehind(at, part.mesh.colors);
-    unpackBehind(at, part.normals);
-    unpackBehind(at, part.mesh.triangles);
-    unpackBehind(at, part.primitives);
+    Loaders::unpack(at, part.mesh.positions);
+    Loaders::unpack(at, part.mesh.colors);
+    Loaders::unpack(at, part.normals);
+    Loaders::unpack(at, part.mesh.triangles);
+    Loaders::unpack(at, part.primitives);
     for (std::size_t i = triangles; i < part.mesh.triangles.size(); ++i)
         for (std::uint32_t& index : part.mesh.triangles[i])
             index += static_cast<std::uint32_t>(vertices);
@@ -146,8 +134,8 @@ inline std::vector<CellSurfaces> exchangeBricks(Scene& scene, const std::vector<
                 detail::unpackMesh(at, detail::partWith(cell.meshes, scene.meshes, what[2]));
             } else {
                 BrickSpheres& part = detail::partWith(cell.spheres, scene.spheres, what[2]);
-                detail::unpackBehind(at, part.spheres);
-                detail::unpackBehind(at, part.primitives);
+                Loaders::unpack(at, part.spheres);
+                Loaders::unpack(at, part.primitives);
             }
         }
         bytes = Loaders::Bytes();

@@ -193,7 +193,7 @@ public:
         return all;
     }
 
-    // Adds an array to some bytes, or takes it from them.
+    // Adds an array to some bytes, or takes it from them and adds it to `array`.
     template <class T>
     static void pack(const std::vector<T>& array, Bytes& bytes)
     {
@@ -212,10 +212,11 @@ public:
         std::uint64_t count = 0;
         std::memcpy(&count, at, sizeof count);
         at += sizeof count;
-        array.resize(static_cast<std::size_t>(count));
+        const std::size_t before = array.size();
+        array.resize(before + static_cast<std::size_t>(count));
         if (count > 0)
-            std::memcpy(static_cast<void*>(array.data()), at, array.size() * sizeof(T));
-        at += array.size() * sizeof(T);
+            std::memcpy(static_cast<void*>(array.data() + before), at, static_cast<std::size_t>(count) * sizeof(T));
+        at += static_cast<std::size_t>(count) * sizeof(T);
     }
 
 private:

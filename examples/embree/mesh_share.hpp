@@ -160,9 +160,7 @@ public:
         std::vector<T> all;
         for (const Loaders::Bytes& bytes : loaders_.exchange(std::move(parts))) { // by rank, and so ascending
             const std::byte* at = bytes.data();
-            std::vector<T> answer;
-            Loaders::unpack(at, answer);
-            all.insert(all.end(), answer.begin(), answer.end());
+            Loaders::unpack(at, all);
         }
         return all;
     }
@@ -271,9 +269,7 @@ void evenOut(std::vector<T>& things, const std::vector<std::uint64_t>& begins, c
     things = {};
     for (const Loaders::Bytes& bytes : loaders.exchange(std::move(parts))) {
         const std::byte* at = bytes.data();
-        std::vector<T> more;
-        Loaders::unpack(at, more);
-        things.insert(things.end(), more.begin(), more.end());
+        Loaders::unpack(at, things);
     }
 }
 
