@@ -19,7 +19,7 @@ DFB_NAMESPACE_BEGIN
 // With DepthComposite, and any operation that says activeByDepth (tile_op.hpp), a pixel is active if its depth is below
 // +infinity. With DepthComposite it then gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
-inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: over
+inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: blended by the operator over
 // Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
 inline constexpr ChannelMask depthChannel = 2;
 // Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they

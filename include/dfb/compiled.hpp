@@ -31,7 +31,8 @@
 #define DFB_COMPILED_TEMPLATE(...) static_assert(true)
 #endif
 
-// A program has one of both: the linker refuses a variable that is of a thread in one file and of all in another.
+// Either all files of a program use dfb::compiled, or none. This variable is thread_local in files that do not, and
+// ordinary in dfb::compiled: the linker refuses a mixture.
 #if defined(__GNUC__) && defined(__ELF__)
 extern "C" {
 #if defined(DFB_COMPILING)

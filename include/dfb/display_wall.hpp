@@ -42,9 +42,10 @@ struct ToWall {
 // at most `poolBytes` each.
 class DisplayWall {
 public:
-    // Makes a wall whose displays show images in `format`. Collective, in the same order as the framebuffers of the
-    // connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong or differs between
-    // ranks, or if a rank has no memory for it.
+    // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside
+    // those of the framebuffers. `poolBytes`: as MessageConfig::poolBytes. Collective, in the same order as the
+    // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong
+    // or differs between ranks, or if a rank has no memory for it.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 
@@ -69,7 +70,8 @@ public:
     // after the frame has ended. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all
     // ranks: TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the
     // ranks have not sent all of it, because it failed or was partial; MalformedMessage if a part of it cannot be
-    // right. The displays then keep their picture. Throws TransportError if the connection fails.
+    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument
+    // on a thread that may not call MPI.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before

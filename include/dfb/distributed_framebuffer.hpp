@@ -21,7 +21,8 @@
 DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
-// begin() and end().
+// the constructor, begin(), end() and what is collective below. All of these throw InvalidArgument, on this rank alone,
+// on a thread that may not call MPI (see Progress).
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
     static_assert(detail::checkTileOp<TileOp>());
@@ -57,9 +58,11 @@ public:
                 engine_->leave();
         }
 
+        // The number of the frame, as in FrameReport::frame. Any thread.
         std::int64_t number() const noexcept { return number_; }
 
-        // In this frame. Any thread. They wait for nothing and throw nothing.
+        // The owner of a tile, and the tiles that this rank owns, in this frame. Any thread. They wait for nothing and
+        // throw nothing; nobody checks the index.
         int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
         const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
@@ -109,9 +112,9 @@ public:
 
         // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
-        // Announces to `rank` that an input of this rank will probably hide that rank's inputs of this generation and
-        // higher ones. `rank` had better wait before it renders them. This rank must then call hide() or, if they can
-        // be seen, show(). Threads and exceptions as for hide().
+        // Tells `rank` that an input of this rank will probably hide its inputs of `generation` and higher ones. That
+        // rank should wait before it renders them. This rank must then call hide() or, if they can be seen, show().
+        // Threads and exceptions as for hide().
         void mayHide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
@@ -138,11 +141,12 @@ public:
         // a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-        // Sets FrameConfig::maxLayers for the inputs of this rank, if it was not known at begin(). Ranks may give
-        // different numbers. Call it before the first setTile(). Waits for nothing. Throws nothing.
+        // Replaces FrameConfig::maxLayers for the inputs of this rank, for a renderer that learns it after begin().
+        // Ranks may give different numbers. Call it before the first setTile(), on one thread. Waits for nothing.
+        // Throws nothing.
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
-        // The samples that a tile gets in this frame. Any thread.
+        // The samples that a tile gets in this frame. Any thread. Waits for nothing. Nobody checks the index.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
         // Returns the next range of jobs for this rank, out of [0, count) for all ranks together; each job goes to one
@@ -152,12 +156,13 @@ public:
         // the frame fails. Throws TransportError.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
-        // Adds `value` to the sum over all ranks that FrameReport::figures will have for this key. For measurements
-        // that all ranks must know, such as the cost of a brick. It travels with the verdict. Any thread.
+        // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. For measurements
+        // that all ranks must know, such as the cost of a brick. Figures travel with the verdict: call it before this
+        // rank's end(). Any thread. Waits for nothing.
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
-        // Notes that an input of that tile was simplified, and that a pixel of one pass may be off by `bound` (colour)
-        // for it; see FrameReport::mergeErrorBound. Any thread.
+        // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
+        // units of colour; see FrameReport::mergeErrorBound. Before this rank's end(). Any thread. Waits for nothing.
         void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
         // Whether the frame has failed on some rank, as far as this rank knows. Then rendering on is of no use. Any
@@ -233,12 +238,14 @@ public:
         // Waits for nothing.
         void cancel() const { engine_->cancel(number_); }
 
-        // Ends the frame. Collective; with several framebuffers, in the same order on all ranks. This rank's last
-        // setTile() must have returned: an input that is not sent when all ranks are in end() counts as missing. Waits
-        // until all tiles of all ranks are finished and the display rank has the image, or until the frame has failed.
-        // It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput). Throws FrameError,
-        // the same on every rank, or TransportError; the frame is over then, and after a FrameError the next may begin.
-        // Throws InvalidArgument on a thread that may not call MPI (see Progress); the frame is still open then.
+        // Ends the frame. Call it once. Collective; with several framebuffers, in the same order on all ranks. This
+        // rank's last setTile() must have returned: an input that is not sent when all ranks are in end() counts as
+        // missing. Waits until all tiles of all ranks are finished and the display rank has the image, or until the
+        // frame has failed. It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput).
+        // Throws FrameError, the same on every rank; with FrameConfig::allowPartial it returns instead, with
+        // FrameReport::failure set, unless ranks disagree. Throws TransportError. The frame is over then, and after a
+        // FrameError the next may begin. Throws InvalidArgument on a thread that may not call MPI (see Progress); the
+        // frame is still open then.
         FrameReport end()
         {
             engine_->requireProgress();
@@ -259,7 +266,8 @@ public:
             return engine_->isDone();
         }
 
-        // Ends the frame if isDone(); otherwise returns nothing. Waits for nothing. Throws what end() throws.
+        // Ends the frame and returns its report if isDone(); otherwise returns nothing, at once. Waits no longer than
+        // end() does after isDone(). Throws what end() throws.
         std::optional<FrameReport> tryEnd() { return isDone() ? std::optional<FrameReport>(end()) : std::nullopt; }
 
     private:
@@ -301,7 +309,8 @@ public:
     DistributedFrameBuffer(const DistributedFrameBuffer&) = delete;
     DistributedFrameBuffer& operator=(const DistributedFrameBuffer&) = delete;
 
-    // Collective. No frame may be open. Waits for all ranks.
+    // Collective. No frame may be open. Must come before MPI_Finalize(). The last object of a connection waits for all
+    // ranks.
     ~DistributedFrameBuffer() = default;
 
     // These wait for nothing and throw nothing. Any thread, but not during resize(). config() has the values in use:

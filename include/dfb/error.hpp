@@ -43,10 +43,10 @@ inline std::string printed(const char* format, std::va_list values)
 
 enum class ErrorKind : std::uint32_t {
     InvalidArgument,  // a call with a wrong argument; in a FrameError one between begin() and end()
-    TooManyInputs,    // a generation has received more tiles than were announced for it
+    TooManyInputs,    // a generation has received more inputs than were announced for it
     DuplicateInput,   // the same (pass, generation, source, part) came twice for one tile
     UnannouncedInput, // an input of a generation or source that nobody announced
-    NegativeChildren, // a tile announced fewer than zero children
+    NegativeChildren, // an input announced fewer than zero children
     MalformedMessage, // bytes off the wire that are not a message of this framebuffer
     Disagreement,     // ranks were given different configurations or frame parameters, or sent more than announced
     UserCode,         // an exception out of a renderer, a tile operation or a pixel operation
@@ -156,7 +156,7 @@ private:
     std::shared_ptr<const void> whileThrown_;
 };
 
-// A call that can never be right. Nothing was sent, the object is unchanged.
+// A wrong argument, or a call that is not allowed now or on this thread. Nothing was sent, the object is unchanged.
 class InvalidArgument : public Error {
 public:
     using Error::Error;

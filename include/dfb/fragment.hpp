@@ -72,9 +72,9 @@ public:
     const TileHeader& header() const noexcept { return header_; }
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
     std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: not known, 0
-    // Whether FragmentCursor::nextBytes() may be called.
+    // Whether the pixels have 8 bits a channel: FragmentCursor::nextBytes() may be called then.
     bool keepsBytes() const noexcept { return parts_.bytes || parts_.inPlace.activity.hasBytes; }
-    // Whether a cursor makes its rows in memory of their own.
+    // Whether FragmentCursor has to convert or copy each row before it can return it.
     bool isMadeByRow() const noexcept { return parts_.bytes || parts_.encoding == FragmentEncoding::InPlace; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr || parts_.inPlace.depth != nullptr; }
     ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
@@ -126,8 +126,8 @@ struct ByteRow : FragmentRow {
 // Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
 class FragmentCursor {
 public:
-    // `row` is memory for a row of a fragment that isMadeByRow(); null: the cursor has its own. `countsFaults`:
-    // whether pixels that are not as they should be are added to the frame's counts; only one walk may.
+    // `row` is scratch memory for a fragment that isMadeByRow(); null: the cursor has its own. `countsFaults`: whether
+    // faults of pixels in place, such as NaN, are added to FrameReport; true for one walk of a fragment only.
     explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
           bytes_(fragment.parts_.bytes), depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
@@ -151,8 +151,8 @@ public:
         return row;
     }
 
-    // Goes to the next row, of colour and depth alone: the other channels of `result` stay as they are. Returns false
-    // if the row has no pixels. advance(row) must follow.
+    // Goes to the next row, and sets its colour and depth in `result`, but no other channel. Returns false if the row
+    // has no pixels. advance(row) must follow.
     bool next(FragmentRow& result)
     {
         const int row = row_++;
@@ -164,7 +164,7 @@ public:
         result.color = bytes_ ? decodeRow(result) : color_;
         return true;
     }
-    // Does so for a fragment that keepsBytes(). Its pixels in place are not looked at: some may be empty.
+    // Does so with bytes, for a fragment that keepsBytes(). Pixels in place are not checked: some may be empty.
     bool nextBytes(ByteRow& result)
     {
         const int row = row_++;
@@ -187,7 +187,7 @@ public:
         result.depthLimit = pixels.activity.depthLimit;
         return true;
     }
-    // Adds to the frame's counts what nextBytes() does not look at.
+    // Adds NaN depths that the caller of nextBytes() has found to the frame's counts.
     void countNanDepths(std::uint64_t count)
     {
         if (count > 0 && countsFaults_ && parts_->faults)
@@ -205,7 +205,7 @@ public:
         advance(pixels);
     }
 
-    // Leaves out rows.
+    // Skips `count` rows.
     void skip(int count)
     {
         for (const int end = row_ + count; row_ < end; ++row_) {

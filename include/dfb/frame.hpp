@@ -105,9 +105,10 @@ struct FrameConfig {
     // For an ErrorBudget: the most inputs that a pixel has in a pass. 0: not known, counts as 65536. ImageParallelLoop,
     // MixedParallelLoop, OrderedLoop and ImageCompositor set it; DataParallelLoop and DeepParallelLoop do not.
     int maxLayers = 0;
-    // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all frames with
-    // this id. Give another id when camera, scene or background change; the samples of each tile then begin with 0.
-    // They also do so after a frame that failed or was partial, and in a frame without `samples` after one with them.
+    // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all consecutive
+    // frames with this id. Give another id when camera, scene or background change; the samples of each tile then begin
+    // with 0. They also do so after a frame that failed or was partial, and in a frame without `samples` after one with
+    // them.
     std::uint64_t accumulationId = 0;
     // False: inputs of generation 0 announce the others, as in the paper, and every tile needs one per pass. True: each
     // rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
@@ -119,8 +120,9 @@ struct FrameConfig {
     std::chrono::milliseconds timeout{0};
     // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
     // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same
-    // as without it. An input of a source that is not in the order makes the frame fail. Loops with a SharedWorld set
-    // it themselves where there is such an order.
+    // as without it. An input of a source that is not in the order makes the frame fail. MixedParallelLoop, and
+    // DataParallelLoop with a SharedWorld, set it where the bricks (1024 at most) have such an order and the camera
+    // says where its rays begin: see render/visibility.hpp.
     std::shared_ptr<const SourceOrder> order{};
     // Not null: which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does not depend
     // on it. Not for operations that keep state. Loops set it themselves: see ImageConfig::ownerMap.
@@ -186,10 +188,10 @@ struct FrameReport {
     std::int64_t messagesSent = 0;              // all
     std::int64_t tilesTotal = 0;                // in the image
     std::int64_t tilesTouched = 0;              // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinity or NaN (wire/active_pixels.hpp)
+    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinite or NaN colour, or a NaN depth
     std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
-    WireFormat wireColor = WireFormat::Float32; // that this rank's inputs in range travelled in
+    WireFormat wireColor = WireFormat::Float32; // how this rank's inputs travelled, but for those out of range
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     std::int64_t compressedLinks = 0;           // all: pairs of sender and receiver for which it paid
     // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance. Depth, positions

@@ -341,10 +341,10 @@ inline int ditherSrgb8(float value, double threshold)
 
 } // namespace detail
 
-// convertPixels() with dithered colour, if the format has 8 bits; (x, y) is where the first pixel is in the image.
-// Alpha is rounded as ever. A colour that is at most alpha gets at most the level to which alpha would be rounded as
-// such a colour (of two that are equally near, the lower), so that in RGBA8 it stays at most alpha; that puts it off by
-// half a level at most. Returns of alpha alone how far the farthest value was from a level.
+// convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
+// Alpha is rounded, not dithered. A colour that is at most alpha gets no level above that of alpha, where alpha is
+// converted as a colour and a tie goes to the lower level: so in RGBA8 it stays at most alpha. This costs it half a
+// level at most. Returns the largest rounding distance of alpha, as convertPixels() does.
 template <class Real>
 double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out)
 {

@@ -74,11 +74,11 @@ struct InputImage {
 // they work on all threads of config.executor.
 class ImageCompositor {
 public:
-    // Makes a compositor on a connection. config.image: the picture of the display rank. Throws as the constructor of
-    // DistributedFrameBuffer.
+    // Makes a compositor on a connection. config.image: the picture of the display rank. config.framesInFlight becomes
+    // 1. Collective. Waits for all ranks. Throws as the constructor of DistributedFrameBuffer.
     ImageCompositor(std::shared_ptr<Connection> connection, ImageBlend blend, FrameBufferConfig config);
 #if defined(DFB_HAS_MPI)
-    // Makes a compositor on a connection of its own.
+    // Makes a compositor on a connection of its own. Waits and throws as above.
     ImageCompositor(MPI_Comm communicator, ImageBlend blend, FrameBufferConfig config, NetworkConfig network = {})
         : ImageCompositor(connect<MpiTransport>(communicator, std::move(network)), blend, std::move(config))
     {
@@ -104,8 +104,9 @@ public:
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
     // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
-    // rank's place in the order, 0 in front, a different one on each rank. Without config.executor, on a rank with one
-    // processor, the calling thread does all the work. Collective. Waits and throws as end().
+    // rank's place in the order, 0 in front, a different one on each rank. `frame` must have one pass and no samples.
+    // If config.executor was not given and this rank's share is one processor, the calling thread does all the work.
+    // Collective. Waits as end(). Throws what start() and end() throw.
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
     // Does so for the other ways to blend, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
@@ -116,13 +117,13 @@ public:
     // Begins a picture: reads this rank's image and sends it. Every rank must call start() or startFailed() once for
     // each picture, then end(). The image's memory may be used again when this returns, unless you have promised
     // InputImage::staysUntilEnd. Waits for another rank only if this one has too much under way
-    // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, and TransportError. If the image is
-    // wrong, end() throws on all ranks.
+    // (MessageConfig::poolBytes). Throws InvalidArgument if a picture is open, if a field of `frame` is out of range,
+    // or on a thread that may not call MPI. Throws TransportError. If the image or `place` is wrong, end() throws on
+    // all ranks.
     void start(const InputImage& image, int place, const FrameConfig& frame = {});
     void start(const InputImage& image, const FrameConfig& frame = {}) { start(image, -1, frame); }
     // In place of start(), on a rank that could not make its image: end() throws a FrameError with the text of `why`
-    // on all ranks, this one among them. The next picture can be made. Waits for nobody. Throws InvalidArgument if a
-    // picture is open.
+    // on all ranks, this one among them. The next picture can be made. Waits for nobody. Throws as start().
     void startFailed(const std::exception_ptr& why, const FrameConfig& frame = {});
 
     // Whether end() would return without waiting; see DistributedFrameBuffer::Frame::isDone(). False without start().
@@ -160,7 +161,8 @@ public:
     }
 
     // Changes the size of the picture; image() is empty then. Collective. Waits for all ranks. Throws InvalidArgument
-    // if a picture is open, or on all ranks if the size cannot be.
+    // on this rank if a picture is open; on all ranks if the size is not 1 to 65536 or differs between ranks, or if
+    // memory is short. Throws TransportError.
     void resize(int width, int height);
 
 private:

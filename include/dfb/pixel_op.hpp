@@ -1,8 +1,8 @@
 // The contract of a pixel operation (PixelOp): it changes a finished tile on its owner, before it is converted to the
 // output format (section 3.1.2 of the paper).
 //
-// A PixelOp is a copyable type; the framebuffer keeps one object per rank and calls process() for several tiles
-// at once.
+// A PixelOp is a copyable type. Each rank keeps one copy for each frame in flight, and calls process() for several
+// tiles at once.
 //
 //   void process(PixelTile&) const;              changes the pixels, sends them elsewhere, ...
 //
@@ -11,7 +11,7 @@
 //                                                are no side effects: then background tiles need not be processed
 //                                                one by one nor travel. Default false.
 //   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
-//   void newFrame(const FrameData&);             called once a frame on every rank, if there is a FrameData
+//   void newFrame(const FrameData&);             called in begin(), once a frame on every rank, if there is a FrameData
 #pragma once
 
 #include <dfb/base/detect.hpp>

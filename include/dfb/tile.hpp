@@ -207,6 +207,7 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
             }
     }
 
+    // The RGBA of a pixel; x and y count from the tile's upper left corner, unlike those of forEachPixel().
     float* pixel(int x, int y) noexcept { return color + 4 * (y * Size + x); }
     const float* pixel(int x, int y) const noexcept { return color + 4 * (y * Size + x); }
     // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region.
@@ -239,9 +240,9 @@ struct TileView : TileHeader {
     // A promise: the pixels do not change until the frame's end() has returned. Then they need not be copied. They are
     // read in place if this rank owns the tile, or if the owner is on the same node and they are in memory of
     // sharedMemory(). They are copied all the same if the operation has no readsInPlace or keeps state, if a channel
-    // beside colour and depth is sent, with a WireFormat that rounds, an ErrorBudget, or minTransmittance above 0.
-    // After a TransportError do not write to such memory until the framebuffer is gone. NetworkConfig::checksums finds
-    // promises that are not kept.
+    // beside colour and depth is sent, with a WireFormat that rounds, an ErrorBudget, minTransmittance above 0, or
+    // HalfLevel for an 8-bit image of ranks on several nodes. After a TransportError do not write to such memory until
+    // the framebuffer is gone. NetworkConfig::checksums finds promises that are not kept.
     bool staysUntilEnd = false;
 
     detail::ConstPlanes planes() const noexcept

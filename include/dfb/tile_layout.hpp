@@ -77,8 +77,8 @@ using TileOwners = std::shared_ptr<const std::vector<int>>;
 // See FrameBufferConfig::onTile.
 using TileCallback = std::function<void(int tile, const Region& pixels, const Image& image)>;
 
-// The default: each tile row is the one above it shifted by about 0.62 of the rank count, so that neighbours in
-// both directions belong to different ranks (tile mod ranks gives vertical stripes where the two divide).
+// The default: each tile row is the one above it, shifted by about 0.62 of the rank count, so that neighbours in both
+// directions belong to different ranks. (With tile % rankCount a rank would own whole columns of many images.)
 inline int latticeOwner(int tile, const TileLayout& layout, int rankCount)
 {
     int shift = std::max(1, static_cast<int>(0.618 * rankCount));
@@ -112,7 +112,7 @@ struct WallLayout {
     int columns = 1, rows = 1;
     int displayWidth = 0, displayHeight = 0; // pixels
     int bezelX = 0, bezelY = 0;              // pixels that are not seen between two displays
-    std::vector<int> ranks;                  // that drives each display; any number of displays each, from none to all
+    std::vector<int> ranks;                  // for each display the rank that drives it; one may drive several, or none
 
     // Of the framebuffer.
     int width() const noexcept { return columns * displayWidth + (columns - 1) * bezelX; }

@@ -1,8 +1,9 @@
 // The contract of a tile operation (TileOp): how the inputs of one tile become a finished tile.
 //
-// A TileOp is a default-constructible type. The framebuffer keeps one object per tile that it owns. Calls for one tile
-// come one after the other, from any worker, so the operation needs no mutex; calls for different tiles come at once.
-// It does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
+// A TileOp is a default-constructible type. A rank keeps one object for each tile that it owns, for each frame in
+// flight. Calls for one tile come one after the other, from any worker, so the operation needs no mutex; calls for
+// different tiles come at once. It does not know the framebuffer, messages or threads. An exception makes the frame
+// fail on all ranks, with its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
 // TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order, empty ones too:
@@ -68,10 +69,10 @@ struct TileInfo {
     int tile = 0;
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
-    int firstSample = 0;                         // of the pixel, over all frames that accumulate: that of pass 0
-    int emptySamples = 0;                        // those before it, if there was nothing in any: they are background
+    int firstSample = 0;                         // the sample number of pass 0, over all frames that accumulate
+    int emptySamples = 0;                        // the number of samples before it, if none of them had an input
     std::uint64_t accumulationId = 0;            // another one: the samples accumulated before are of no use
-    float minTransmittance = 0;                  // a pixel that lets less through counts as opaque
+    float minTransmittance = 0;                  // a pixel whose layers let less than this through counts as opaque
     ChannelMask wanted = 0;                      // channels of the image beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
     const SourceOrder* order = nullptr;          // FrameConfig::order; null without, and without takesOrder

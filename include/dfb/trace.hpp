@@ -20,7 +20,7 @@ struct TraceEvent {
         Render,  // begin() to the call of end(): renderMs
         End,     // the call of end() to its return: compositingOverheadMs
         Verdict, // this rank's vote to the verdict of all; byteCount: this rank's part of FrameReport::bytesSent
-        // Of a thread, by which they are told; one lies within another or beside it:
+        // Of a thread, which reports them itself. Two spans of a thread are nested, or do not overlap:
         Tile,    // a job of Frame::forEachTile()
         SetTile, // Frame::setTile(): the input is encoded and sent, or taken by this rank
         Input,   // an input is taken by the owner of its tile: TileOp::add(). peer: whose message it is, or -1
@@ -41,7 +41,7 @@ struct TraceEvent {
 };
 
 // The contract: add() is called by any thread, several at once, sometimes with a lock held. It is quick, waits for
-// nothing, and calls nothing of the library. It cannot throw: a sink that fails has to bear it.
+// nothing, and calls nothing of the library. It must not throw: a sink handles its own failures.
 class TraceSink {
 public:
     virtual ~TraceSink() = default;

@@ -1,6 +1,6 @@
-// TraceFile: keeps what a rank is told, and writes that of all ranks into one file in the Trace Event Format, which
-// Perfetto (ui.perfetto.dev) and speedscope open: a process for each rank, with rows for its frames and its threads,
-// and an arrow for each message.
+// TraceFile: keeps the events of a rank, and writes those of all ranks into one file in the Trace Event Format, which
+// Perfetto (ui.perfetto.dev) and speedscope open. The file has a process for each rank, with rows for its frames and
+// its threads, and an arrow for each message.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -229,7 +229,7 @@ private:
 // One object per rank, for the framebuffers of one connection.
 class TraceFile final : public TraceSink {
 public:
-    // Keeps up to `capacity` events, 64 bytes each, and counts those that come then. Allocates that at once.
+    // Keeps up to `capacity` events, 64 bytes each, in memory that it allocates now. Later events are only counted.
     explicit TraceFile(std::size_t capacity = 200'000) : capacity_(capacity) { records_.reserve(capacity); }
 
     void add(const TraceEvent& event) noexcept override
@@ -246,9 +246,9 @@ public:
         ++dropped_;
     }
 
-    // Writes the file on rank 0, and forgets what it has. Collective, outside frames; waits for all ranks. `fb`: one of
-    // the framebuffers, or an ImageCompositor. What was told on all ranks travels to each. Throws InvalidArgument on
-    // all ranks if the file cannot be written, and TransportError.
+    // Writes the file on rank 0, and forgets the events. Collective, outside frames; waits for all ranks. `fb`: one of
+    // the framebuffers, or an ImageCompositor. Each rank gets the events of all, and needs memory for them. Throws
+    // InvalidArgument on all ranks if the file cannot be written, and TransportError.
     template <class FrameBuffer>
     void write(FrameBuffer& fb, const std::string& path)
     {

@@ -7,8 +7,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Expects one input of generation 0 without children per pass. The tile is laid over the background, passes are
-// averaged. Of the other channels only those that the image has travel.
+// Expects one input per pass, of generation 0 and without children. The tile is laid over the background, passes are
+// averaged. Channels beside colour travel only if the image has them.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicImageParallel : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:

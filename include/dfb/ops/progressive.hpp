@@ -44,11 +44,11 @@ inline double growthOfM2(std::int64_t n, const double* sum, const double* sample
 //       loop.render(renderTile, params); // any loop; tile.sample is 0, 1, 2 and so on
 //   }
 //
-// With FrameConfig::samples, a tile must get its samples in order, in each frame those that follow; a tile without
-// samples in a frame costs nothing and keeps its pixels. For each finished tile TileReport::error is the standard error
-// of its pixels' mean (root mean square over pixels and RGBA) in the worst of its blocks of 8x8 pixels, so that a
-// bright corner counts however dark the rest is; infinite before the second sample. Memory: 45 bytes a pixel of a tile
-// that is owned and was touched, and 36 with normals and albedo more.
+// With FrameConfig::samples, TileSamples::first of a tile must be the number of samples that it has already, or 0,
+// which begins again. A tile without samples in a frame costs nothing and keeps its pixels. TileReport::error is the
+// standard error of the mean of a finished tile: the root mean square over pixels and RGBA in the worst of its blocks
+// of 8x8 pixels, so that a bright corner counts however dark the rest is. It is infinite before the second sample.
+// Memory: 45 bytes for each pixel of a tile that this rank owns and that had an input; 56 more with normals and albedo.
 template <class Base>
 class Progressive {
 public:

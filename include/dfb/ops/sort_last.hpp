@@ -233,7 +233,7 @@ protected:
 // Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
 // announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
 // n passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
-// order is undefined. Of `Channels` beside colour, depth and farChannel only those travel that the image has. With
+// order is undefined. Channels beside colour, depth and farChannel travel only if the image has them. With
 // FrameConfig::order it blends in that order, without a sort; not with farChannel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
@@ -246,10 +246,11 @@ public:
 
 // Blends inputs in the order of their generation, front to back. Use it if one order of the bricks is right for all
 // pixels of a tile. It sorts nothing, and no depth travels unless the image has it. The tree is a list: each input
-// announces one child, the last none. A tile without inputs has an empty one of generation 0. See OrderedLoop.
+// announces one child, the last none. A tile that no brick covers needs an empty input of generation 0, which
+// OrderedLoop sends.
 //
-// In a tile with one pass and no channel but colour, inputs behind an opaque one do not count, and the tile does not
-// wait for them.
+// In a tile with one pass, if the image has colour alone, inputs behind an opaque one are not blended, and the tile
+// does not wait for them.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicOrderedBlend : public detail::SortLast<BlendRule::InOrder, TileSize, Channels> {
 public:

@@ -1,7 +1,7 @@
-// Cameras beyond the pinhole: what per-pixel sorting allows (section 4.2 of the paper). Each gives a ray for a point of
-// the image and sample numbers for lens and time, and can tell which tiles a box may project to. A ray's sample numbers
-// must be a function of pixel, sample and seed alone, so that all bricks are seen along the same ray; each sample is a
-// pass.
+// Cameras beyond the pinhole: matrices, depth of field, stereo, domes, motion blur (section 4.2 of the paper). ray() is
+// the ray through a point of the image, with sample numbers for lens and time. project() says which pixels a box may
+// cover. Make the sample numbers of pixel, sample and seed alone: then all bricks are seen along the same ray. Each
+// sample is a pass. Any thread may call any member, several at once.
 //
 // Points of the image are in pixels, pixel centres at .5; sample numbers are in [0, 1); angles in degrees.
 #pragma once
@@ -134,7 +134,8 @@ private:
 // the world.
 class ThinLensCamera {
 public:
-    // Looks along `view`, of any length. Throws InvalidArgument if no camera can be so.
+    // Looks along `view`, of any length. Throws InvalidArgument if `view` is 0, `up` is 0 or along it, `fovY` is not in
+    // (0, 180), the radius is below 0, or the distance is not above 0.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
         : pose_(detail::poseOf(eye, view, up, fovY)), radius_(static_cast<double>(apertureRadius)),
@@ -166,7 +167,8 @@ private:
 // `separation` apart. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
-    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument if no camera can be so.
+    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument if `view` is 0, `up` is 0
+    // or along it, `fovY` is not in (0, 180), `separation` is below 0, or `convergence` is not above 0.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
         : pose_(detail::poseOf(eye, view, up, fovY)), separation_(static_cast<double>(separation)),
           convergence_(static_cast<double>(convergence))
@@ -265,8 +267,8 @@ private:
 // Motion blur of a camera that turns around an axis while the shutter is open: by `degrees` from sample time 0 to 1.
 class OrbitBlurCamera {
 public:
-    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument if no camera
-    // can be so, for an axis of length 0, and for more than a full turn.
+    // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument if `view` is
+    // 0, `up` is 0 or along it, `fovY` is not in (0, 180), the axis has length 0, or `degrees` is not within +-360.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
         : pose_(detail::poseOf(eye, view, up, fovY)), center_(detail::pointOf(center)), axis_(detail::pointOf(axis)),

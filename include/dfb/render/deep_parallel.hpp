@@ -18,8 +18,8 @@
 #include <utility>
 #include <vector>
 
-// DeepTile: a tile of a renderer that has several segments per pixel: what one brick contributes in one piece of a
-// ray, with a gap before the next in which other bricks may have theirs.
+// DeepTile: a tile whose pixels may have several segments. A segment is what one brick contributes along one piece of a
+// ray. In the gaps between its segments other bricks may have theirs.
 
 DFB_NAMESPACE_BEGIN
 
@@ -80,13 +80,13 @@ public:
         layers_ = std::max<int>(layers_, ++count);
     }
 
-    // The most that a pixel has, at most maxSegments().
+    // The largest number of segments of a pixel, at most maxSegments().
     int layers() const noexcept { return layers_; }
 
     // How much merging may have changed a pixel, at most; see above.
     double errorBound() const noexcept { return errorBound_; }
 
-    // Writes the segments of that number, front to back, into a cleared tile of the same region.
+    // Writes segment `layer` of each pixel, counted from the front, into a cleared tile of the same region.
     template <class TileType>
     void writeLayer(int layer, TileType& tile) const
     {

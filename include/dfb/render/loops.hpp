@@ -125,8 +125,9 @@ public:
 
     // Begins a frame, renders this rank's share, and returns the frame: call end(). renderTile(tile) writes the pixels
     // of tile.region into the cleared tile. Several threads call it at once, for each pass with its own tile.pass and
-    // tile.sample. Waits for its share, with WorkDistribution::Dynamic also for other ranks. Throws what
-    // FrameBuffer::begin() throws. An exception of renderTile comes out of Frame::end() on all ranks, as a FrameError.
+    // tile.sample. Returns when this rank has rendered its share. Waits for other ranks only for room, as setTile(),
+    // and with WorkDistribution::Dynamic for jobs. Throws what FrameBuffer::begin() throws. An exception of renderTile
+    // comes out of Frame::end() on all ranks, as a FrameError.
     template <class RenderTile>
     [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
                                                     const typename FrameBuffer::TileFrameData& tileData = {},
@@ -281,9 +282,9 @@ class DataParallelLoop {
 public:
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
-    // With the bricks of all ranks, which must outlive it, and of which `world` must have those of this rank. Where
-    // they have an order for a camera, AlphaBlend is told, sends no depth, and sorts nothing: see FrameConfig::order.
-    // On several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
+    // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an
+    // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sends no depth, and
+    // sorts nothing. On several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }
@@ -292,8 +293,9 @@ public:
     // call end(). renderBrick(brick, tile) writes colour and depth of the pixels of tile.region into the cleared tile,
     // as far as their rays are within brick.bounds; depth grows away from the camera. Several threads call it at once,
     // for each pass with its own tile.pass. Unlike in Listing 3, each rank declares its inputs, so that owners need not
-    // know the bricks. Waits for this rank's share. Throws what FrameBuffer::begin() throws. An exception of
-    // renderBrick comes out of Frame::end() on all ranks, as a FrameError.
+    // know the bricks. Returns when this rank has rendered its share. Waits for other ranks only for room, as
+    // setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick comes out of Frame::end() on all
+    // ranks, as a FrameError.
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
                                                     FrameConfig params = {},

@@ -6,9 +6,10 @@
 //   int operator()(const SharedBrick& brick, int tile, int pass);      returns the rank, one of brick.ranks
 // and, if it decides about all pairs of brick and tile together,
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
-//                                  called once a frame, before the other: with all pairs, and the number of passes of
+//                                  called once a frame, before operator(): with all pairs, and the number of passes of
 //                                  each. FrameReport::figures then has the cost of each pair, for the next plan.
-// All ranks must get the same answers. If it picks a rank that does not hold the brick, the frame fails.
+// MixedParallelLoop calls both on the thread that is in start(). OrderedLoop calls operator() from several workers at
+// once as well. All ranks must get the same answers. If it picks a rank that does not hold the brick, the frame fails.
 #pragma once
 
 #include <dfb/base/detect.hpp>

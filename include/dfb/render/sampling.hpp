@@ -27,7 +27,8 @@ inline SamplePlan samplesIn(const TileLayout& layout, const Region& region, int 
 }
 
 struct SamplingConfig {
-    // A tile is done when its TileReport::error, a standard error in units of colour, is at most this. 0: never.
+    // A tile is done when its TileReport::error, a standard error in units of colour, is at most this. 0: when it
+    // has maxSamples.
     double maxError = 0;
     int firstSamples = 8;  // of each tile, before its error is believed; at least 2
     int maxSamples = 1024; // of each tile, in all
@@ -64,13 +65,13 @@ public:
         decide();
     }
 
-    // Whether no tile needs more.
+    // True if no tile needs another sample.
     bool done() const
     {
         return std::all_of(plan_.begin(), plan_.end(), [](const TileSamples& t) { return t.count == 0; });
     }
 
-    // The parameters of the next frame; the others are those of `params`.
+    // Returns `params` with the samples and the accumulationId of the next frame.
     FrameConfig next(FrameConfig params = {}) const
     {
         params.samples = std::make_shared<const std::vector<TileSamples>>(plan_);
@@ -78,7 +79,7 @@ public:
         return params;
     }
 
-    // Takes note of the frame that was begun with next().
+    // Plans the next frame by the report of the last one, which was begun with next(). Call it after each frame.
     void update(const FrameReport& report)
     {
         for (std::size_t t = 0; t < plan_.size(); ++t)
@@ -92,7 +93,8 @@ public:
         decide();
     }
 
-    // Samples of pixels: taken in all, and those fewer than if each tile had as many as the one that has most.
+    // samplesTaken(): the samples of all pixels so far. samplesSaved(): how many more there would be if each tile had
+    // as many as the tile with the most.
     std::int64_t samplesTaken() const
     {
         std::int64_t sum = 0;

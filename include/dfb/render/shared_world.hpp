@@ -29,8 +29,8 @@ struct SharedBrick : Brick {
 class SharedWorld {
 public:
     // Gathers the bricks of all ranks. Bricks with the same id are one. Collective, outside frames. Waits for all
-    // ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if a rank sends no
-    // World.
+    // ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the bricks of a
+    // rank cannot be read. Throws TransportError.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {

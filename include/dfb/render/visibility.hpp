@@ -9,6 +9,7 @@
 //   std::optional<Vec3> commonEye() const;
 // the point where all its rays begin, if there is one: then AlphaBlend need not sort (FrameConfig::order). Parallel
 // rays come from infinitely far away: its coordinates are +-infinity, or NaN along an axis along which no ray goes.
+// Loops call both on the thread that is in start(); if they throw, the frame fails on all ranks.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -350,7 +351,8 @@ const auto& brickOf(const AnyWorld& world, const BrickInTile& pair)
 
 } // namespace detail
 
-// All pairs, tile by tile, so that the inputs of a tile are rendered one after the other. Of a World or a SharedWorld.
+// Returns the pairs of a brick and a tile that it may project to, by tile, then by brick. `world`: a World or a
+// SharedWorld. Any thread. Waits for nothing. Throws what camera.project() throws.
 // The result has the memory of `memory`.
 template <class AnyWorld, class Camera>
 std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout,

@@ -49,7 +49,7 @@ inline bool isBox(const Box3& b) noexcept
 // renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion,
 // which secondary rays see beyond the bounds as well.
 struct Brick {
-    std::uint32_t id = 0; // the same number means the same data, on any rank; bounds do not matter for that
+    std::uint32_t id = 0; // the same number: the same brick on any rank, with equal bounds in a SharedWorld
     Box3 bounds;
 };
 
