@@ -386,8 +386,15 @@ private:
         auto place = gather_.reserve(tile);
         table_.backgroundPixels(tile).newFrame(region.width(), region.height(), 0);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
-        for (int y = 0; y < region.height(); ++y)
-            out.setRow(y, floatsOf(floatTile.colorRow(y)), floatTile.depthRow(y), floatTile.auxRow(y));
+        for (int y = 0; y < region.height(); ++y) {
+            const auto row = [&](std::size_t c) {
+                const std::size_t before = 4 * channelWords[c] * width * static_cast<std::size_t>(y);
+                return planes.at[c] ? planes.at[c] + before : nullptr;
+            };
+            out.setRow(y, floatsOf(row(Color)), floatsOf(row(Depth)),
+                       {floatsOf(row(Normal)), floatsOf(row(Albedo)), floatsOf(row(Position)), idsOf(row(PrimitiveId)),
+                        idsOf(row(InstanceId))});
+        }
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
 
