@@ -515,7 +515,7 @@ private:
     void fail(const ErrorInfo& error)
     {
         failed_ = true;
-        if (error.rank == rank_) // else it was another rank that told all
+        if (error.rank < 0 || error.rank == rank_) // else another rank has told all
             tellFailure(error.message);
         finishNotices();
         if (handler_)
