@@ -4,7 +4,7 @@
 // a frame comes out of Frame::end() as FrameError, the same on every rank.
 #pragma once
 
-#include <dfb/version.hpp>
+#include <dfb/compiled.hpp>
 
 #include <cstdarg>
 #include <cstdint>
@@ -94,39 +94,43 @@ struct ErrorInfo {
     std::string message; // the detail in words, may be empty
 
     // One line that names everything that applies.
-    std::string describe() const
-    {
-        std::string text = detail::printed("dfb: %s", toString(kind));
-        auto add = [&text, separator = ": "](const char* name, std::int64_t value) mutable {
-            if (value < 0)
-                return;
-            text += detail::printed("%s%s %lld", separator, name, static_cast<long long>(value));
-            separator = ", ";
-        };
-        const bool isLate = kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput
-                            || (kind == ErrorKind::Transport && from >= 0);
-        const bool isHere = kind == ErrorKind::UserCode || kind == ErrorKind::Cancelled
-                            || kind == ErrorKind::InvalidArgument || (kind == ErrorKind::Transport && !isLate);
-        add(isHere ? "rank" : "noticed by rank", rank);
-        const bool isInput = kind == ErrorKind::TooManyInputs || kind == ErrorKind::DuplicateInput
-                             || kind == ErrorKind::UnannouncedInput || kind == ErrorKind::NegativeChildren;
-        add(isInput           ? "from rank"
-            : !isLate         ? "in a message from rank"
-            : generation >= 0 ? "announced by rank"
-                              : "waiting for rank",
-            from);
-        add("frame", frame);
-        add("tile", tile);
-        add("pass", pass);
-        add("generation", generation);
-        add("source", source);
-        add("expected", expected);
-        add("got", got);
-        if (!message.empty())
-            text += ": " + message;
-        return text;
-    }
+    std::string describe() const;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE std::string ErrorInfo::describe() const
+{
+    std::string text = detail::printed("dfb: %s", toString(kind));
+    auto add = [&text, separator = ": "](const char* name, std::int64_t value) mutable {
+        if (value < 0)
+            return;
+        text += detail::printed("%s%s %lld", separator, name, static_cast<long long>(value));
+        separator = ", ";
+    };
+    const bool isLate =
+        kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput || (kind == ErrorKind::Transport && from >= 0);
+    const bool isHere = kind == ErrorKind::UserCode || kind == ErrorKind::Cancelled
+                        || kind == ErrorKind::InvalidArgument || (kind == ErrorKind::Transport && !isLate);
+    add(isHere ? "rank" : "noticed by rank", rank);
+    const bool isInput = kind == ErrorKind::TooManyInputs || kind == ErrorKind::DuplicateInput
+                         || kind == ErrorKind::UnannouncedInput || kind == ErrorKind::NegativeChildren;
+    add(isInput           ? "from rank"
+        : !isLate         ? "in a message from rank"
+        : generation >= 0 ? "announced by rank"
+                          : "waiting for rank",
+        from);
+    add("frame", frame);
+    add("tile", tile);
+    add("pass", pass);
+    add("generation", generation);
+    add("source", source);
+    add("expected", expected);
+    add("got", got);
+    if (!message.empty())
+        text += ": " + message;
+    return text;
+}
+#endif
 
 namespace detail {
 

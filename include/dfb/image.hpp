@@ -5,6 +5,7 @@
 #include <dfb/base/cpu.hpp>
 #include <dfb/buffer.hpp>
 #include <dfb/channels.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/error.hpp>
 #include <dfb/levels.hpp>
 
@@ -261,7 +262,10 @@ private:
 // Writes the colours of an image to a file that any image viewer opens: a PPM file, 8 bits a channel, without alpha.
 // RGBA32F becomes sRGB; 8-bit images are written as they are. Throws InvalidArgument if the image is empty or the file
 // cannot be written.
-inline void writePpm(const std::string& path, const Image& image)
+DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
 {
     if (image.empty())
         detail::failArgument("no image to write to %s: only the display rank has one", path.c_str());
@@ -284,6 +288,7 @@ inline void writePpm(const std::string& path, const Image& image)
     if (!good)
         detail::failArgument("cannot write %s", path.c_str());
 }
+#endif
 
 // Dither: conversion to 8 bit that leaves no bands in gradients. Each pixel's place in the image says from which part
 // of the way between two levels on it takes the upper one, so that the mean over neighbours lies between the levels,

@@ -9,6 +9,7 @@
 #pragma once
 
 #include <dfb/comm/mpi_transport.hpp>
+#include <dfb/compiled.hpp>
 
 #include <chrono>
 #include <cstddef>
@@ -25,23 +26,7 @@ public:
     // Initialises MPI at this thread level or a higher one; without `level` at the highest that it has. With
     // MPI_THREAD_MULTIPLE messages move by themselves (see Progress). Throws TransportError if MPI has been initialised
     // or finalised before, or does not have the level.
-    MpiSession(int& argc, char**& argv, std::optional<int> level = std::nullopt)
-    {
-        if (detail::mpiSays(MPI_Finalized))
-            throw TransportError("MPI has been finalised: it cannot be initialised again");
-        if (detail::mpiSays(MPI_Initialized))
-            throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
-        detail::checkMpi(MPI_Init_thread(&argc, &argv, level.value_or(MPI_THREAD_MULTIPLE), &level_), "MPI_Init_thread",
-                         -1);
-        check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
-        if (level && level_ < *level) {
-            finalize();
-            throw TransportError(detail::printed("this MPI library has the thread level %s at most, %s was asked for",
-                                                 detail::mpiLevelName(level_), detail::mpiLevelName(*level)),
-                                 rank_);
-        }
-    }
+    MpiSession(int& argc, char**& argv, std::optional<int> level = std::nullopt);
 
     MpiSession(const MpiSession&) = delete;
     MpiSession& operator=(const MpiSession&) = delete;
@@ -49,15 +34,7 @@ public:
     // Waits for all ranks, then finalises MPI, unless that has been done. Collective. If an exception destroys this
     // object, it waits for nobody, as other ranks may wait for messages that never come. The program can still report
     // the exception; when the process exits, it aborts the job with code 1.
-    ~MpiSession()
-    {
-        if (detail::mpiSays(MPI_Finalized))
-            return;
-        if (!isGivenUp_ && std::uncaught_exceptions() == exceptions_)
-            finalize();
-        else if (std::atexit(abortJob) != 0)
-            abortJob();
-    }
+    ~MpiSession();
 
     // Call it to go on after a TransportError. Other ranks may have gone, and MPI_Finalize would wait for them for
     // ever. The destructor then waits for nobody, and when the process exits, it aborts the job with code 1.
@@ -69,69 +46,102 @@ public:
     MPI_Comm communicator() const noexcept { return MPI_COMM_WORLD; }
 
 private:
-    // Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
-    // second at most. Then waits for the launcher: it may drop output that a rank has written just before MPI_Abort.
-    static void abortJob()
-    {
-        if (detail::mpiSays(MPI_Finalized))
-            return;
-        int done = 0;
-        MPI_Request request = MPI_REQUEST_NULL;
-        MPI_Ibarrier(MPI_COMM_WORLD, &request);
-        detail::Patience patience;
-        for (const auto limit = std::chrono::steady_clock::now() + std::chrono::milliseconds(500);
-             MPI_Test(&request, &done, MPI_STATUS_IGNORE) == MPI_SUCCESS && !done
-             && std::chrono::steady_clock::now() < limit;)
-            patience.nap();
-        std::this_thread::sleep_for(std::chrono::milliseconds(50));
-        MPI_Abort(MPI_COMM_WORLD, 1);
-    }
-
-    void finalize()
-    {
-        try {
-            partFromAll();
-        } catch (const std::exception&) { // it is only a precaution
-        }
-        MPI_Finalize();
-    }
-
-    // MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
-    // the rest in its connections, but a rank that has got further answers no more. With no connection in use, and
-    // nothing new on them for a while, it does not.
-    void partFromAll()
-    {
-        if (size_ == 1)
-            return;
-        MPI_Comm comm = MPI_COMM_NULL;
-        MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
-        detail::waitMpi(request, rank_);
-        check(MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
-
-        std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
-        std::vector<MPI_Request> requests;
-        for (int other = 0; other < size_; ++other)
-            if (other != rank_) {
-                requests.push_back(MPI_REQUEST_NULL);
-                check(MPI_Irecv(&bytes[static_cast<std::size_t>(other)], 1, MPI_CHAR, other, 0, comm, &requests.back()),
-                      "MPI_Irecv");
-                requests.push_back(MPI_REQUEST_NULL);
-                check(MPI_Isend(&bytes.back(), 1, MPI_CHAR, other, 0, comm, &requests.back()), "MPI_Isend");
-            }
-        for (MPI_Request& each : requests)
-            detail::waitMpi(each, rank_);
-        check(MPI_Ibarrier(comm, &request), "MPI_Ibarrier");
-        detail::waitMpi(request, rank_);
-        MPI_Comm_free(&comm);
-        std::this_thread::sleep_for(std::chrono::milliseconds(20));
-    }
-
+    static void abortJob();
+    void finalize();
+    void partFromAll();
     void check(int code, const char* call) const { detail::checkMpi(code, call, rank_); }
 
     int level_ = MPI_THREAD_SINGLE, rank_ = 0, size_ = 1;
     int exceptions_ = std::uncaught_exceptions();
     bool isGivenUp_ = false;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE MpiSession::MpiSession(int& argc, char**& argv, std::optional<int> level)
+{
+    if (detail::mpiSays(MPI_Finalized))
+        throw TransportError("MPI has been finalised: it cannot be initialised again");
+    if (detail::mpiSays(MPI_Initialized))
+        throw TransportError("MPI is already initialised: an MpiSession does it itself, and there can be one only");
+    detail::checkMpi(MPI_Init_thread(&argc, &argv, level.value_or(MPI_THREAD_MULTIPLE), &level_), "MPI_Init_thread",
+                     -1);
+    check(MPI_Comm_rank(MPI_COMM_WORLD, &rank_), "MPI_Comm_rank");
+    check(MPI_Comm_size(MPI_COMM_WORLD, &size_), "MPI_Comm_size");
+    if (level && level_ < *level) {
+        finalize();
+        throw TransportError(detail::printed("this MPI library has the thread level %s at most, %s was asked for",
+                                             detail::mpiLevelName(level_), detail::mpiLevelName(*level)),
+                             rank_);
+    }
+}
+
+DFB_COMPILED_ONCE MpiSession::~MpiSession()
+{
+    if (detail::mpiSays(MPI_Finalized))
+        return;
+    if (!isGivenUp_ && std::uncaught_exceptions() == exceptions_)
+        finalize();
+    else if (std::atexit(abortJob) != 0)
+        abortJob();
+}
+
+// Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
+// second at most. Then waits for the launcher: it may drop output that a rank has written just before MPI_Abort.
+DFB_COMPILED_ONCE void MpiSession::abortJob()
+{
+    if (detail::mpiSays(MPI_Finalized))
+        return;
+    int done = 0;
+    MPI_Request request = MPI_REQUEST_NULL;
+    MPI_Ibarrier(MPI_COMM_WORLD, &request);
+    detail::Patience patience;
+    for (const auto limit = std::chrono::steady_clock::now() + std::chrono::milliseconds(500);
+         MPI_Test(&request, &done, MPI_STATUS_IGNORE) == MPI_SUCCESS && !done
+         && std::chrono::steady_clock::now() < limit;)
+        patience.nap();
+    std::this_thread::sleep_for(std::chrono::milliseconds(50));
+    MPI_Abort(MPI_COMM_WORLD, 1);
+}
+
+DFB_COMPILED_ONCE void MpiSession::finalize()
+{
+    try {
+        partFromAll();
+    } catch (const std::exception&) { // it is only a precaution
+    }
+    MPI_Finalize();
+}
+
+// MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
+// the rest in its connections, but a rank that has got further answers no more. With no connection in use, and
+// nothing new on them for a while, it does not.
+DFB_COMPILED_ONCE void MpiSession::partFromAll()
+{
+    if (size_ == 1)
+        return;
+    MPI_Comm comm = MPI_COMM_NULL;
+    MPI_Request request = MPI_REQUEST_NULL;
+    check(MPI_Comm_idup(MPI_COMM_WORLD, &comm, &request), "MPI_Comm_idup");
+    detail::waitMpi(request, rank_);
+    check(MPI_Comm_set_errhandler(comm, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
+
+    std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
+    std::vector<MPI_Request> requests;
+    for (int other = 0; other < size_; ++other)
+        if (other != rank_) {
+            requests.push_back(MPI_REQUEST_NULL);
+            check(MPI_Irecv(&bytes[static_cast<std::size_t>(other)], 1, MPI_CHAR, other, 0, comm, &requests.back()),
+                  "MPI_Irecv");
+            requests.push_back(MPI_REQUEST_NULL);
+            check(MPI_Isend(&bytes.back(), 1, MPI_CHAR, other, 0, comm, &requests.back()), "MPI_Isend");
+        }
+    for (MPI_Request& each : requests)
+        detail::waitMpi(each, rank_);
+    check(MPI_Ibarrier(comm, &request), "MPI_Ibarrier");
+    detail::waitMpi(request, rank_);
+    MPI_Comm_free(&comm);
+    std::this_thread::sleep_for(std::chrono::milliseconds(20));
+}
+#endif
 
 DFB_NAMESPACE_END

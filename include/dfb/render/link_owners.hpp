@@ -2,6 +2,8 @@
 // carry than the others.
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
@@ -48,28 +50,7 @@ public:
 
     // Returns the owners of tiles that have pixels. `hasDepth`: inputs have. `elsewhere(tile)` gives the owners of the
     // other tiles.
-    template <class Elsewhere>
-    TileOwners find(const FrameBufferConfig& config, bool hasDepth, const Elsewhere& elsewhere)
-    {
-        sortByTile();
-        const ImageConfig& image = config.image;
-        inputBytes_ = 4.0 * static_cast<double>(bytesOf(config.precision.color)) + 4 * (hasDepth || image.depth);
-        imageBytes_ = static_cast<double>(bytesPerPixel(image.format)) + 4 * image.depth;
-        displayNode_ = nodeOf(image.displayRank);
-        std::fill(links_.begin(), links_.end(), Link());
-        std::fill(work_.begin(), work_.end(), 0.0);
-        nodes_.assign(static_cast<std::size_t>(layout_.tileCount()), -1);
-        for (int sweep = 0; sweep < 2; ++sweep) // the second time, each tile is placed knowing all others
-            for (int tile = 0; tile < layout_.tileCount(); ++tile)
-                if (isAnywhere(tile))
-                    place(tile);
-        owners_.clear();
-        for (int tile = 0; tile < layout_.tileCount(); ++tile)
-            owners_.push_back(isAnywhere(tile) ? leastBusy(tile) : elsewhere(tile));
-        if (!last_ || *last_ != owners_)
-            last_ = keep();
-        return last_;
-    }
+    TileOwners find(const FrameBufferConfig& config, bool hasDepth, FunctionRef<int(int)> elsewhere);
 
 private:
     struct Part {
@@ -82,18 +63,7 @@ private:
         double in = 0, out = 0;
     };
 
-    // Frames that are open have lists of theirs.
-    TileOwners keep()
-    {
-        for (const auto& list : lists_)
-            if (list.use_count() == 1) {
-                *list = owners_;
-                return list;
-            }
-        lists_.push_back(std::make_shared<std::vector<int>>(owners_));
-        return lists_.back();
-    }
-
+    TileOwners keep();
     static double areaOf(const Region& r) { return static_cast<double>(r.width()) * static_cast<double>(r.height()); }
     int nodeOf(int rank) const { return nodeOf_[static_cast<std::size_t>(rank)]; }
     Link& linkOf(int node) { return links_[static_cast<std::size_t>(node)]; }
@@ -102,41 +72,9 @@ private:
     const Part* end(int tile) const { return begin(tile + 1); }
     bool isAnywhere(int tile) const { return begin(tile) != end(tile); }
 
-    void sortByTile()
-    {
-        for (std::size_t tile = 1; tile < first_.size(); ++tile)
-            first_[tile] += first_[tile - 1];
-        parts_.resize(found_.size());
-        next_ = first_;
-        for (const Part& part : found_)
-            parts_[next_[static_cast<std::size_t>(part.tile)]++] = part;
-    }
+    void sortByTile();
 
-    // Takes a tile to the node with which the sum of the squares of all links' loads is least: one that has pixels of
-    // it, or that of the display rank.
-    void place(int tile)
-    {
-        double pixels = 0;
-        from_.clear();
-        addFrom(displayNode_, 0);
-        for (const Part* part = begin(tile); part != end(tile); ++part) {
-            pixels += part->pixels;
-            for (std::size_t i = 0; i < part->rankCount; ++i)
-                addFrom(nodeOf(part->ranks[i]), inputBytes_ * part->pixels / static_cast<double>(part->rankCount));
-        }
-        const double finished = imageBytes_ * std::min(pixels, areaOf(layout_.region(tile)));
-        int& node = nodes_[static_cast<std::size_t>(tile)];
-        if (node >= 0)
-            carry(node, finished, -1);
-        node = -1;
-        double least = 0;
-        for (const auto& from : from_)
-            if (const double cost = costOf(from.first, finished); node < 0 || cost < least) {
-                node = from.first;
-                least = cost;
-            }
-        carry(node, finished, 1);
-    }
+    void place(int tile);
 
     void addFrom(int node, double bytes)
     {
@@ -177,17 +115,7 @@ private:
         return cost;
     }
 
-    // Of the ranks of the tile's node, the one with the fewest pixels to blend.
-    int leastBusy(int tile)
-    {
-        const auto& ranks = ranksOf_[static_cast<std::size_t>(nodes_[static_cast<std::size_t>(tile)])];
-        const auto workOf = [this](int rank) -> double& { return work_[static_cast<std::size_t>(rank)]; };
-        const int best =
-            *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return workOf(a) < workOf(b); });
-        for (const Part* part = begin(tile); part != end(tile); ++part)
-            workOf(best) += part->pixels;
-        return best;
-    }
+    int leastBusy(int tile);
 
     std::vector<int> nodeOf_;
     std::vector<std::vector<int>> ranksOf_; // of each node
@@ -203,6 +131,90 @@ private:
     TileOwners last_;
     std::vector<std::shared_ptr<std::vector<int>>> lists_;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, bool hasDepth,
+                                              FunctionRef<int(int)> elsewhere)
+{
+    sortByTile();
+    const ImageConfig& image = config.image;
+    inputBytes_ = 4.0 * static_cast<double>(bytesOf(config.precision.color)) + 4 * (hasDepth || image.depth);
+    imageBytes_ = static_cast<double>(bytesPerPixel(image.format)) + 4 * image.depth;
+    displayNode_ = nodeOf(image.displayRank);
+    std::fill(links_.begin(), links_.end(), Link());
+    std::fill(work_.begin(), work_.end(), 0.0);
+    nodes_.assign(static_cast<std::size_t>(layout_.tileCount()), -1);
+    for (int sweep = 0; sweep < 2; ++sweep) // the second time, each tile is placed knowing all others
+        for (int tile = 0; tile < layout_.tileCount(); ++tile)
+            if (isAnywhere(tile))
+                place(tile);
+    owners_.clear();
+    for (int tile = 0; tile < layout_.tileCount(); ++tile)
+        owners_.push_back(isAnywhere(tile) ? leastBusy(tile) : elsewhere(tile));
+    if (!last_ || *last_ != owners_)
+        last_ = keep();
+    return last_;
+}
+
+// Frames that are open have lists of theirs.
+DFB_COMPILED_ONCE TileOwners LinkOwners::keep()
+{
+    for (const auto& list : lists_)
+        if (list.use_count() == 1) {
+            *list = owners_;
+            return list;
+        }
+    lists_.push_back(std::make_shared<std::vector<int>>(owners_));
+    return lists_.back();
+}
+
+DFB_COMPILED_ONCE void LinkOwners::sortByTile()
+{
+    for (std::size_t tile = 1; tile < first_.size(); ++tile)
+        first_[tile] += first_[tile - 1];
+    parts_.resize(found_.size());
+    next_ = first_;
+    for (const Part& part : found_)
+        parts_[next_[static_cast<std::size_t>(part.tile)]++] = part;
+}
+
+// Takes a tile to the node with which the sum of the squares of all links' loads is least: one that has pixels of
+// it, or that of the display rank.
+DFB_COMPILED_ONCE void LinkOwners::place(int tile)
+{
+    double pixels = 0;
+    from_.clear();
+    addFrom(displayNode_, 0);
+    for (const Part* part = begin(tile); part != end(tile); ++part) {
+        pixels += part->pixels;
+        for (std::size_t i = 0; i < part->rankCount; ++i)
+            addFrom(nodeOf(part->ranks[i]), inputBytes_ * part->pixels / static_cast<double>(part->rankCount));
+    }
+    const double finished = imageBytes_ * std::min(pixels, areaOf(layout_.region(tile)));
+    int& node = nodes_[static_cast<std::size_t>(tile)];
+    if (node >= 0)
+        carry(node, finished, -1);
+    node = -1;
+    double least = 0;
+    for (const auto& from : from_)
+        if (const double cost = costOf(from.first, finished); node < 0 || cost < least) {
+            node = from.first;
+            least = cost;
+        }
+    carry(node, finished, 1);
+}
+
+// Of the ranks of the tile's node, the one with the fewest pixels to blend.
+DFB_COMPILED_ONCE int LinkOwners::leastBusy(int tile)
+{
+    const auto& ranks = ranksOf_[static_cast<std::size_t>(nodes_[static_cast<std::size_t>(tile)])];
+    const auto workOf = [this](int rank) -> double& { return work_[static_cast<std::size_t>(rank)]; };
+    const int best = *std::min_element(ranks.begin(), ranks.end(), [&](int a, int b) { return workOf(a) < workOf(b); });
+    for (const Part* part = begin(tile); part != end(tile); ++part)
+        workOf(best) += part->pixels;
+    return best;
+}
+#endif
 
 } // namespace detail
 DFB_NAMESPACE_END

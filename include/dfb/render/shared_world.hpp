@@ -3,6 +3,7 @@
 #pragma once
 
 #include <dfb/base/detect.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/render/cameras.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/tile.hpp>
@@ -85,34 +86,7 @@ DFB_DETECTS(has_common_eye_v, std::declval<const T&>().commonEye());
 class FrontToBack {
 public:
     // Returns null, or why there is no order.
-    const char* find(const SharedWorld& world, const Vec3& eye)
-    {
-        const auto& bricks = world.bricks();
-        const auto compare = [&](std::size_t a, std::size_t b) {
-            return before(bricks[a].bounds, bricks[b].bounds, eye);
-        };
-        order_.clear();
-        inFront_.assign(bricks.size(), 0);
-        for (std::size_t a = 0; a < bricks.size(); ++a)
-            for (std::size_t b = a + 1; b < bricks.size(); ++b) {
-                const Before which = compare(a, b);
-                if (which == Before::Overlaps)
-                    return "two bricks overlap: there is no order in which they could be blended";
-                if (which != Before::Either)
-                    ++inFront_[which == Before::First ? b : a];
-            }
-        for (std::size_t i = 0; i < bricks.size(); ++i)
-            if (inFront_[i] == 0)
-                order_.push_back(static_cast<int>(i));
-        for (std::size_t i = 0; i < order_.size(); ++i)
-            for (std::size_t b = 0; b < bricks.size(); ++b)
-                if (inFront_[b] > 0 && compare(static_cast<std::size_t>(order_[i]), b) == Before::First
-                    && --inFront_[b] == 0)
-                    order_.push_back(static_cast<int>(b));
-        return order_.size() == bricks.size()
-                   ? nullptr
-                   : "the bricks are in front of each other in a circle: no order is right for all pixels";
-    }
+    const char* find(const SharedWorld& world, const Vec3& eye);
 
     // By their place in SharedWorld::bricks().
     const std::vector<int>& order() const noexcept { return order_; }
@@ -120,32 +94,63 @@ public:
 private:
     enum class Before { Either, First, Second, Overlaps };
 
-    // A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
-    // Either is right if no ray crosses it: the eye's coordinate is then NaN, and no comparison holds.
-    static Before before(const Box3& a, const Box3& b, const Vec3& eye)
-    {
-        bool apart = false, first = false, second = false;
-        const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
-            if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
-                apart = true;
-                first = first || !(e > bLower);
-                second = second || !(e < aUpper);
-            } else if (bUpper <= aLower) {
-                apart = true;
-                first = first || !(e < bUpper);
-                second = second || !(e > aLower);
-            }
-        };
-        alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
-        alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
-        alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
-        if (!apart)
-            return Before::Overlaps;
-        return first == second ? Before::Either : first ? Before::First : Before::Second;
-    }
+    static Before before(const Box3& a, const Box3& b, const Vec3& eye);
 
     std::vector<int> order_, inFront_;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE const char* FrontToBack::find(const SharedWorld& world, const Vec3& eye)
+{
+    const auto& bricks = world.bricks();
+    const auto compare = [&](std::size_t a, std::size_t b) { return before(bricks[a].bounds, bricks[b].bounds, eye); };
+    order_.clear();
+    inFront_.assign(bricks.size(), 0);
+    for (std::size_t a = 0; a < bricks.size(); ++a)
+        for (std::size_t b = a + 1; b < bricks.size(); ++b) {
+            const Before which = compare(a, b);
+            if (which == Before::Overlaps)
+                return "two bricks overlap: there is no order in which they could be blended";
+            if (which != Before::Either)
+                ++inFront_[which == Before::First ? b : a];
+        }
+    for (std::size_t i = 0; i < bricks.size(); ++i)
+        if (inFront_[i] == 0)
+            order_.push_back(static_cast<int>(i));
+    for (std::size_t i = 0; i < order_.size(); ++i)
+        for (std::size_t b = 0; b < bricks.size(); ++b)
+            if (inFront_[b] > 0 && compare(static_cast<std::size_t>(order_[i]), b) == Before::First
+                && --inFront_[b] == 0)
+                order_.push_back(static_cast<int>(b));
+    return order_.size() == bricks.size()
+               ? nullptr
+               : "the bricks are in front of each other in a circle: no order is right for all pixels";
+}
+
+// A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
+// Either is right if no ray crosses it: the eye's coordinate is then NaN, and no comparison holds.
+DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(const Box3& a, const Box3& b, const Vec3& eye)
+{
+    bool apart = false, first = false, second = false;
+    const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
+        if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
+            apart = true;
+            first = first || !(e > bLower);
+            second = second || !(e < aUpper);
+        } else if (bUpper <= aLower) {
+            apart = true;
+            first = first || !(e < bUpper);
+            second = second || !(e > aLower);
+        }
+    };
+    alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
+    alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
+    alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
+    if (!apart)
+        return Before::Overlaps;
+    return first == second ? Before::Either : first ? Before::First : Before::Second;
+}
+#endif
 
 // Gives FrameConfig::order to the frames of a loop.
 class BrickOrder {
