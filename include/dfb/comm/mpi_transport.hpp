@@ -71,7 +71,7 @@ inline void checkMpi(int code, const char* call, int rank, int peer = -1)
                          rank);
 }
 
-// What MPI_Initialized, MPI_Finalized or MPI_Is_thread_main says.
+// Asks MPI_Initialized, MPI_Finalized or MPI_Is_thread_main.
 inline bool mpiSays(int (*ask)(int*))
 {
     int answer = 0;

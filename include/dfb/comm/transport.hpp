@@ -271,7 +271,7 @@ private:
         std::byte* blockAt(int, std::int32_t, std::size_t) const { return nullptr; }
         int sharingRanks() const { return 1; }
     };
-    // What has the optional members.
+    // The transport, if it has these optional members; else a stand-in for them.
     template <bool Has>
     decltype(auto) with() const
     {
