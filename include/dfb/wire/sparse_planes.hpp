@@ -10,7 +10,9 @@
 // from a multiple of 4 on. A body that is split has its planes as splitPlane() leaves them.
 #pragma once
 
+#include <dfb/base/cpu.hpp>
 #include <dfb/comm/message.hpp>
+#include <dfb/compiled.hpp>
 #include <dfb/fragment.hpp>
 #include <dfb/wire/active_pixels.hpp>
 
@@ -58,52 +60,63 @@ struct SparseShape {
 };
 static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
 
-// Makes a plane of pixels easier to compress. Neighbouring pixels are alike in the upper bits of each word and rarely
-// in the lower ones. Each word becomes its difference to the word of the pixel before, coded so that small differences
-// of either sign have zeros at the top. Then all first bytes are stored, then all second bytes, and so on. A codec that
-// looks for repetitions finds few in the plain bytes of floats.
+// Makes a plane of pixels, of so many words each, easier to compress. Neighbouring pixels are alike in the upper bits of
+// each word and rarely in the lower ones. Each word becomes its difference to the word of the pixel before, coded so
+// that small differences of either sign have zeros at the top. Then all first bytes are stored, then all second bytes,
+// and so on. A codec that looks for repetitions finds few in the plain bytes of floats.
 //
-// Of `pixels` pixels that have `words` words each.
-template <class Word>
-void splitPlane(const std::byte* in, std::size_t pixels, std::size_t words, std::byte* out)
+// Works on blocks of pixels, with loops that compilers vectorize.
+template <class Word, std::size_t words>
+DFB_INLINE void splitPlane(const std::byte* in, std::size_t pixels, std::byte* out)
 {
-    constexpr std::size_t size = sizeof(Word);
-    constexpr int top = 8 * static_cast<int>(size) - 1;
-    const std::size_t count = pixels * words;
-    for (std::size_t w = 0; w < words; ++w) {
-        Word before = 0;
-        std::byte* to = out + w * pixels;
-        for (std::size_t i = 0; i < pixels; ++i) {
-            Word word = 0;
-            std::memcpy(&word, in + (i * words + w) * size, size);
-            const auto difference = static_cast<Word>(word - before);
-            const auto folded = static_cast<Word>(static_cast<Word>(difference << 1)
-                                                  ^ static_cast<Word>(difference >> top ? Word(~Word{0}) : Word{0}));
-            for (std::size_t b = 0; b < size; ++b)
-                to[b * count + i] = static_cast<std::byte>(folded >> (8 * b));
-            before = word;
+    constexpr std::size_t size = sizeof(Word), block = 128;
+    Word values[words * (1 + block)] = {}; // begins with the last pixel of the block before
+    for (std::size_t first = 0; first < pixels; first += block) {
+        const std::size_t count = std::min(block, pixels - first);
+        std::copy_n(values + words * block, words, values);
+        std::memcpy(values + words, in + first * words * size, count * words * size);
+        Word folded[words * block];
+        for (std::size_t i = 0; i < words * block; ++i) {
+            const auto difference = static_cast<Word>(values[i + words] - values[i]);
+            const auto sign = static_cast<Word>(difference >> (8 * size - 1));
+            folded[i] = static_cast<Word>(static_cast<Word>(difference << 1) ^ static_cast<Word>(0 - sign));
+        }
+        for (std::size_t b = 0; b < size; ++b) {
+            std::uint8_t bytes[words][block];
+            for (std::size_t i = 0; i < block; ++i)
+                for (std::size_t w = 0; w < words; ++w)
+                    bytes[w][i] = static_cast<std::uint8_t>(folded[i * words + w] >> (8 * b));
+            for (std::size_t w = 0; w < words; ++w)
+                std::memcpy(out + (b * words + w) * pixels + first, bytes[w], count);
         }
     }
 }
 // The inverse.
-template <class Word>
-void joinPlane(const std::byte* in, std::size_t pixels, std::size_t words, std::byte* out)
+template <class Word, std::size_t words>
+DFB_INLINE void joinPlane(const std::byte* in, std::size_t pixels, std::byte* out)
 {
-    constexpr std::size_t size = sizeof(Word);
-    const std::size_t count = pixels * words;
-    for (std::size_t w = 0; w < words; ++w) {
-        Word before = 0;
-        const std::byte* from = in + w * pixels;
-        for (std::size_t i = 0; i < pixels; ++i) {
-            Word folded = 0;
+    constexpr std::size_t size = sizeof(Word), block = 128;
+    Word before[words] = {};
+    for (std::size_t first = 0; first < pixels; first += block) {
+        const std::size_t count = std::min(block, pixels - first);
+        Word differences[words][block];
+        for (std::size_t w = 0; w < words; ++w) {
+            std::uint8_t bytes[size][block] = {};
             for (std::size_t b = 0; b < size; ++b)
-                folded =
-                    static_cast<Word>(folded | static_cast<Word>(static_cast<Word>(from[b * count + i]) << (8 * b)));
-            const auto difference = static_cast<Word>(static_cast<Word>(folded >> 1)
-                                                      ^ static_cast<Word>(folded & 1 ? Word(~Word{0}) : Word{0}));
-            before = static_cast<Word>(before + difference);
-            std::memcpy(out + (i * words + w) * size, &before, size);
+                std::memcpy(bytes[b], in + (b * words + w) * pixels + first, count);
+            for (std::size_t i = 0; i < block; ++i) {
+                Word folded = 0;
+                for (std::size_t b = 0; b < size; ++b)
+                    folded = static_cast<Word>(folded | static_cast<Word>(Word{bytes[b][i]} << (8 * b)));
+                const auto sign = static_cast<Word>(0 - (folded & 1));
+                differences[w][i] = static_cast<Word>(static_cast<Word>(folded >> 1) ^ sign);
+            }
         }
+        Word values[words * block];
+        for (std::size_t i = 0; i < block; ++i)
+            for (std::size_t w = 0; w < words; ++w)
+                values[i * words + w] = before[w] = static_cast<Word>(before[w] + differences[w][i]);
+        std::memcpy(out + first * words * size, values, count * words * size);
     }
 }
 
@@ -146,26 +159,30 @@ public:
         return planes;
     }
 
-    void split(const SparseShape& shape, const std::byte* in, std::byte* out) const
-    {
-        transform(shape, in, out, [](auto word, auto... plane) { splitPlane<decltype(word)>(plane...); });
-    }
-    void join(const SparseShape& shape, const std::byte* in, std::byte* out) const
-    {
-        transform(shape, in, out, [](auto word, auto... plane) { joinPlane<decltype(word)>(plane...); });
-    }
+    // splitPlane() or joinPlane() for each plane of a body. The table stays as it is.
+    void split(const SparseShape& shape, const std::byte* in, std::byte* out) const;
+    void join(const SparseShape& shape, const std::byte* in, std::byte* out) const;
 
 private:
+    // Colour has 4 words of 1, 2 or 4 bytes; other channels have 1 or 3 words of 4 bytes.
     template <class Transform>
     void transform(const SparseShape& shape, const std::byte* in, std::byte* out, const Transform& call) const
     {
-        const std::size_t end = forEachPlane(shape.stored(), [&](std::size_t c, std::size_t at, std::size_t) {
-            if (wordBytes_[c] == 4)
-                call(std::uint32_t{}, in + at, shape.stored(), channelWords[c], out + at);
+        const std::size_t pixels = shape.stored();
+        const std::size_t end = forEachPlane(pixels, [&](std::size_t c, std::size_t at, std::size_t) {
+            constexpr std::integral_constant<std::size_t, 1> one;
+            constexpr std::integral_constant<std::size_t, 3> three;
+            constexpr std::integral_constant<std::size_t, 4> four;
+            if (channelWords[c] == one)
+                call(std::uint32_t{}, one, in + at, pixels, out + at);
+            else if (channelWords[c] == three)
+                call(std::uint32_t{}, three, in + at, pixels, out + at);
+            else if (wordBytes_[c] == 4)
+                call(std::uint32_t{}, four, in + at, pixels, out + at);
             else if (wordBytes_[c] == 2)
-                call(std::uint16_t{}, in + at, shape.stored(), channelWords[c], out + at);
+                call(std::uint16_t{}, four, in + at, pixels, out + at);
             else
-                call(std::uint8_t{}, in + at, shape.stored(), channelWords[c], out + at);
+                call(std::uint8_t{}, four, in + at, pixels, out + at);
         });
         std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
     }
@@ -173,6 +190,19 @@ private:
     std::array<std::size_t, channelCount> wordBytes_{};
     std::size_t pixelBytes_ = 0;
 };
+
+#if DFB_HAS_BODIES
+DFB_COMPILED_ONCE void PlaneFormat::split(const SparseShape& shape, const std::byte* in, std::byte* out) const
+{
+    transform(shape, in, out,
+              [](auto word, auto words, auto... plane) { fastest<splitPlane<decltype(word), words>>(plane...); });
+}
+DFB_COMPILED_ONCE void PlaneFormat::join(const SparseShape& shape, const std::byte* in, std::byte* out) const
+{
+    transform(shape, in, out,
+              [](auto word, auto words, auto... plane) { fastest<joinPlane<decltype(word), words>>(plane...); });
+}
+#endif
 
 // Returns the shape of the body of a region with these active pixels.
 inline SparseShape shapeOf(const ActiveSpans& active, const Region& region)

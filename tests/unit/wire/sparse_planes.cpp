@@ -13,6 +13,7 @@
 #include <memory>
 #include <random>
 #include <string>
+#include <type_traits>
 #include <vector>
 
 namespace sparse_planes_cases {
@@ -125,20 +126,40 @@ TEST_CASE("Outside of a view's valid region nothing is read", "[wire]")
 TEST_CASE("Planes that were split come back", "[wire]")
 {
     std::mt19937 random(9);
-    const auto check = [&](auto word) {
-        for (const std::size_t words : {1u, 3u, 4u})
-            for (const std::size_t pixels : {0u, 1u, 3u, 4u, 25u, 1024u}) {
-                std::vector<std::byte> in(pixels * words * sizeof word), split(in), out(in);
-                for (std::byte& byte : in)
-                    byte = static_cast<std::byte>(random() % (random() % 2 ? 256 : 3));
-                d::splitPlane<decltype(word)>(in.data(), pixels, words, split.data());
-                d::joinPlane<decltype(word)>(split.data(), pixels, words, out.data());
-                CHECK(out == in);
-            }
+    const auto check = [&](auto word, auto words) {
+        for (const std::size_t pixels : {0u, 1u, 3u, 4u, 25u, 127u, 128u, 129u, 1024u}) {
+            const std::size_t bytes = pixels * words * sizeof word;
+            std::vector<std::byte> in(bytes), split(bytes + 1), plain(split), out(split);
+            for (std::byte& byte : in)
+                byte = static_cast<std::byte>(random() % (random() % 2 ? 256 : 3));
+            const std::byte *from = in.data(), *middle = split.data();
+            d::fastest<d::splitPlane<decltype(word), words>>(from, pixels, split.data());
+            d::splitPlane<decltype(word), words>(from, pixels, plain.data());
+            CHECK(split == plain);
+            d::fastest<d::joinPlane<decltype(word), words>>(middle, pixels, out.data());
+            CHECK(std::equal(in.begin(), in.end(), out.begin()));
+            CHECK(out[bytes] == std::byte{0});
+            d::joinPlane<decltype(word), words>(middle, pixels, out.data());
+            CHECK(std::equal(in.begin(), in.end(), out.begin()));
+            CHECK(out[bytes] == std::byte{0});
+        }
     };
-    check(std::uint8_t{});
-    check(std::uint16_t{});
-    check(std::uint32_t{});
+    check(std::uint8_t{}, std::integral_constant<std::size_t, 4>());
+    check(std::uint16_t{}, std::integral_constant<std::size_t, 4>());
+    check(std::uint32_t{}, std::integral_constant<std::size_t, 4>());
+    check(std::uint32_t{}, std::integral_constant<std::size_t, 3>());
+    check(std::uint32_t{}, std::integral_constant<std::size_t, 1>());
+}
+
+// What other versions of the library would read: the layout must not change unnoticed.
+TEST_CASE("A plane is split into differences to the pixel before, then into bytes", "[wire]")
+{
+    const std::uint16_t in[] = {1, 2, 3, 0x400, 3, 1, 3, 0x300}; // two pixels
+    std::byte split[16];
+    d::splitPlane<std::uint16_t, 4>(reinterpret_cast<const std::byte*>(in), 2, split);
+    const int expected[] = {2, 4, 4, 1, 6, 0, 0, 0xff, /* the upper bytes */ 0, 0, 0, 0, 0, 0, 8, 1};
+    for (int i = 0; i < 16; ++i)
+        CHECK(std::to_integer<int>(split[i]) == expected[i]);
 }
 
 TEST_CASE("Active pixels come back at their places, in each format of planes, split or not", "[wire]")
