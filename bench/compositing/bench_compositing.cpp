@@ -73,7 +73,11 @@ void addAllDfb(std::vector<System>& systems, const Inputs& inputs)
     addOrdered("unorm8", {WireFormat::Unorm8});
 #if defined(DFB_HAS_SNAPPY)
     const auto snappy = std::make_shared<dfb::SnappyCodec>();
+    bench::DfbSettings packedBytes = bytes;
+    packedBytes.codec = snappy;
     addOrdered("float32, snappy", {WireFormat::Float32, snappy});
+    addOrdered("within half a level, snappy", {dfb::HalfLevel{}, snappy});
+    addOrdered("bytes, snappy", packedBytes);
     addOrdered("float32, snappy if faster", {WireFormat::Float32, snappy, 0, false, dfb::CompressionMode::Auto});
 #endif
     bench::addDfb<dfb::OrderedBlend>(systems, own, inputs, "tiles of 64, in order, float32", {});

@@ -60,8 +60,8 @@ struct SparseShape {
 };
 static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
 
-// Makes a plane of pixels, of so many words each, easier to compress. Neighbouring pixels are alike in the upper bits of
-// each word and rarely in the lower ones. Each word becomes its difference to the word of the pixel before, coded so
+// Makes a plane of pixels, of so many words each, easier to compress. Neighbouring pixels are alike in the upper bits
+// of each word and rarely in the lower ones. Each word becomes its difference to the word of the pixel before, coded so
 // that small differences of either sign have zeros at the top. Then all first bytes are stored, then all second bytes,
 // and so on. A codec that looks for repetitions finds few in the plain bytes of floats.
 //
