@@ -97,7 +97,7 @@ status=0
 
 if [ -n "$launcher" ]; then
     $launcher "$bench"/bench_compositing --scene bricks --size 1024x1024 --frames "$frames" --commit "$commit" \
-        --only "in order, float32, to|in order, float32, snappy|icet: float, direct|icet: float, sequential" \
+        --only "in order, float32, to|snappy|half a level|in order, bytes, to|direct|sequential" \
         --json "$results/network.json" --table "$results/network.md"
 else
     echo "run.sh: no --launcher: nothing was measured over a network"
