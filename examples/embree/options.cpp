@@ -76,6 +76,8 @@ public:
     {
         try {
             app_.parse(withPort(argc, argv));
+            if (options_.scene.empty())
+                throw CLI::RequiredError("scene"); // not by CLI11, which would say so before it names a wrong option
             readValues();
             refuseContradictions();
             refuseForFiles();
@@ -132,7 +134,6 @@ private:
                         ".stl, .gltf, .glb; atoms: .xyz. Behind a file's name may stand how it is shown, as in "
                         "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, scale, rotate, "
                         "translate, and as the options of that name clip, transfer, range, isovalue")
-            ->required()
             ->option_text("SCENE...");
         app_.option_defaults()->take_last(); // of an option that is given twice the last counts
     }

@@ -431,6 +431,8 @@ TEST_CASE("A scene must be named", "[options]")
         CHECK(parsed.exitCode == 2);
         CHECK(test::isLineWith(parsed.message, "dfb_render: "));
     }
+    CHECK(test::contains(parse({"--size", "5x5"}).message, "scene"));
+    CHECK(test::contains(parse({"--nope"}).message, "--nope")); // which comes before the scene
 }
 
 TEST_CASE("The help says it all", "[options]")
