@@ -79,7 +79,7 @@ const shows = (page, width, height) =>
 // The picture of what this page has asked for last, with all samples, and its statistics.
 const refined = page => until(page, () => {
   const now = liveView.stats;
-  return !liveView.isAsking && now && now.frame && now.frame.wishes >= liveView.asked && now.frame.wishes === now.wishes.number && now.frame.samples >= now.wishes.samples
+  return !liveView.isAsking && !liveView.isMoving && now && now.frame && now.frame.wishes >= liveView.asked && now.frame.wishes === now.wishes.number && now.frame.samples >= now.wishes.samples
          && liveView.frame === now.frame.number && now.times[now.times.length - 1][0] === now.frame.number;
 });
 async function drag(page, from, to, steps, options = {}) {
@@ -189,6 +189,7 @@ try {
 
   // ---- many frames while dragging, and how long they take
 
+  await page.select("#moving", "1");
   const count = await look(page, () => liveView.pictures), wanted = isStrict ? 100 : 30, begin = performance.now();
   await look(page, () => { liveView.latencies.length = 0; });
   await page.mouse.move(400, 400);
@@ -275,6 +276,16 @@ try {
   await page.mouse.up();
   await shows(page, 1024, 768);
   check(true, "half of the size while moving");
+
+  await refined(page);
+  await page.select("#moving", "auto");
+  const whole = await look(page, () => liveView.stats.frame.total_ms), side = [1024, 512, 256][whole <= 100 ? 0 : whole <= 400 ? 1 : 2];
+  await page.mouse.down();
+  await page.mouse.move(500, 400, {steps: 3});
+  await shows(page, side, side * 3 / 4);
+  await page.mouse.up();
+  await shows(page, 1024, 768);
+  check(true, `while moving, where a frame takes ${whole.toFixed(0)} ms, it has ${side} pixels across`);
 
   await page.click("#end");
   check(await job.ended === 0, "the button ends the job with 0");
