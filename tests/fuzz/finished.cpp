@@ -23,8 +23,7 @@ constexpr std::size_t mostBytes = 4096;
 enum Flags : std::uint8_t { HasCodec = 1, MakeHeader = 2, Record = 4, Splits = 8, Shared = 16 };
 
 struct BatchHeader { // as in FinalGather
-    std::uint64_t rawBytes = 0;
-    std::uint32_t codec = 0, reserved = 0;
+    std::uint64_t rawBytes = 0, codec = 0;
 };
 
 std::shared_ptr<const dfb::Codec> codec()

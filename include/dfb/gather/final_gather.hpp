@@ -459,9 +459,7 @@ private:
         bool closed = false;
     };
     struct BatchHeader {
-        std::uint64_t rawBytes = 0;
-        std::uint32_t codec = 0;
-        std::uint32_t isTried = 0; // whether one was to be used
+        std::uint64_t rawBytes = 0, codec = 0; // no codec: 0
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
@@ -593,7 +591,6 @@ private:
             const std::lock_guard<std::mutex> lock(mutex_);
             spareBatches_.push_back(std::move(batch));
         }
-        h.isTried = compresses_;
         if (compresses_) {
             Buffer packed = pool_->acquire(prefix + config_.codec->bound(h.rawBytes));
             const std::size_t bytes =
@@ -607,7 +604,7 @@ private:
         const auto m = MessageHeader::of(MessageKind::FinishedTiles, config_.receiver, frame_);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
-        send_(std::move(message), h.isTried ? prefix + h.rawBytes : 0);
+        send_(std::move(message), compresses_ ? prefix + h.rawBytes : 0);
     }
 
     std::shared_ptr<MemoryPool> pool_;
