@@ -175,7 +175,7 @@ public:
             systems.push_back(std::move(s));
         };
         for (const int samples : {1, 4, 16, 64})
-            add(std::to_string(samples) + " samples", samples, 0);
+            add(std::to_string(samples) + (samples == 1 ? " sample" : " samples"), samples, 0);
         for (const double threshold : {0.05, 0.02, 0.01}) {
             std::ostringstream name;
             name << "adaptive, " << threshold;
