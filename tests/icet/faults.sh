@@ -58,14 +58,14 @@ count=0
 while IFS='|' read -r name file old new; do
     case $name in '' | '#'*) continue ;; esac
     count=$((count + 1))
-    if ! put "$file" "$old" "$new" >/dev/null; then
-        echo "$name: NOT PUT IN: $file has not one line with: $old"
+    target=/dev/null
+    [ "$isCheck" ] || target=$adapter/$file
+    if ! put "$file" "$old" "$new" >"$target"; then
+        result="NOT PUT IN: $file has not one line with: $old"
         verdict=1
+    elif [ "$isCheck" ]; then
         continue
-    fi
-    [ ! "$isCheck" ] || continue
-    put "$file" "$old" "$new" >"$adapter/$file"
-    if ! build; then
+    elif ! build; then
         result="DOES NOT COMPILE: see $copy/build.log"
         verdict=1
     elif differential; then
@@ -75,7 +75,7 @@ while IFS='|' read -r name file old new; do
         result="found: $(grep -m 1 'case' "$copy/test.log" || tail -n 1 "$copy/test.log")"
     fi
     echo "$name: $result"
-    cp "$source/examples/adapters/icet/$file" "$adapter/$file"
+    [ "$isCheck" ] || cp "$source/examples/adapters/icet/$file" "$target"
 done <<'END'
 order of the ranks ignored|composite.cpp|if (s.isEnabled(ICET_ORDERED_COMPOSITE))|if (false)
 8-bit background not rounded down|composite.cpp|value = std::floor(255 * std::clamp(value, 0.0f, 1.0f)) / 255;|value = std::clamp(value, 0.0f, 1.0f);

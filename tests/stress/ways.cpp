@@ -16,9 +16,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
-#include <cstdlib>
 #include <cstring>
-#include <functional>
 #include <memory>
 #include <string>
 #include <vector>
@@ -75,22 +73,8 @@ struct Way {
     dfb::Precision precision{};
 };
 
-struct Picture {
-    std::vector<std::byte> color;
-    std::vector<float> depth;
-    dfb::FrameReport report;
-
-    bool operator==(const Picture& o) const
-    {
-        return color == o.color && depth.size() == o.depth.size()
-               && (depth.empty() || std::memcmp(depth.data(), o.depth.data(), 4 * depth.size()) == 0);
-    }
-    float value(std::size_t i) const
-    {
-        float result = 0;
-        std::memcpy(&result, color.data() + 4 * i, 4);
-        return result;
-    }
+struct Picture : dfb::testing::TileOutput {
+    dfb::FrameReport frame;
 };
 
 // The second of two pictures: memory is used again.
@@ -138,7 +122,7 @@ Picture pictureOf(const std::vector<Pixels>& images, ImageBlend blend, dfb::Outp
             picture.color.assign(color, color + bytesPerPixel(format) * pixels);
             if (config.image.depth)
                 picture.depth.assign(compositor.image().depth(), compositor.image().depth() + pixels);
-            picture.report = report;
+            picture.frame = report;
         }
     });
     return picture;
@@ -237,7 +221,7 @@ TEST_CASE("Adversarial images between nodes keep the bounds of half a level and 
             way.precision = dfb::HalfLevel{};
             INFO("seed " << seed);
             const Picture levels = pictureOf(images, blend, dfb::OutputFormat::RGBA8, way);
-            CHECK(levels.report.wireErrorBound <= 0.5 / 255);
+            CHECK(levels.frame.wireErrorBound <= 0.5 / 255);
             ErrorReport report;
             for (std::size_t i = 0; i < 4 * pixels; ++i)
                 report.addByte(std::to_integer<std::uint8_t>(levels.color[i]),
@@ -249,7 +233,7 @@ TEST_CASE("Adversarial images between nodes keep the bounds of half a level and 
             for (std::size_t i = 0; i < 4 * pixels; ++i)
                 if (const auto exact = static_cast<double>(expected[i / 4].rgba[i % 4]); std::abs(exact) <= 2)
                     worst = std::max(worst, std::abs(static_cast<double>(floats.value(i)) - exact));
-            CHECK(worst <= floats.report.wireErrorBound + 0x1p-23);
+            CHECK(worst <= floats.frame.wireErrorBound + 0x1p-23);
             CHECK((seed % 4 == 0 || worst > 0));
         }
 }
