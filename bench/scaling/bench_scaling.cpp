@@ -15,12 +15,14 @@
 #include "trace.hpp"
 
 #include <dfb/distributed_framebuffer.hpp>
+#include <dfb/frame/verdict.hpp>
 #include <dfb/ops/sort_last.hpp>
 #include <dfb/render/loops.hpp>
 #include <dfb/wire/fragment_message.hpp>
 
 #include <algorithm>
 #include <array>
+#include <chrono>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
@@ -166,7 +168,8 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         for (const Input& input : some)
             if (input.activePixels > 0)
                 isTouched[static_cast<std::size_t>(input.tile)] = true;
-    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40, verdictBytes = 241, consensusBytes = 28;
+    constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40, consensusBytes = 28;
+    const auto verdictBytes = consensusBytes + static_cast<std::int64_t>(dfb::detail::Verdict().bytes().size());
     constexpr std::int64_t record = 16 + bytesPerOutput * tileSize * tileSize;
     constexpr std::int64_t perBatch = (batchBytes - batchPrefix) / record;
     std::vector<std::int64_t> finished(inputs.size());
@@ -288,6 +291,7 @@ Measured measure(const std::vector<bench::PartialImage>& images, int width, int 
         config.image.width = width;
         config.image.height = height;
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        config.quiet = std::chrono::minutes(10); // or slow frames have messages that say that nothing is lost
         const bench::Trace trace(tracePath);
         config.trace = trace.sink;
         FrameBuffer fb(connection, config);

@@ -298,15 +298,18 @@ public:
         const Connection::Hurry hurry(*connection_);
         std::unique_lock<std::mutex> lock(mutex_);
         if (!connection_->needsCaller()) {
-            while (!over() && !late()) {
-                const auto next = Clock::now() + std::chrono::milliseconds(2);
+            // Workers may be short: those of several ranks in one process can all be in waitForRoom(), each for the
+            // others. So this looks for tasks now and then; less often while there are none, as with many ranks in a
+            // process looking takes all the time.
+            constexpr std::chrono::milliseconds shortest{2}, longest{32};
+            for (std::chrono::milliseconds pause = shortest; !over() && !late();) {
+                const auto next = Clock::now() + pause;
                 changed_.wait_until(lock, deadline ? std::min(*deadline, next) : next,
                                     [&] { return over() || (!executor_->hasWorkers() && executor_->hasTasks()); });
-                // Workers may be short: those of several ranks in one process can all be in waitForRoom(), each for
-                // the others.
                 lock.unlock();
-                while (!over() && !late() && executor_->help()) {
-                }
+                pause = std::min(2 * pause, longest);
+                while (!over() && !late() && executor_->help())
+                    pause = shortest;
                 lock.lock();
             }
         } else {
