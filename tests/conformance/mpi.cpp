@@ -165,7 +165,7 @@ TEST_CASE("A rank that was built with another packet format is named on all rank
     for (const int odd : {0, size - 1}) {
         std::string text;
         if (rank == odd) {
-            // What any version does first, see mpi_transport.hpp.
+            // What any version does first, see mpi_ranks.hpp.
             const std::uint64_t format = 12345;
             std::vector<std::uint64_t> all(static_cast<std::size_t>(size));
             MPI_Comm own = MPI_COMM_NULL;

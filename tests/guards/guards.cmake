@@ -76,7 +76,7 @@ endfunction()
 _dfb_flags_of(_mpi_flags MPI::MPI_CXX)
 _dfb_flags_of(_tbb_flags TBB::tbb)
 _dfb_flags_of(_snappy_flags Snappy::snappy)
-set(_mpi_doors dfb/comm/mpi_transport.hpp dfb/comm/mpi_session.hpp)
+set(_mpi_doors dfb/comm/mpi_calls.hpp dfb/comm/mpi_ranks.hpp dfb/comm/mpi_session.hpp dfb/comm/mpi_transport.hpp)
 set(_tbb_doors dfb/tbb_executor.hpp)
 set(_snappy_doors dfb/comm/snappy_codec.hpp)
 

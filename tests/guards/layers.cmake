@@ -9,14 +9,14 @@ set(level_1 base/detect.hpp base/fifo.hpp base/function_ref.hpp channels.hpp com
 set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp error.hpp
             testing/error_report.hpp)
 set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
-            comm/message.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
-            gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
-set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/progress.hpp comm/reduction.hpp frame/open_frame.hpp
-            image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp trace_file.hpp)
+            comm/message.hpp comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
+            comm/transport.hpp exec.hpp gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
+set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/mpi_ranks.hpp comm/mpi_session.hpp comm/progress.hpp
+            comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp trace_file.hpp)
 set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
 set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
             tile_layout.hpp)
-set(level_7 blend/fragment_compositor.hpp comm/mpi_session.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
+set(level_7 blend/fragment_compositor.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
             wire/sparse_planes.hpp wire/wire_losses.hpp)
 set(level_8 frame/declarations.hpp ops/sort_last.hpp pixel_op.hpp render/link_owners.hpp
             render/sampling.hpp render/visibility.hpp wire/finished_record.hpp wire/fragment_message.hpp)
@@ -33,7 +33,7 @@ set(level_16 dfb.hpp)
 set(last_level 16)
 
 # A dependency has one door.
-set(door_of_mpi comm/mpi_transport.hpp)
+set(door_of_mpi comm/mpi_calls.hpp)
 set(door_of_snappy comm/snappy_codec.hpp)
 set(door_of_tbb tbb_executor.hpp)
 

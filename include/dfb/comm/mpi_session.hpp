@@ -8,7 +8,7 @@
 //   }
 #pragma once
 
-#include <dfb/comm/mpi_transport.hpp>
+#include <dfb/comm/mpi_calls.hpp>
 #include <dfb/compiled.hpp>
 
 #include <chrono>

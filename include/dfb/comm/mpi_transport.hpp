@@ -1,4 +1,4 @@
-// MpiTransport: ranks are MPI processes. The only header that includes mpi.h.
+// MpiTransport: ranks are MPI processes.
 //
 // All MPI calls are made by the constructor, poll() and stop(), and none of them blocks, because MPI libraries spin
 // while they block: a caller that has to wait tests and naps. Works on a duplicate of the caller's communicator; never
@@ -9,24 +9,19 @@
 // says where it lies in memory that both see (comm/node_memory.hpp), and nothing is copied. Otherwise it is sent on its
 // own under the tag that the announcement names, so that it goes straight into the block that the handler gets.
 // Receives of packets are posted beforehand: nothing is ever probed for. They take 64 KiB per transport.
-//
-// Ranks of every version of this file first duplicate the communicator and gather the 8 bytes of their packetFormat on
-// it. No version may change that.
 #pragma once
 
-#include <dfb/base/cpu.hpp>
 #include <dfb/base/fifo.hpp>
 #include <dfb/base/function_ref.hpp>
 #include <dfb/comm/connection.hpp>
+#include <dfb/comm/mpi_calls.hpp>
+#include <dfb/comm/mpi_ranks.hpp>
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
 #include <dfb/comm/transport.hpp>
 #include <dfb/compiled.hpp>
 
-#include <mpi.h>
-
 #include <algorithm>
-#include <array>
 #include <atomic>
 #include <chrono>
 #include <cstddef>
@@ -35,7 +30,6 @@
 #include <cstdlib>
 #include <cstring>
 #include <exception>
-#include <functional>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -45,64 +39,6 @@
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
-
-namespace detail {
-
-inline const char* mpiLevelName(int level)
-{
-    return level == MPI_THREAD_SINGLE       ? "MPI_THREAD_SINGLE"
-           : level == MPI_THREAD_FUNNELED   ? "MPI_THREAD_FUNNELED"
-           : level == MPI_THREAD_SERIALIZED ? "MPI_THREAD_SERIALIZED"
-                                            : "MPI_THREAD_MULTIPLE";
-}
-
-// Throws TransportError unless the call was successful. `rank`: this one; `peer`: whom it was about, or -1. That one
-// may be the cause: over a network MPI can find that a rank is gone before the library does.
-inline void checkMpi(int code, const char* call, int rank, int peer = -1)
-{
-    if (code == MPI_SUCCESS)
-        return;
-    char text[MPI_MAX_ERROR_STRING];
-    int length = 0;
-    if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
-        length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
-    throw TransportError(peer < 0 ? printed("%s: %.*s", call, length, text)
-                                  : printed("%s with rank %d: %.*s", call, peer, length, text),
-                         rank);
-}
-
-// Asks MPI_Initialized, MPI_Finalized or MPI_Is_thread_main.
-inline bool mpiSays(int (*ask)(int*))
-{
-    int answer = 0;
-    ask(&answer);
-    return answer != 0;
-}
-
-// For waiting without spinning and without a blocking call.
-class Patience {
-public:
-    void nap()
-    {
-        std::this_thread::sleep_for(next_);
-        next_ = std::min<std::chrono::microseconds>(next_ + next_ / 4, std::chrono::microseconds(200));
-    }
-    void reset() { next_ = shortest; }
-
-private:
-    static constexpr std::chrono::microseconds shortest{20};
-    std::chrono::microseconds next_ = shortest;
-};
-
-// Waits until the request has completed. Throws as checkMpi() does.
-inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STATUS_IGNORE)
-{
-    int done = 0;
-    for (Patience patience; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
-        patience.nap();
-}
-
-} // namespace detail
 
 class MpiTransport {
 public:
@@ -117,39 +53,26 @@ public:
     // rank and the reason. The others cannot be told, and wait, only if a collective of MPI fails on one rank, or finds
     // no memory there for its result. Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
-        : pool_(std::move(pool)), packet_(pool_)
+        : onlyThread_(threadFor(progress)), pool_(std::move(pool)), ranks_(communicator, *pool_), packet_(pool_)
     {
-        checkLevel(progress);
-        if (communicator == MPI_COMM_NULL)
-            detail::failArgument("the communicator is MPI_COMM_NULL: only ranks that have one can take part");
-        duplicate(communicator);
-        Reason wrong{};
-        attempt(wrong, [this] { prepare(); });
+        int failed = size();
         try {
-            compareFormats();
-        } catch (...) {
-            MPI_Comm_free(&comm_);
-            throw;
-        }
-        int failed = size_;
-        try {
-            meetNode(wrong);
-            attempt(wrong, [this] { postPackets(); });
-            failed = firstFailed(wrong);
+            ranks_.attempt([this] { prepare(); });
+            failed = ranks_.firstFailed();
         } catch (...) {
             abandon();
             throw;
         }
-        if (failed < size_) {
+        if (failed < size()) {
             release();
-            throw TransportError(wrong.data(), failed);
+            throw TransportError(ranks_.reason(), failed);
         }
     }
     MpiTransport(const MpiTransport&) = delete;
     MpiTransport& operator=(const MpiTransport&) = delete;
     ~MpiTransport()
     {
-        if (comm_ != MPI_COMM_NULL && !detail::mpiSays(MPI_Finalized))
+        if (!isEnded_ && !detail::mpiSays(MPI_Finalized))
             release();
     }
 
@@ -162,22 +85,23 @@ public:
         return level == MPI_THREAD_MULTIPLE;
     }
 
-    int rank() const noexcept { return rank_; }
-    int size() const noexcept { return size_; }
+    int rank() const noexcept { return ranks_.rank(); }
+    int size() const noexcept { return ranks_.size(); }
     // How many ranks of this node may run on this rank's processors (CPU affinity when the transports were made).
-    int sharingRanks() const noexcept { return sharingRanks_; }
+    int sharingRanks() const noexcept { return ranks_.sharingRanks(); }
     // Whether messages to that rank stay where they are, in memory that it sees.
-    bool lendsTo(int other) const noexcept { return peers_[static_cast<std::size_t>(other)].seesMine; }
+    bool lendsTo(int other) const noexcept { return ranks_[other].seesMine; }
     // Where a block of the pool lies for ranks that see it; -1: nowhere.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         static_assert(detail::NodeMemory::alignment == bytesOfPlace);
-        return memory_ && memory_->holds(block) ? memory_->placeOf(block) : -1;
+        const auto& memory = ranks_.memory();
+        return memory && memory->holds(block) ? memory->placeOf(block) : -1;
     }
     // The block of another rank that lies there, as long as this lives; null: this rank does not see it.
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
     {
-        const auto& memory = peers_[static_cast<std::size_t>(other)].itsMemory;
+        const auto& memory = ranks_[other].itsMemory;
         return memory ? memory->at(place, byteCount) : nullptr;
     }
     bool needsPolling() const noexcept { return true; }
@@ -202,7 +126,7 @@ public:
         else
             signal_.nap(limit);
     }
-    void interrupt() { listener_ ? memory_->bell().interrupt() : signal_.interrupt(); }
+    void interrupt() { listener_ ? ranks_.memory()->bell().interrupt() : signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
 
@@ -259,188 +183,46 @@ public:
     }
 
 private:
-    // --- the beginning
-
-    void checkLevel(Progress progress)
+    // The only thread that may call MPI; none if all may.
+    static std::thread::id threadFor(Progress progress)
     {
-        const bool finalized = detail::mpiSays(MPI_Finalized);
-        if (finalized || !detail::mpiSays(MPI_Initialized))
-            throw TransportError(finalized ? "MPI has been finalised"
-                                           : "MPI is not initialised: call MPI_Init or MPI_Init_thread first");
-        int level = MPI_THREAD_SINGLE;
-        MPI_Query_thread(&level);
+        const int level = detail::mpiLevel();
         if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
             throw TransportError(
                 detail::printed("MPI was initialised at thread level %s, Progress::Thread needs MPI_THREAD_MULTIPLE: "
                                 "call MPI_Init_thread with it, or leave Progress::Auto",
                                 detail::mpiLevelName(level)));
-        if (level < MPI_THREAD_SERIALIZED) {
-            if (!detail::mpiSays(MPI_Is_thread_main))
-                throw TransportError(detail::printed(
-                    "MPI was initialised at thread level %s by another thread: only that one may call MPI",
-                    detail::mpiLevelName(level)));
-            onlyThread_ = std::this_thread::get_id();
-        }
-    }
-
-    void duplicate(MPI_Comm communicator)
-    {
-        MPI_Request duplicated = MPI_REQUEST_NULL;
-        check(MPI_Comm_idup(communicator, &comm_, &duplicated), "MPI_Comm_idup");
-        wait(duplicated);
-        check(MPI_Comm_rank(comm_, &rank_), "MPI_Comm_rank");
-        check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
-    }
-
-    // Why this rank can have no transport; empty if nothing is wrong. Takes no memory, of which there may be none.
-    using Reason = std::array<char, 512>;
-
-    // Runs a step that a rank does alone. A rank that fails does no more such steps. It still takes part in the steps
-    // of all ranks, as they wait for it there, until it can tell them.
-    static void attempt(Reason& wrong, detail::FunctionRef<void()> step)
-    {
-        if (wrong[0] != 0)
-            return;
-        try {
-            step();
-        } catch (const Error& e) {
-            std::snprintf(wrong.data(), wrong.size(), "%s", e.info().message.c_str());
-        } catch (const std::exception& e) {
-            std::snprintf(wrong.data(), wrong.size(), "%s", e.what());
-        }
-    }
-
-    // The first rank that something is wrong on, and on all ranks its reason; size() if there is none.
-    int firstFailed(Reason& wrong) const
-    {
-        const int mine = wrong[0] != 0 ? rank_ : size_;
-        int first = size_;
-        MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Iallreduce(&mine, &first, 1, MPI_INT, MPI_MIN, comm_, &request), "MPI_Iallreduce");
-        wait(request);
-        if (first < size_) {
-            check(MPI_Ibcast(wrong.data(), static_cast<int>(wrong.size()), MPI_CHAR, first, comm_, &request),
-                  "MPI_Ibcast");
-            wait(request);
-        }
-        return first;
+        if (level >= MPI_THREAD_SERIALIZED)
+            return {};
+        if (!detail::mpiSays(MPI_Is_thread_main))
+            throw TransportError(
+                detail::printed("MPI was initialised at thread level %s by another thread: only that one may call MPI",
+                                detail::mpiLevelName(level)));
+        return std::this_thread::get_id();
     }
 
     void prepare()
     {
-        check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");
         const int* tagBound = nullptr;
         int found = 0;
-        check(MPI_Comm_get_attr(comm_, MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
+        check(MPI_Comm_get_attr(comm(), MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound, 1 << 20) : 32767;
-        peers_.resize(static_cast<std::size_t>(size_));
-    }
-
-    void postPackets()
-    {
+        crowding_ = crowding();
+        if (ranks_.memory())
+            listener_.emplace(ranks_.memory()->bell());
+        peers_.resize(static_cast<std::size_t>(size()));
         packetRequests_.assign(postedPackets, MPI_REQUEST_NULL);
         packets_ = pool_->acquire(detail::packetBytes * postedPackets);
         for (int slot = 0; slot < postedPackets; ++slot)
             postPacket(slot);
     }
 
-    // The first thing that ranks say to each other, see above. Throws the same TransportError on all.
-    void compareFormats() const
-    {
-        const std::uint64_t mine = detail::packetFormat;
-        std::vector<std::uint64_t> all(static_cast<std::size_t>(size_));
-        MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
-              "MPI_Iallgather");
-        wait(request);
-        const auto differs = std::find_if(all.begin(), all.end(), [&](std::uint64_t f) { return f != all.front(); });
-        if (differs == all.end())
-            return;
-        const int other = static_cast<int>(differs - all.begin());
-        const auto number = [](std::uint64_t format) { return static_cast<unsigned long long>(format); };
-        std::string text = detail::printed("ranks were built with versions of dfb that cannot read each other: rank 0 "
-                                           "sends packets of format %llu",
-                                           number(all.front()));
-        int named = 0; // those that differ from rank 0
-        for (std::size_t rank = 0; rank < all.size(); ++rank)
-            if (all[rank] != all.front() && ++named <= 8)
-                text += detail::printed(", rank %zu of format %llu", rank, number(all[rank]));
-        if (named > 8)
-            text += detail::printed(", and %d more of others than rank 0", named - 8);
-        throw TransportError(std::move(text), other);
-    }
-
-    // A rank's message to all others in meetNode().
-    struct Card {
-        std::uint64_t host;
-        Processors processors;
-        detail::NodeMemory::Address memory;
-    };
-
-    // Finds the ranks of this node, and shares memory with those that it can be shared with.
-    void meetNode(Reason& wrong)
-    {
-        std::shared_ptr<detail::NodeMemory> memory;
-        Card mine{};
-        attempt(wrong, [&] {
-            char host[MPI_MAX_PROCESSOR_NAME + 1] = {};
-            int length = 0;
-            check(MPI_Get_processor_name(host, &length), "MPI_Get_processor_name");
-            memory = memoryToShare();
-            mine = {std::hash<std::string>()(std::string(host, static_cast<std::size_t>(length))),
-                    Processors::ofThisThread(), memory ? memory->address() : detail::NodeMemory::Address()};
-        });
-        std::vector<Card> all(static_cast<std::size_t>(size_));
-        MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Iallgather(&mine, sizeof mine, MPI_BYTE, all.data(), sizeof mine, MPI_BYTE, comm_, &request),
-              "MPI_Iallgather");
-        wait(request);
-        const auto isHere = [&](const Card& card) { return card.host == mine.host; };
-        sharingRanks_ = static_cast<int>(std::count_if(all.begin(), all.end(), [&](const Card& card) {
-            return isHere(card) && card.processors.meets(mine.processors);
-        }));
-        findCrowding(mine.processors.count());
-
-        // Each tells the others whose memory it sees.
-        std::vector<std::uint8_t> sees(all.size()), seen(all.size());
-        attempt(wrong, [&] {
-            for (std::size_t i = 0; i < all.size() && memory; ++i) {
-                if (static_cast<int>(i) == rank_ || !isHere(all[i]) || all[i].memory.process == 0)
-                    continue;
-                peers_[i].itsMemory = detail::NodeMemory::open(all[i].memory);
-                sees[i] = peers_[i].itsMemory != nullptr;
-            }
-        });
-        check(MPI_Ialltoall(sees.data(), 1, MPI_BYTE, seen.data(), 1, MPI_BYTE, comm_, &request), "MPI_Ialltoall");
-        wait(request);
-        attempt(wrong, [&] {
-            for (std::size_t i = 0; i < all.size(); ++i)
-                peers_[i].seesMine = seen[i] != 0;
-            const auto seers = std::count(seen.begin(), seen.end(), 1);
-            if (seers > 0) {
-                memory_ = memory;
-                listener_.emplace(memory->bell());
-                pool_->share(memory);
-            }
-            areAllHere_ = seers == size_ - 1;
-        });
-    }
-
-    std::shared_ptr<detail::NodeMemory> memoryToShare() const
-    {
-        if (size_ == 1 || !pool_->mayBeShared())
-            return nullptr;
-        if (const auto has = std::dynamic_pointer_cast<detail::NodeMemory>(pool_->shared()))
-            return has; // of another transport with this pool
-        return detail::NodeMemory::create();
-    }
-
     // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
     // each wakes up so often, and takes the core from all others that often.
-    void findCrowding(int cores)
+    int crowding() const
     {
-        const std::int64_t ranksPerCore = std::int64_t{4} * sharingRanks_ / std::max(1, cores); // in quarters
-        crowding_ = static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
+        const std::int64_t ranksPerCore = std::int64_t{4} * ranks_.sharingRanks() / ranks_.processors(); // in quarters
+        return static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
     // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile:
@@ -489,15 +271,14 @@ private:
         int inFlight = 0; // sends to it that have not completed
         int tag = 0;      // the last one used
         bool addressed = false;
-        std::shared_ptr<detail::NodeMemory> itsMemory; // if it is on this node
-        bool seesMine = false;                         // my memory
     };
 
     // More would not be faster, but every poll() looks at each.
     static constexpr int sendsPerPeer = 32;
     static constexpr std::size_t bodiesAtOnce = 64;
 
-    void check(int code, const char* call, int peer = -1) const { detail::checkMpi(code, call, rank_, peer); }
+    MPI_Comm comm() const noexcept { return ranks_.comm(); }
+    void check(int code, const char* call, int peer = -1) const { detail::checkMpi(code, call, rank(), peer); }
 
     // `action()`, or false if it failed.
     bool guarded(detail::FunctionRef<bool()> action)
@@ -507,7 +288,7 @@ private:
         } catch (const Error& e) {
             fail(e.info());
         } catch (const std::exception& e) {
-            fail(TransportError(e.what(), rank_).info());
+            fail(TransportError(e.what(), rank()).info());
         }
         return false;
     }
@@ -515,7 +296,7 @@ private:
     void fail(const ErrorInfo& error)
     {
         failed_ = true;
-        if (error.rank < 0 || error.rank == rank_) // else another rank has told all
+        if (error.rank < 0 || error.rank == rank()) // else another rank has told all
             tellFailure(error.message);
         finishNotices();
         if (handler_)
@@ -531,10 +312,10 @@ private:
             notice.add({length, 0, Record::Failure}, reinterpret_cast<const std::byte*>(text.data()), length);
             notices_.items.push_back({notice.take(), 0, -1, 0});
             const Transfer& sent = notices_.items.back();
-            for (int peer = 0; peer < size_; ++peer) {
+            for (int peer = 0; peer < size(); ++peer) {
                 MPI_Request request = MPI_REQUEST_NULL;
-                if (peer != rank_
-                    && MPI_Isend(sent.data.data(), sent.count(), MPI_BYTE, peer, 0, comm_, &request) == MPI_SUCCESS)
+                if (peer != rank()
+                    && MPI_Isend(sent.data.data(), sent.count(), MPI_BYTE, peer, 0, comm(), &request) == MPI_SUCCESS)
                     notices_.requests.push_back(request);
             }
         } catch (const std::exception&) {
@@ -561,8 +342,6 @@ private:
         return done != 0;
     }
 
-    void wait(MPI_Request& request) const { detail::waitMpi(request, rank_); }
-
     bool move()
     {
         if (listener_)
@@ -573,14 +352,15 @@ private:
         const bool arrived = receivePackets() || receivePackets();
         const bool delivered = receiveBodies();
         const bool completed = finishSends();
-        isRungForAll_ = areAllHere_ && sends_.requests.empty() && receives_.requests.empty() && waitingPeers_.empty();
+        isRungForAll_ =
+            ranks_.doAllSeeMine() && sends_.requests.empty() && receives_.requests.empty() && waitingPeers_.empty();
         return started || arrived || delivered || completed;
     }
 
     // Wakes a rank of this node that naps: MPI has something for it.
     void ring(int other)
     {
-        if (const auto& memory = peers_[static_cast<std::size_t>(other)].itsMemory)
+        if (const auto& memory = ranks_[other].itsMemory)
             memory->bell().ring();
     }
 
@@ -625,11 +405,11 @@ private:
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
             const std::size_t byteCount = message.size();
-            if (peer.seesMine && byteCount >= MemoryPool::smallestShared) { // to copy less is quicker
+            if (lendsTo(destination) && byteCount >= MemoryPool::smallestShared) { // to copy less is quicker
                 if (const std::byte* lent = pool_->lend(message)) {
                     if (!packet_.hasRoom(0))
                         sendPacket(destination);
-                    packet_.add({byteCount, memory_->placeOf(lent), Record::Lent}, nullptr, 0);
+                    packet_.add({byteCount, ranks_.memory()->placeOf(lent), Record::Lent}, nullptr, 0);
                     continue;
                 }
             }
@@ -673,7 +453,7 @@ private:
     {
         MPI_Request request = MPI_REQUEST_NULL;
         check(MPI_Isend(transfer.data.data() + transfer.offset, transfer.count(), MPI_BYTE, transfer.peer, transfer.tag,
-                        comm_, &request),
+                        comm(), &request),
               "MPI_Isend", transfer.peer);
         ring(transfer.peer);
         return request;
@@ -703,7 +483,7 @@ private:
 
     void postPacket(int slot)
     {
-        check(MPI_Irecv(packetAt(slot), static_cast<int>(detail::packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm_,
+        check(MPI_Irecv(packetAt(slot), static_cast<int>(detail::packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm(),
                         &packetRequests_[static_cast<std::size_t>(slot)]),
               "MPI_Irecv");
     }
@@ -729,12 +509,12 @@ private:
                 if (record.kind == Record::Announcement) {
                     announced_.push({source, record.tag, record.byteCount});
                 } else if (record.kind == Record::Lent) {
-                    Peer& peer = peers_[static_cast<std::size_t>(source)];
-                    Buffer message = peer.itsMemory ? peer.itsMemory->borrow(record.tag, record.byteCount) : Buffer();
+                    const auto& memory = ranks_[source].itsMemory;
+                    Buffer message = memory ? memory->borrow(record.tag, record.byteCount) : Buffer();
                     if (message.empty())
                         throw TransportError(
                             detail::printed("rank %d has lent a block that is not in the memory of this node", source),
-                            rank_);
+                            rank());
                     deliver(source, std::move(message));
                 } else if (record.kind == Record::Failure) {
                     throw TransportError(std::string(reinterpret_cast<const char*>(payload), payloadBytes), source);
@@ -746,7 +526,7 @@ private:
                 }
             });
         if (!isPacket)
-            throw TransportError(detail::printed("a packet from rank %d is malformed", source), rank_);
+            throw TransportError(detail::printed("a packet from rank %d is malformed", source), rank());
     }
 
     bool receiveBodies()
@@ -761,7 +541,7 @@ private:
         return testSome(receives_, [this](Transfer& body, const MPI_Status& status) {
             if (byteCountOf(status) != static_cast<std::size_t>(body.count()))
                 throw TransportError(
-                    detail::printed("a message from rank %d is not as long as it was announced", body.peer), rank_);
+                    detail::printed("a message from rank %d is not as long as it was announced", body.peer), rank());
             body.offset += static_cast<std::size_t>(body.count());
             if (body.offset < body.data.size())
                 return startReceive(body);
@@ -773,7 +553,7 @@ private:
     MPI_Request startReceive(Transfer& body)
     {
         MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Irecv(body.data.data() + body.offset, body.count(), MPI_BYTE, body.peer, body.tag, comm_, &request),
+        check(MPI_Irecv(body.data.data() + body.offset, body.count(), MPI_BYTE, body.peer, body.tag, comm(), &request),
               "MPI_Irecv", body.peer);
         return request;
     }
@@ -863,7 +643,7 @@ private:
     bool barrier()
     {
         MPI_Request request = MPI_REQUEST_NULL;
-        check(MPI_Ibarrier(comm_, &request), "MPI_Ibarrier");
+        check(MPI_Ibarrier(comm(), &request), "MPI_Ibarrier");
         return moveUntil([&] { return completed(request); });
     }
 
@@ -876,11 +656,11 @@ private:
             return false;
         leaving_ = true;
         std::vector<MPI_Request> goodbyes;
-        for (int peer = 0; peer < size_; ++peer) {
+        for (int peer = 0; peer < size(); ++peer) {
             if (!peers_[static_cast<std::size_t>(peer)].addressed)
                 continue;
             goodbyes.push_back(MPI_REQUEST_NULL);
-            check(MPI_Issend(nullptr, 0, MPI_BYTE, peer, 0, comm_, &goodbyes.back()), "MPI_Issend");
+            check(MPI_Issend(nullptr, 0, MPI_BYTE, peer, 0, comm(), &goodbyes.back()), "MPI_Issend");
         }
         const auto haveLeft = [&] {
             return std::all_of(goodbyes.begin(), goodbyes.end(), [this](MPI_Request& each) { return completed(each); });
@@ -907,7 +687,7 @@ private:
                 continue;
             MPI_Status& status = statuses_[slot];
             int cancelled = 0;
-            detail::waitMpi(request, rank_, &status);
+            detail::waitMpi(request, rank(), &status);
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
                 came(static_cast<int>(slot), byteCountOf(status));
@@ -921,7 +701,9 @@ private:
             cancelPackets([](int, std::size_t) {}); // if stop() was never called
         } catch (const std::exception&) {
         }
-        MPI_Comm_free(&comm_);
+        MPI_Comm comm = ranks_.comm();
+        MPI_Comm_free(&comm);
+        isEnded_ = true;
     }
 
     // Tries to send the messages that tell the others why this rank leaves, for a short time.
@@ -949,20 +731,18 @@ private:
             Buffer packets;
         };
         new Abandoned{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
-        comm_ = MPI_COMM_NULL;
+        isEnded_ = true;
     }
 
+    const std::thread::id onlyThread_; // that may call MPI; none if all may
     std::shared_ptr<MemoryPool> pool_;
-    std::shared_ptr<detail::NodeMemory> memory_; // of the pool, if another rank sees it
+    detail::MpiRanks ranks_;
     TransportHandler* handler_ = nullptr;
-    MPI_Comm comm_ = MPI_COMM_NULL;
-    int rank_ = 0, size_ = 1, lastTag_ = 1;
+    int lastTag_ = 1;
     int crowding_ = 4;
-    int sharingRanks_ = 1;
-    std::thread::id onlyThread_; // that may call MPI; none if all may
+    bool isEnded_ = false; // the communicator is freed, or left to MPI
 
-    std::optional<detail::Bell::Listener> listener_; // of memory_; none: signal_ in its place
-    bool areAllHere_ = false;                        // all other ranks can ring
+    std::optional<detail::Bell::Listener> listener_; // of this rank's memory; none: signal_ in its place
     std::atomic<bool> isRungForAll_{false};          // nothing can come that is not announced by the bell
     NapSignal signal_;
     mutable std::mutex mutex_;

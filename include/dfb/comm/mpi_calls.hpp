@@ -1,0 +1,87 @@
+// Calls of MPI: errors become exceptions, and nothing waits in a call that blocks, because MPI libraries spin there.
+// The only header that includes mpi.h.
+#pragma once
+
+#include <dfb/compiled.hpp>
+#include <dfb/error.hpp>
+
+#include <mpi.h>
+
+#include <algorithm>
+#include <chrono>
+#include <cstdio>
+#include <thread>
+
+DFB_NAMESPACE_BEGIN
+
+namespace detail {
+
+inline const char* mpiLevelName(int level)
+{
+    return level == MPI_THREAD_SINGLE       ? "MPI_THREAD_SINGLE"
+           : level == MPI_THREAD_FUNNELED   ? "MPI_THREAD_FUNNELED"
+           : level == MPI_THREAD_SERIALIZED ? "MPI_THREAD_SERIALIZED"
+                                            : "MPI_THREAD_MULTIPLE";
+}
+
+// Throws TransportError unless the call was successful. `rank`: this one; `peer`: whom it was about, or -1. That one
+// may be the cause: over a network MPI can find that a rank is gone before the library does.
+inline void checkMpi(int code, const char* call, int rank, int peer = -1)
+{
+    if (code == MPI_SUCCESS)
+        return;
+    char text[MPI_MAX_ERROR_STRING];
+    int length = 0;
+    if (MPI_Error_string(code, text, &length) != MPI_SUCCESS || length == 0)
+        length = std::snprintf(text, sizeof text, "error %d, of which MPI knows nothing", code);
+    throw TransportError(peer < 0 ? printed("%s: %.*s", call, length, text)
+                                  : printed("%s with rank %d: %.*s", call, peer, length, text),
+                         rank);
+}
+
+// Asks MPI_Initialized, MPI_Finalized or MPI_Is_thread_main.
+inline bool mpiSays(int (*ask)(int*))
+{
+    int answer = 0;
+    ask(&answer);
+    return answer != 0;
+}
+
+// The thread level of MPI. Throws TransportError if MPI is not initialised, or is finalised.
+inline int mpiLevel()
+{
+    const bool finalized = mpiSays(MPI_Finalized);
+    if (finalized || !mpiSays(MPI_Initialized))
+        throw TransportError(finalized ? "MPI has been finalised"
+                                       : "MPI is not initialised: call MPI_Init or MPI_Init_thread first");
+    int level = MPI_THREAD_SINGLE;
+    MPI_Query_thread(&level);
+    return level;
+}
+
+// For waiting without spinning and without a blocking call.
+class Patience {
+public:
+    void nap()
+    {
+        std::this_thread::sleep_for(next_);
+        next_ = std::min<std::chrono::microseconds>(next_ + next_ / 4, std::chrono::microseconds(200));
+    }
+    void reset() { next_ = shortest; }
+
+private:
+    static constexpr std::chrono::microseconds shortest{20};
+    std::chrono::microseconds next_ = shortest;
+};
+
+// Waits until the request has completed. Throws as checkMpi() does.
+inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STATUS_IGNORE)
+{
+    int done = 0;
+    for (Patience patience; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
+        patience.nap();
+}
+
+} // namespace detail
+
+DFB_NAMESPACE_END
