@@ -8,6 +8,7 @@
 #include <dfb/frame/operations.hpp>
 
 #include <algorithm>
+#include <chrono>
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
@@ -207,6 +208,34 @@ private:
         return settings;
     }
 };
+
+// Throws InvalidArgument if a rank of so many cannot work with this configuration.
+inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& operations, int size,
+                        std::chrono::milliseconds peerTimeout)
+{
+    if (c.image.displayRank < 0 || c.image.displayRank >= size)
+        failArgument("the display rank is %d of %d", c.image.displayRank, size);
+    if (c.framesInFlight < 1 || (c.framesInFlight > 1 && operations.keepsState))
+        failArgument("there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
+                     c.framesInFlight);
+    if (c.image.aux & ~(operations.channels & imageAuxChannels))
+        failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation do not "
+                     "have",
+                     c.image.aux);
+    if (const long long ms = peerTimeout.count(); ms != 0 && ms < 100)
+        failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
+    if (const long long ms = c.quiet.count(); ms < 1)
+        failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
+    const Precision& w = c.precision;
+    if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
+        failArgument("half a level, and another precision");
+    if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
+        failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
+    if (w.color == WireFormat::Bytes)
+        failArgument("the format bytes is that of inputs of 8 bits, and cannot be asked for");
+    if (!(c.minTransmittance >= 0 && c.minTransmittance < 1))
+        failArgument("a least transmittance of %f", c.minTransmittance);
+}
 
 // Finds out whether all ranks have the same configuration, which makeMine() returns, and returns what all have.
 // Collective. Throws InvalidArgument on all ranks if something is wrong, as if makeMine() throws on one of them. No

@@ -22,7 +22,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <exception>
-#include <limits>
 #include <memory>
 #include <optional>
 #include <utility>
@@ -49,7 +48,7 @@ public:
         compression_.emplace(config_.messages.codec, config_.messages.compression, size());
         mailbox_->start();
         const auto all = agree(*mailbox_, [this] {
-            checkConfig();
+            checkConfig(config_, traits(), size(), mailbox_->connection().config().peerTimeout);
             try {
                 makeParts();
             } catch (const OutOfMemory& e) {
@@ -98,16 +97,9 @@ public:
     {
         if (isOpen())
             failArgument("begin() while a frame is open: end() it first");
-        if (params.passes < 1)
-            failArgument("a frame has at least 1 pass, not %d", params.passes);
-        if (params.maxLayers < 0)
-            failArgument("at most %d layers", params.maxLayers);
+        FrameTerms::check(params, traits());
         const bool lastFailed = outcome_->lastFailed();
         accumulation_.check(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
-        if (params.owners && traits().keepsState)
-            failArgument("owners of a frame's own, with a tile operation that keeps state");
-        if (const long long ms = params.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
-            failArgument("a time-out of %lld ms", ms);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().prepare(params.owners);
@@ -761,33 +753,6 @@ private:
     {
         if (isOpen())
             outcome_->tryVote();
-    }
-
-    // Throws InvalidArgument.
-    void checkConfig() const
-    {
-        if (config_.image.displayRank < 0 || config_.image.displayRank >= size())
-            failArgument("the display rank is %d of %d", config_.image.displayRank, size());
-        if (config_.framesInFlight < 1 || (config_.framesInFlight > 1 && traits().keepsState))
-            failArgument("there cannot be %d frames in flight: 1 or more, and only 1 if the tile operation keeps state",
-                         config_.framesInFlight);
-        if (config_.image.aux & ~(traits().channels & imageAuxChannels))
-            failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation "
-                         "do not have",
-                         config_.image.aux);
-        if (const long long ms = mailbox_->connection().config().peerTimeout.count(); ms != 0 && ms < 100)
-            failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
-        if (const long long ms = config_.quiet.count(); ms < 1)
-            failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
-        const Precision& w = config_.precision;
-        if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
-            failArgument("half a level, and another precision");
-        if (!(w.budget >= 0) || !(w.maxColor >= 1e-30f && w.maxColor <= 1e30f))
-            failArgument("an error budget of %f, colours up to %f", w.budget, w.maxColor);
-        if (w.color == WireFormat::Bytes)
-            failArgument("the format bytes is that of inputs of 8 bits, and cannot be asked for");
-        if (!(config_.minTransmittance >= 0 && config_.minTransmittance < 1))
-            failArgument("a least transmittance of %f", config_.minTransmittance);
     }
 
     void makeParts()

@@ -15,6 +15,7 @@
 #include <cstring>
 #include <exception>
 #include <iterator>
+#include <limits>
 #include <mutex>
 #include <optional>
 #include <string>
@@ -66,6 +67,19 @@ struct FrameTerms {
     std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
     std::int32_t declared = 0, allowPartial = 0;
     std::int32_t rank = 0; // whose; the lowest of those that are alike
+
+    // Throws InvalidArgument.
+    static void check(const FrameConfig& p, const OperationTraits& operations)
+    {
+        if (p.passes < 1)
+            failArgument("a frame has at least 1 pass, not %d", p.passes);
+        if (p.maxLayers < 0)
+            failArgument("at most %d layers", p.maxLayers);
+        if (p.owners && operations.keepsState)
+            failArgument("owners of a frame's own, with a tile operation that keeps state");
+        if (const long long ms = p.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
+            failArgument("a time-out of %lld ms", ms);
+    }
 
     static FrameTerms of(const FrameConfig& p, int rank)
     {
