@@ -170,6 +170,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
                 isTouched[static_cast<std::size_t>(input.tile)] = true;
     constexpr std::int64_t batchBytes = 256 << 10, batchPrefix = 40, consensusBytes = 28;
     const auto verdictBytes = consensusBytes + static_cast<std::int64_t>(dfb::detail::Verdict().bytes().size());
+    const std::int64_t agreementBytes = 2048 + 8 * ranks; // at most: what all ranks agree on at first
     constexpr std::int64_t record = 16 + bytesPerOutput * tileSize * tileSize;
     constexpr std::int64_t perBatch = (batchBytes - batchPrefix) / record;
     std::vector<std::int64_t> finished(inputs.size());
@@ -201,6 +202,7 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
         }
         for (const auto& [owner, count] : to) {
             e.manifests.add(24 + 10 * count.messages);
+            e.poolBytes += blockOf(24 + 10 * count.messages);
             at(owner).acks.add(24);
         }
         if (rank != 0) { // the display rank
@@ -230,9 +232,12 @@ std::vector<Expected> expectedOf(const std::vector<std::vector<Input>>& inputs, 
             if (rank + bit < ranks) {
                 e.verdict.add(verdictBytes);
                 e.consensus.add(consensusBytes);
+                e.poolBytes += blockOf(agreementBytes);
             }
         e.poolBytes += blockOf(mostInput) + (64 << 10); // and what is small, in blocks
     }
+    for (Expected& e : all)
+        e.poolBytes += blockOf(24) * (e.acks.messages + e.mostCredits + e.mostCreditsIn);
     return all;
 }
 
