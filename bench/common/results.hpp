@@ -54,6 +54,16 @@ inline void appendJson(const std::string& path, const std::vector<Result>& resul
         throw std::runtime_error("cannot write " + path);
 }
 
+// Whether a file has a table, to which lines can be added. False, too, if there is no file.
+inline bool hasTable(const std::string& path)
+{
+    std::ifstream file(path);
+    for (std::string line; std::getline(file, line);)
+        if (line.rfind("| ", 0) == 0)
+            return true;
+    return false;
+}
+
 // Whether no other result is at least as fast and as exact, and better in one.
 inline bool isOnFront(const Result& r, const std::vector<Result>& all)
 {

@@ -341,19 +341,10 @@ private:
             addToTable(best, {first.scene, size, std::to_string(size_), output});
     }
 
-    bool hasTable() const
-    {
-        std::ifstream file(o_.table);
-        for (std::string line; std::getline(file, line);)
-            if (line.rfind("| ", 0) == 0)
-                return true;
-        return false;
-    }
-
     // With a head, if the file has no table yet.
     void addToTable(const Best& best, const std::array<std::string, 4>& what) const
     {
-        const bool isFirst = !hasTable();
+        const bool isFirst = !bench::hasTable(o_.table);
         std::ofstream file(o_.table, std::ios::app);
         if (isFirst)
             file << "| scene | size | ranks | to | memory alone [ms] | dfb float32 [ms] | dfb defaults [ms] | dfb "

@@ -238,8 +238,8 @@ private:
         std::printf("\n%s%s", head, line.c_str());
         if (o_.table.empty())
             return;
-        const bool isNew = !std::ifstream(o_.table).good();
-        std::ofstream(o_.table, std::ios::app) << (isNew ? head : "") << line;
+        const bool isFirst = !bench::hasTable(o_.table);
+        std::ofstream(o_.table, std::ios::app) << (isFirst ? head : "") << line;
     }
 
     MPI_Comm comm_;
