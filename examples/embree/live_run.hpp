@@ -189,7 +189,7 @@ private:
         }
         std::optional<dfb::FrameReport> report;
         try {
-            report = render(isFirst ? LiveView::anyLook : wishes_.look);
+            report = render(isFirst);
         } catch (const dfb::FrameError& e) {
             const bool isSuperseded = e.info().kind == dfb::ErrorKind::Cancelled
                                       || (e.info().kind == dfb::ErrorKind::UserCode
@@ -207,19 +207,21 @@ private:
             show(*report);
     }
 
-    // Renders a frame, which fails on all ranks if the viewers do not want `look` any more.
-    dfb::FrameReport render(std::uint64_t look)
+    // Renders a frame, which fails on all ranks if the viewers want to look elsewhere. The first frame of a look is
+    // shown nevertheless, or nothing would be seen while the camera moves, unless they want a smaller one, which comes
+    // soon.
+    dfb::FrameReport render(bool isFirst)
     {
         const FrameCamera camera = frameCamera(scene_->info, settings_, 0);
         const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
-            checkWanted(look);
+            checkWanted(isFirst);
             return static_cast<double>(scene_->of(brick.id).front().renderTile(tile, 0));
         };
         auto frame = [&] {
             if constexpr (isSingle) {
                 return imageLoop_.start(
                     [&](auto& tile) {
-                        checkWanted(look);
+                        checkWanted(isFirst);
                         scene_->renderers.front().front().renderTile(tile, 0);
                     },
                     params_);
@@ -238,13 +240,13 @@ private:
             owners_.push_back(frame.tileOwner(tile));
         std::optional<dfb::FrameReport> report;
         view_->whileWatching(
-            look, [&] { frame.cancel(); }, [&] { report = frame.end(); });
+            wishes_.look, isFirst, [&] { frame.cancel(); }, [&] { report = frame.end(); });
         return *report;
     }
 
-    void checkWanted(std::uint64_t look) const
+    void checkWanted(bool isFirst) const
     {
-        if (Interrupt::happened() || (view_ && view_->hasMoved(look)))
+        if (Interrupt::happened() || (view_ && view_->hasMoved(wishes_.look, isFirst)))
             throw Superseded();
     }
 

@@ -213,12 +213,12 @@ public:
         }
     }
 
-    bool hasMoved(std::uint64_t look) const override
+    bool hasMoved(std::uint64_t look, bool onlyIfSmaller) const override
     {
-        return ends_ || Interrupt::happened() || (look != anyLook && look_ != look);
+        return ends_ || Interrupt::happened() || (onlyIfSmaller ? smaller_ > look : look_ != look);
     }
 
-    void whileWatching(std::uint64_t look, const std::function<void()>& onMove,
+    void whileWatching(std::uint64_t look, bool onlyIfSmaller, const std::function<void()>& onMove,
                        const std::function<void()>& work) override
     {
         struct Watch {
@@ -233,6 +233,7 @@ public:
         {
             const std::lock_guard<std::mutex> lock(watchMutex_);
             watched_ = look;
+            isOnlyIfSmaller_ = onlyIfSmaller;
             onMove_ = onMove;
             callIfMoved();
         }
@@ -275,7 +276,7 @@ private:
     // Under the lock of what is watched.
     void callIfMoved()
     {
-        if (onMove_ && hasMoved(watched_))
+        if (onMove_ && hasMoved(watched_, isOnlyIfSmaller_))
             std::exchange(onMove_, nullptr)();
     }
 
@@ -524,6 +525,8 @@ private:
             const bool looksElsewhere = a.azimuth != b.azimuth || a.elevation != b.elevation || a.distance != b.distance
                                         || a.target != b.target || wishes_.width != next.width
                                         || wishes_.height != next.height;
+            const bool isSmaller =
+                std::int64_t{next.width} * next.height < std::int64_t{wishes_.width} * wishes_.height;
             if (looksElsewhere || wishes_.samples != next.samples || wishes_.isPaused != next.isPaused
                 || wishes_.steps != next.steps)
                 ++next.number;
@@ -531,6 +534,8 @@ private:
                 next.look = next.number;
             wishes_ = next;
             look_ = next.look;
+            if (isSmaller)
+                smaller_ = next.look;
             number = next.number;
             changed_.notify_all();
         }
@@ -555,11 +560,12 @@ private:
     int waiting_ = 0; // requests for pictures
     bool isOver_ = false;
 
-    std::atomic<std::uint64_t> look_{0};
+    std::atomic<std::uint64_t> look_{0}, smaller_{0}; // numbers of the last changes of the look, and to a smaller size
     std::atomic<bool> ends_{false};
 
-    std::mutex watchMutex_; // of these two; after the other
+    std::mutex watchMutex_; // of these three; after the other
     std::uint64_t watched_ = 0;
+    bool isOnlyIfSmaller_ = false;
     std::function<void()> onMove_;
 
     BoundedServer http_;

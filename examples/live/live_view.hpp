@@ -89,12 +89,12 @@ public:
     // Waits until they want something else than at `number`, or the job is to end, or for `atMost`.
     virtual LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const = 0;
 
-    // Whether camera or size have changed since `look`, or the job is to end. Cheap. Any thread.
-    virtual bool hasMoved(std::uint64_t look) const = 0;
-    static constexpr std::uint64_t anyLook = ~std::uint64_t{0}; // for those two: only whether the job is to end
+    // Whether camera or size have changed since `look`, or the job is to end. With `onlyIfSmaller`: whether the size
+    // has become smaller since, as it does when somebody begins to turn a picture that takes long. Cheap. Any thread.
+    virtual bool hasMoved(std::uint64_t look, bool onlyIfSmaller) const = 0;
     // Runs `work`. If hasMoved() becomes true meanwhile, or is, `onMove` is called once, by any thread, unless it is
     // for a signal, for which work() must look itself.
-    virtual void whileWatching(std::uint64_t look, const std::function<void()>& onMove,
+    virtual void whileWatching(std::uint64_t look, bool onlyIfSmaller, const std::function<void()>& onMove,
                                const std::function<void()>& work) = 0;
 
     // Shows 8-bit RGBA pixels, whose alpha is left out, and what the report says of them. Copies both; waits for no

@@ -259,9 +259,9 @@ TEST_CASE("what viewers want reaches the job, and nonsense does not")
     CHECK(f.post("/camera", R"({"samples": 4, "target": [1, 2, 3.5]})") == 200);
     CHECK(f.view.wishes().samples == 4);
     CHECK(f.view.wishes().camera.target[2] == 3.5);
-    CHECK(f.view.hasMoved(1));
-    CHECK_FALSE(f.view.hasMoved(2));
-    CHECK_FALSE(f.view.hasMoved(example::LiveView::anyLook));
+    CHECK(f.view.hasMoved(1, false));
+    CHECK_FALSE(f.view.hasMoved(2, false));
+    CHECK_FALSE(f.view.hasMoved(1, true));
     CHECK(f.post("/command", R"({"command": "step"})") == 200);
     CHECK(f.view.wishes().isPaused == 1);
     CHECK(f.view.wishes().steps == 1);
@@ -321,7 +321,7 @@ TEST_CASE("a job that waits for its viewers hears them")
     // While it works it is told once, also of what came before.
     int told = 0;
     f.view.whileWatching(
-        1, [&] { ++told; },
+        1, false, [&] { ++told; },
         [&] {
             CHECK(told == 0);
             CHECK(f.post("/camera", R"({"samples": 9})") == 200); // nothing moves
@@ -332,16 +332,29 @@ TEST_CASE("a job that waits for its viewers hears them")
             CHECK(told == 1);
         });
     f.view.whileWatching(
-        1, [&] { ++told; }, [&] { CHECK(told == 2); });
+        1, false, [&] { ++told; }, [&] { CHECK(told == 2); });
     CHECK(f.post("/camera", R"({"azimuth": 4})") == 200);
     CHECK(told == 2);
+    const auto looksAt = [&](const char* wish) {
+        CHECK(f.post("/camera", wish) == 200);
+        return f.view.wishes().look;
+    };
     f.view.whileWatching(
-        example::LiveView::anyLook, [&] { ++told; },
+        looksAt(R"({"width": 640, "height": 480})"), true, [&] { ++told; },
         [&] {
-            CHECK(f.post("/camera", R"({"azimuth": 5})") == 200);
+            looksAt(R"({"azimuth": 5})");
+            looksAt(R"({"width": 800})");
             CHECK(told == 2);
-            CHECK(f.post("/command", R"({"command": "end"})") == 200);
+            looksAt(R"({"width": 320, "height": 240})");
             CHECK(told == 3);
+        });
+    f.view.whileWatching(
+        f.view.wishes().look, true, [&] { ++told; },
+        [&] {
+            looksAt(R"({"azimuth": 6})");
+            CHECK(told == 3);
+            CHECK(f.post("/command", R"({"command": "end"})") == 200);
+            CHECK(told == 4);
         });
 }
 

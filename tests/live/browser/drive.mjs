@@ -283,6 +283,18 @@ try {
   await page.mouse.up();
   await shows(page, 1024, 768);
   check(true, "half of the size while moving");
+  await look(page, () => { // the camera rests at once, as if a picture took longer than the pause after which it does
+    window.laterTrue = window.setTimeout;
+    window.setTimeout = (work, ms) => laterTrue(work, ms === 250 ? 0 : ms);
+  });
+  await refined(page);
+  await page.mouse.down();
+  await page.mouse.move(540, 400);
+  await page.mouse.up();
+  await shows(page, 512, 384);
+  await shows(page, 1024, 768);
+  await look(page, () => { window.setTimeout = laterTrue; });
+  check(true, "the small picture comes before the whole one, however long they take");
 
   await refined(page);
   await page.select("#moving", "auto");
