@@ -1,4 +1,5 @@
-// ProgressLine: on a terminal, when rendering takes long, one line that tells how far it is.
+// ProgressLine: when rendering takes long, tells how far it is: on a terminal in one line that changes, elsewhere, as
+// under mpirun and in the log of a batch job, in a line every 10 s.
 #pragma once
 
 #include <algorithm>
@@ -31,8 +32,8 @@ inline std::string progressText(int frame, int frameCount, std::int64_t tiles, s
 
 class ProgressLine {
 public:
-    // Silent unless `enabled` and standard error is a terminal.
-    ProgressLine(bool enabled, int frameCount) : enabled_(enabled && isatty(STDERR_FILENO)), frameCount_(frameCount) {}
+    // Silent unless `enabled`.
+    ProgressLine(bool enabled, int frameCount) : enabled_(enabled), frameCount_(frameCount) {}
 
     // `tiles`: of this rank in the frame, about.
     void beginFrame(int frame, std::int64_t tiles)
@@ -51,11 +52,11 @@ public:
         const std::int64_t tiles = ++tiles_;
         const std::int64_t now = std::chrono::nanoseconds(std::chrono::steady_clock::now() - begin_).count();
         std::int64_t due = nextNs_.load();
-        if (now < due || !nextNs_.compare_exchange_strong(due, now + intervalNs))
+        if (now < due || !nextNs_.compare_exchange_strong(due, now + intervalNs_))
             return;
-        std::fprintf(stderr, "\r%s   ",
-                     progressText(frame_, frameCount_, tiles, expected_, static_cast<double>(now) / 1e9).c_str());
-        shown_ = true;
+        const std::string text = progressText(frame_, frameCount_, tiles, expected_, static_cast<double>(now) / 1e9);
+        std::fprintf(stderr, isTerminal_ ? "\r%s   " : "%s\n", text.c_str());
+        shown_ = isTerminal_;
     }
 
     void end()
@@ -66,12 +67,12 @@ public:
     }
 
 private:
-    static constexpr std::int64_t intervalNs = 500000000;
-
     bool enabled_;
+    const bool isTerminal_ = isatty(STDERR_FILENO) != 0;
+    const std::int64_t intervalNs_ = isTerminal_ ? 500000000 : 10000000000;
     int frameCount_;
     std::atomic<int> frame_{0};
-    std::atomic<std::int64_t> tiles_{0}, expected_{0}, nextNs_{4 * intervalNs};
+    std::atomic<std::int64_t> tiles_{0}, expected_{0}, nextNs_{isTerminal_ ? 2000000000 : intervalNs_};
     std::atomic<bool> shown_{false};
     std::chrono::steady_clock::time_point begin_ = std::chrono::steady_clock::now();
 };
