@@ -189,7 +189,7 @@ private:
         }
         std::optional<dfb::FrameReport> report;
         try {
-            report = render(isFirst);
+            report = render();
         } catch (const dfb::FrameError& e) {
             const bool isSuperseded = e.info().kind == dfb::ErrorKind::Cancelled
                                       || (e.info().kind == dfb::ErrorKind::UserCode
@@ -210,18 +210,18 @@ private:
     // Renders a frame, which fails on all ranks if the viewers want to look elsewhere. The first frame of a look is
     // shown nevertheless, or nothing would be seen while the camera moves, unless they want a smaller one, which comes
     // soon.
-    dfb::FrameReport render(bool isFirst)
+    dfb::FrameReport render()
     {
         const FrameCamera camera = frameCamera(scene_->info, settings_, 0);
         const auto renderBrick = [&](const dfb::Brick& brick, auto& tile) {
-            checkWanted(isFirst);
+            checkWanted();
             return static_cast<double>(scene_->of(brick.id).front().renderTile(tile, 0));
         };
         auto frame = [&] {
             if constexpr (isSingle) {
                 return imageLoop_.start(
                     [&](auto& tile) {
-                        checkWanted(isFirst);
+                        checkWanted();
                         scene_->renderers.front().front().renderTile(tile, 0);
                     },
                     params_);
@@ -240,13 +240,13 @@ private:
             owners_.push_back(frame.tileOwner(tile));
         std::optional<dfb::FrameReport> report;
         view_->whileWatching(
-            wishes_.look, isFirst, [&] { frame.cancel(); }, [&] { report = frame.end(); });
+            wishes_.look, !isDrawn_, [&] { frame.cancel(); }, [&] { report = frame.end(); });
         return *report;
     }
 
-    void checkWanted(bool isFirst) const
+    void checkWanted() const
     {
-        if (Interrupt::happened() || (view_ && view_->hasMoved(wishes_.look, isFirst)))
+        if (Interrupt::happened() || (view_ && view_->hasMoved(wishes_.look, !isDrawn_)))
             throw Superseded();
     }
 

@@ -12,7 +12,8 @@ set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kerne
             comm/message.hpp comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
             comm/transport.hpp exec.hpp gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
 set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/mpi_ranks.hpp comm/mpi_session.hpp comm/progress.hpp
-            comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp trace_file.hpp)
+            comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp
+            trace_file.hpp)
 set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
 set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
             tile_layout.hpp)

@@ -32,7 +32,7 @@ namespace detail {
 
 class MpiRanks {
 public:
-    // What one rank is to this one.
+    // A rank as this one sees it.
     struct Other {
         std::shared_ptr<NodeMemory> itsMemory; // null: this rank does not see it
         bool seesMine = false;                 // my memory
@@ -91,7 +91,9 @@ public:
     }
     const char* reason() const noexcept { return wrong_.data(); }
 
-    MPI_Comm comm() const noexcept { return comm_; } // the duplicate; whoever has this object frees it
+    MPI_Comm comm() const noexcept { return comm_; }   // the duplicate; MPI_COMM_NULL after the two below
+    void free() { MPI_Comm_free(&comm_); }             // collective
+    void abandon() noexcept { comm_ = MPI_COMM_NULL; } // MPI keeps it
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     const Other& operator[](int other) const noexcept { return others_[static_cast<std::size_t>(other)]; }

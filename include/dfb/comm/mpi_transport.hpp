@@ -72,7 +72,7 @@ public:
     MpiTransport& operator=(const MpiTransport&) = delete;
     ~MpiTransport()
     {
-        if (!isEnded_ && !detail::mpiSays(MPI_Finalized))
+        if (comm() != MPI_COMM_NULL && !detail::mpiSays(MPI_Finalized))
             release();
     }
 
@@ -701,9 +701,7 @@ private:
             cancelPackets([](int, std::size_t) {}); // if stop() was never called
         } catch (const std::exception&) {
         }
-        MPI_Comm comm = ranks_.comm();
-        MPI_Comm_free(&comm);
-        isEnded_ = true;
+        ranks_.free();
     }
 
     // Tries to send the messages that tell the others why this rank leaves, for a short time.
@@ -731,7 +729,7 @@ private:
             Buffer packets;
         };
         new Abandoned{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
-        isEnded_ = true;
+        ranks_.abandon();
     }
 
     const std::thread::id onlyThread_; // that may call MPI; none if all may
@@ -740,7 +738,6 @@ private:
     TransportHandler* handler_ = nullptr;
     int lastTag_ = 1;
     int crowding_ = 4;
-    bool isEnded_ = false; // the communicator is freed, or left to MPI
 
     std::optional<detail::Bell::Listener> listener_; // of this rank's memory; none: signal_ in its place
     std::atomic<bool> isRungForAll_{false};          // nothing can come that is not announced by the bell
