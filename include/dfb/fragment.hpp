@@ -123,6 +123,18 @@ struct ByteRow : FragmentRow {
     Span valid; // in which all pixels of a fragment in place are
 };
 
+namespace detail {
+
+// A row of pixels in place that are probably all active. Others may still change them.
+struct FullRow {
+    Span span;
+    const float* color = nullptr;
+    const float* depth = nullptr; // null: not wanted
+    const float* ahead = nullptr; // colours to load into the cache meanwhile, for a later row
+};
+
+} // namespace detail
+
 // Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
 class FragmentCursor {
 public:
@@ -194,6 +206,21 @@ public:
             parts_->faults->add({count, 0});
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
+
+    // Finds the next row, and does not go there: skip(1) does. False if it has gaps for certain, or must be converted.
+    bool findFullRow(detail::FullRow& row) const
+    {
+        const detail::PixelsInPlace& pixels = parts_->inPlace;
+        if (!isInPlace() || !pixels.activity.byColorAlone() || row_ < pixels.valid.y0 || row_ >= pixels.valid.y1)
+            return false;
+        const int x = pixels.valid.x0, width = pixels.valid.width();
+        const detail::RowPlace first = pixels.at(x, row_);
+        row.span = {static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(width)};
+        row.color = detail::floatsOf(first.color);
+        row.depth = first.depth;
+        row.ahead = detail::floatsOf(pixels.at(x, detail::rowAhead(row_, pixels.valid.y1, width)).color);
+        return true;
+    }
 
     void advance(const FragmentRow& row)
     {

@@ -190,9 +190,9 @@ struct Avx2Pixel {
     __m256d sum, through;
 
     // The first layer, added to 0; -0 becomes 0.
-    DFB_AVX2 DFB_INLINE void take(const float* color, double minTransmittance)
+    DFB_AVX2 DFB_INLINE void take(__m128 color, double minTransmittance)
     {
-        const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
+        const __m256d v = _mm256_cvtps_pd(color);
         sum = _mm256_add_pd(_mm256_setzero_pd(), v);
         through = _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff));
         close(minTransmittance);
@@ -207,9 +207,9 @@ struct Avx2Pixel {
         _mm256_storeu_pd(rgba, sum);
         _mm_store_sd(transmittance, _mm256_castpd256_pd128(through));
     }
-    DFB_AVX2 DFB_INLINE void add(const float* color, double minTransmittance)
+    DFB_AVX2 DFB_INLINE void add(__m128 color, double minTransmittance)
     {
-        const __m256d v = _mm256_cvtps_pd(_mm_loadu_ps(color));
+        const __m256d v = _mm256_cvtps_pd(color);
         sum = _mm256_add_pd(sum, _mm256_mul_pd(through, v));
         through = _mm256_mul_pd(through, _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff)));
         close(minTransmittance);
@@ -221,23 +221,39 @@ struct Avx2Pixel {
     }
 };
 
+// The colours of four pixels.
+struct Avx2Colors {
+    __m128 a, b, c, d;
+
+    // That lie side by side. Also loads what is the next row in a full tile: no processor foresees streams that jump
+    // from layer to layer.
+    DFB_AVX2 DFB_INLINE void load(const float* color)
+    {
+        _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
+        a = _mm_loadu_ps(color), b = _mm_loadu_ps(color + 4), c = _mm_loadu_ps(color + 8), d = _mm_loadu_ps(color + 12);
+    }
+    // Each of its own layer, of which `colors` are those of the first pixel.
+    DFB_AVX2 DFB_INLINE void load(const float* const* colors, const std::uint32_t (&layers)[4])
+    {
+        a = _mm_loadu_ps(colors[layers[0]]), b = _mm_loadu_ps(colors[layers[1]] + 4);
+        c = _mm_loadu_ps(colors[layers[2]] + 8), d = _mm_loadu_ps(colors[layers[3]] + 12);
+    }
+};
+
 // Four of them, each in registers of its own: as an array they would go through memory where loops are not unrolled.
 template <bool HasLeast>
 struct Avx2Block {
     Avx2Pixel<HasLeast> a, b, c, d;
 
-    // Of pixels that lie side by side.
-    DFB_AVX2 DFB_INLINE void take(const float* color, double minTransmittance)
+    DFB_AVX2 DFB_INLINE void take(const Avx2Colors& v, double minTransmittance)
     {
-        prefetch(color);
-        a.take(color, minTransmittance), b.take(color + 4, minTransmittance);
-        c.take(color + 8, minTransmittance), d.take(color + 12, minTransmittance);
+        a.take(v.a, minTransmittance), b.take(v.b, minTransmittance);
+        c.take(v.c, minTransmittance), d.take(v.d, minTransmittance);
     }
-    DFB_AVX2 DFB_INLINE void add(const float* color, double minTransmittance)
+    DFB_AVX2 DFB_INLINE void add(const Avx2Colors& v, double minTransmittance)
     {
-        prefetch(color);
-        a.add(color, minTransmittance), b.add(color + 4, minTransmittance);
-        c.add(color + 8, minTransmittance), d.add(color + 12, minTransmittance);
+        a.add(v.a, minTransmittance), b.add(v.b, minTransmittance);
+        c.add(v.c, minTransmittance), d.add(v.d, minTransmittance);
     }
     DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* t)
     {
@@ -247,18 +263,15 @@ struct Avx2Block {
     {
         a.store(rgba, t), b.store(rgba + 4, t + 1), c.store(rgba + 8, t + 2), d.store(rgba + 12, t + 3);
     }
-    DFB_AVX2 DFB_INLINE bool isOpaque() const
-    {
-        const __m256d any = _mm256_or_pd(_mm256_or_pd(a.through, b.through), _mm256_or_pd(c.through, d.through));
-        const __m256i withoutSign = _mm256_set1_epi64x(0x7fffffffffffffff);
-        return _mm256_testz_si256(_mm256_castpd_si256(any), withoutSign) != 0;
-    }
+    DFB_AVX2 DFB_INLINE bool isOpaque() const { return areZero(a.through, b.through, c.through, d.through); }
+    DFB_AVX2 DFB_INLINE bool isEmpty() const { return areZero(a.sum, b.sum, c.sum, d.sum); }
 
 private:
-    // The next row of a tile that is full: streams that jump from layer to layer are not foreseen.
-    DFB_AVX2 DFB_INLINE static void prefetch(const float* color)
+    DFB_AVX2 DFB_INLINE static bool areZero(__m256d a, __m256d b, __m256d c, __m256d d)
     {
-        _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
+        const __m256d any = _mm256_or_pd(_mm256_or_pd(a, b), _mm256_or_pd(c, d));
+        const __m256i withoutSign = _mm256_set1_epi64x(0x7fffffffffffffff);
+        return _mm256_testz_si256(_mm256_castpd_si256(any), withoutSign) != 0;
     }
 };
 
@@ -269,14 +282,19 @@ DFB_AVX2 bool blendGroupAvx2(double* rgba, double* transmittance, int count, con
     const std::ptrdiff_t inBlocks = count - count % 4;
     for (std::ptrdiff_t i = 0; i < inBlocks; i += 4) {
         Avx2Block<HasLeast> block;
+        Avx2Colors colors;
         int k = 0;
-        if (group.isFirst)
-            block.take(group.colors[k++] + 4 * i, group.minTransmittance);
-        else
+        if (group.isFirst) {
+            colors.load(group.colors[k++] + 4 * i);
+            block.take(colors, group.minTransmittance);
+        } else {
             block.load(rgba + 4 * i, transmittance + i);
+        }
         while (k < group.layers && !block.isOpaque())
-            for (const int end = nextLook(k, group.layers); k < end; ++k)
-                block.add(group.colors[k] + 4 * i, group.minTransmittance);
+            for (const int end = nextLook(k, group.layers); k < end; ++k) {
+                colors.load(group.colors[k] + 4 * i);
+                block.add(colors, group.minTransmittance);
+            }
         block.store(rgba + 4 * i, transmittance + i);
         isSeen |= !block.isOpaque();
     }
@@ -290,16 +308,13 @@ DFB_AVX2 void blendFourAvx2(double* rgba, double* transmittance, const float* co
                             const std::uint32_t (*orders)[4], int layers, double minTransmittance)
 {
     Avx2Block<HasLeast> block;
-    block.a.take(colors[orders[0][0]], minTransmittance);
-    block.b.take(colors[orders[0][1]] + 4, minTransmittance);
-    block.c.take(colors[orders[0][2]] + 8, minTransmittance);
-    block.d.take(colors[orders[0][3]] + 12, minTransmittance);
+    Avx2Colors four;
+    four.load(colors, orders[0]);
+    block.take(four, minTransmittance);
     for (int k = 1; k < layers && !block.isOpaque();)
         for (const int end = nextLook(k, layers); k < end; ++k) {
-            block.a.add(colors[orders[k][0]], minTransmittance);
-            block.b.add(colors[orders[k][1]] + 4, minTransmittance);
-            block.c.add(colors[orders[k][2]] + 8, minTransmittance);
-            block.d.add(colors[orders[k][3]] + 12, minTransmittance);
+            four.load(colors, orders[k]);
+            block.add(four, minTransmittance);
         }
     block.store(rgba, transmittance);
 }

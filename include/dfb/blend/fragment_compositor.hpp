@@ -6,12 +6,54 @@
 #include <dfb/fragment.hpp>
 
 #include <algorithm>
+#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <memory>
 #include <vector>
 
 DFB_NAMESPACE_BEGIN
+namespace detail {
+
+#if defined(DFB_HAS_AVX2_CLONES)
+// Reads four pixels of a row in place, each value once, and checks them.
+DFB_AVX2 DFB_INLINE void read(const FullRow& row, std::ptrdiff_t pixel, Avx2Colors& colors, Avx2ColorCheck& check)
+{
+    prefetch(reinterpret_cast<const std::byte*>(row.ahead + 4 * pixel), 64);
+    const __m256 ab = _mm256_loadu_ps(row.color + 4 * pixel), cd = _mm256_loadu_ps(row.color + 4 * pixel + 8);
+    check.add(ab), check.add(cd);
+    colors.a = _mm256_castps256_ps128(ab), colors.b = _mm256_extractf128_ps(ab, 1);
+    colors.c = _mm256_castps256_ps128(cd), colors.d = _mm256_extractf128_ps(cd, 1);
+}
+
+// Blends rows of 4 pixels or more, the front one first, to what blendGroup() makes of them. False if that is not so: a
+// value is not finite, an alpha not within [0, 1], or four neighbours have nothing in any row.
+template <bool HasLeast>
+DFB_AVX2 bool blendFullRowsAvx2(const FullRow* rows, int layers, double minTransmittance, double* rgba,
+                                double* transmittance)
+{
+    const std::ptrdiff_t count = rows->span.count;
+    Avx2ColorCheck check;
+    check.clear();
+    bool hasGap = false;
+    for (std::ptrdiff_t begin = 0; begin < count; begin += 4) {
+        const std::ptrdiff_t i = std::min(begin, count - 4); // some may be blended twice
+        Avx2Colors colors;
+        Avx2Block<HasLeast> block;
+        read(rows[0], i, colors, check);
+        block.take(colors, minTransmittance);
+        for (int k = 1; k < layers; ++k) {
+            read(rows[k], i, colors, check);
+            block.add(colors, minTransmittance);
+        }
+        block.store(rgba + 4 * i, transmittance + i);
+        hasGap |= block.isEmpty();
+    }
+    return !hasGap && check.isGood();
+}
+#endif
+
+} // namespace detail
 
 // How the inputs of a pixel become one.
 enum class BlendRule {
@@ -31,6 +73,7 @@ public:
     {
         rule_ = rule;
         cursors_.clear();
+        triesFullRows_ = true;
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         std::size_t made = 0;
         for (; begin != end; ++begin)
@@ -54,6 +97,9 @@ public:
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
+        if (triesFullRows_ && !wantsAux && compositeFullRow(row))
+            return;
+        triesFullRows_ = false;
         const bool isOneRun = takeRows(wantsAux) && !wantsAux;
         const int width = static_cast<int>(row.transmittance.size());
         if (active_.empty()) {
@@ -164,6 +210,64 @@ private:
         }
         active_.resize(rows);
         return isOneRun;
+    }
+
+    // Composites the next row if all inputs lie in place, cover the same pixels without gaps, and have one order there:
+    // then each colour is read once, and not copied. Else does nothing and returns false.
+    bool compositeFullRow([[maybe_unused]] CompositeRow& row)
+    {
+#if defined(DFB_HAS_AVX2_CLONES)
+        if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
+            return false;
+        std::array<detail::FullRow, detail::BlendGroup::mostLayers> found, rows;
+        if (!findFullRows(found) || !haveOneOrder(found.front().span.count))
+            return false;
+        for (std::size_t k = 0; k < order_.size(); ++k)
+            rows[k] = found[static_cast<std::size_t>(order_[k])];
+        const int x = rows.front().span.x, count = rows.front().span.count;
+        const auto blend =
+            row.minTransmittance > 0 ? detail::blendFullRowsAvx2<true> : detail::blendFullRowsAvx2<false>;
+        if (!blend(rows.data(), static_cast<int>(order_.size()), row.minTransmittance, row.rgba.data() + 4 * x,
+                   row.transmittance.data() + x))
+            return false;
+        clearGap(row, 0, x);
+        clearGap(row, x + count, static_cast<int>(row.transmittance.size()));
+        joinRun(x, count);
+        skipRows(1);
+        return true;
+#else
+        return false;
+#endif
+    }
+
+    // Finds the rows of all inputs, and sets layers_. False if they do not cover the same pixels.
+    bool findFullRows(std::array<detail::FullRow, detail::BlendGroup::mostLayers>& rows)
+    {
+        if (cursors_.size() < 2 || cursors_.size() > rows.size())
+            return false;
+        layers_.resize(cursors_.size());
+        for (std::size_t k = 0; k < cursors_.size(); ++k) {
+            if (!cursors_[k].findFullRow(rows[k]))
+                return false;
+            const Span &span = rows[k].span, &first = rows.front().span;
+            if (span.x != first.x || span.count != first.count || span.count < 4)
+                return false;
+            layers_[k] = {rows[k].color, rows[k].depth, nullptr};
+        }
+        return true;
+    }
+
+    // Sets order_ to the order of layers_. False if that changes within their `count` pixels, or a depth is NaN.
+    bool haveOneOrder(int count)
+    {
+        const bool isTold = rule_ == BlendRule::InOrder
+                            || std::any_of(layers_.begin(), layers_.end(), [](const Layer& l) { return !l.depth; });
+        if (isTold || order_.size() != layers_.size())
+            detail::resetOrder(order_, layers_.size());
+        if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
+            return true;
+        detail::sortAt(0, layers_, order_);
+        return detail::firstOutOfOrder(layers_, order_, 0, count) == count;
     }
 
     // Of the only fragment that has something in this row.
@@ -317,6 +421,7 @@ private:
     }
 
     BlendRule rule_ = BlendRule::SortByDepth;
+    bool triesFullRows_ = false; // until one fails: the rows below are likely to, too
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;

@@ -4,6 +4,7 @@
 #include <dfb/blend/fragment_compositor.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <cstring>
@@ -35,7 +36,8 @@ struct Pixels {
         }
     }
 
-    dfb::Fragment fragment(bool hasDepth) const
+    dfb::Fragment fragment(bool hasDepth, const dfb::Region& valid = {0, 0, width, height},
+                           dfb::detail::FaultCounts* faults = nullptr) const
     {
         dfb::TileHeader header;
         header.region = {0, 0, width, height};
@@ -45,7 +47,8 @@ struct Pixels {
         parts.inPlace.color = reinterpret_cast<const std::byte*>(colors.data());
         parts.inPlace.depth = hasDepth ? depths.data() : nullptr;
         parts.inPlace.stride = width;
-        parts.inPlace.valid = header.region;
+        parts.inPlace.valid = valid;
+        parts.faults = faults;
         return dfb::Fragment(header, dfb::Buffer(), parts);
     }
     bool isActive(std::size_t pixel) const
@@ -60,23 +63,43 @@ struct Folded {
     int layers = 0;
 };
 
-Folded fold(const std::vector<Pixels>& inputs, std::size_t pixel, double minTransmittance)
+// Of inputs front to back.
+Folded fold(const std::vector<const Pixels*>& inputs, std::size_t pixel, double minTransmittance)
 {
     Folded result;
-    for (const Pixels& input : inputs) {
-        if (!input.isActive(pixel))
+    for (const Pixels* input : inputs) {
+        if (!input->isActive(pixel))
             continue;
         ++result.layers;
-        const float* color = &input.colors[4 * pixel];
+        const float* color = &input->colors[4 * pixel];
         for (int c = 0; c < 4; ++c)
             result.rgba[c] += result.transmittance * static_cast<double>(color[c]);
         result.transmittance *= 1.0 - static_cast<double>(color[3]);
-        if (result.transmittance < minTransmittance)
+        if (minTransmittance > 0 && result.transmittance < minTransmittance)
             result.transmittance = 0;
         if (color[3] > 0)
-            result.depth = std::min(result.depth, input.depths[pixel]);
+            result.depth = std::min(result.depth, input->depths[pixel]);
     }
     return result;
+}
+
+std::vector<const Pixels*> inOrder(const std::vector<Pixels>& inputs)
+{
+    std::vector<const Pixels*> all;
+    for (const Pixels& input : inputs)
+        all.push_back(&input);
+    return all;
+}
+
+// By their depth at a pixel, in which NaN counts as farthest.
+std::vector<const Pixels*> sorted(const std::vector<Pixels>& inputs, std::size_t pixel)
+{
+    const auto depthOf = [=](const Pixels* input) {
+        return std::isnan(input->depths[pixel]) ? infinity : input->depths[pixel];
+    };
+    std::vector<const Pixels*> all = inOrder(inputs);
+    std::stable_sort(all.begin(), all.end(), [&](const Pixels* a, const Pixels* b) { return depthOf(a) < depthOf(b); });
+    return all;
 }
 
 } // namespace
@@ -116,7 +139,7 @@ TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in sho
                 std::fill_n(runOf.begin() + run.x, run.count, &run);
             }
             for (std::size_t x = 0; x < width; ++x) {
-                const Folded expected = fold(inputs, y * width + x, least);
+                const Folded expected = fold(inOrder(inputs), y * width + x, least);
                 if (expected.layers > 0)
                     REQUIRE(runOf[x]);
                 if (!runOf[x] && !wantsGaps)
@@ -132,6 +155,88 @@ TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in sho
                     CHECK(row.depth[x] == expected.depth);
             }
         }
+    }
+}
+
+// What may be wrong with a row of inputs that have no gaps.
+enum class Flaw { None, Hole, HoleInOne, NotFinite, AlphaOutside, Crossing, NanDepth };
+
+TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and sorted", "[compositing]")
+{
+    std::mt19937 random(13);
+    for (int round = 0; round < 400; ++round) {
+        const bool isSorted = round % 2 == 1;
+        const auto flaw = static_cast<Flaw>(random() % 7);
+        const double least = round % 7 == 0 && flaw != Flaw::NotFinite ? 0.05 : 0;
+        const int x0 = round % 3 == 0 ? 0 : 5, y0 = round % 5 == 0 ? 2 : 0;
+        const int x1 = round % 13 == 12 ? x0 + 1 + round % 3 : round % 3 == 0 ? width : width - 1 - round % 40;
+        const dfb::Region valid{x0, y0, x1, height};
+        const dfb::Region validOfSecond{x0, y0, round % 11 == 10 ? std::max(x0 + 1, x1 - 1) : x1, height};
+        const std::size_t layers = 2 + random() % 8; // also more than are blended at once
+        std::vector<Pixels> inputs;
+        for (std::size_t k = 0; k < layers; ++k)
+            inputs.emplace_back(random, 1u << 30, false);             // without colours
+        const int flawed = static_cast<int>(random() % (2 * height)); // often none
+        std::uint64_t nonFinite = 0, alphaOutside = 0;
+        for (std::size_t k = 0; k < layers; ++k)
+            for (std::size_t i = 0; i < width * height; ++i) {
+                const int x = static_cast<int>(i) % width, y = static_cast<int>(i) / width;
+                const bool isFlawed = y == flawed;
+                if (k == 1 && !validOfSecond.contains(x, y))
+                    continue;
+                for (std::size_t c = 0; c < 4; ++c)
+                    inputs[k].colors[4 * i + c] = static_cast<float>(1 + random() % 900) / 1000.0f;
+                // The row's order changes with y; equal depths, and 0 beside -0, are there, too.
+                inputs[k].depths[i] = y % 4 == 3 ? (k % 2 ? 0.0f : -0.0f) : static_cast<float>((3 * k + y) % 11 / 2);
+                if (isFlawed && (flaw == Flaw::Hole || (flaw == Flaw::HoleInOne && k == 1)) && x >= 40 && x < 120)
+                    std::fill_n(&inputs[k].colors[4 * i], 4, x % 2 ? 0.0f : -0.0f);
+                if (isFlawed && flaw == Flaw::Crossing && x >= 60)
+                    inputs[k].depths[i] = -inputs[k].depths[i];
+                const bool isHit = isFlawed && x % 50 == 7 && k == 1;
+                if (isHit && flaw == Flaw::NotFinite)
+                    inputs[k].colors[4 * i + random() % 3] = random() % 2 ? infinity : -infinity, ++nonFinite;
+                if (isHit && flaw == Flaw::AlphaOutside)
+                    inputs[k].colors[4 * i + 3] = random() % 2 ? 1.25f : -0.25f, ++alphaOutside;
+                if (isHit && flaw == Flaw::NanDepth && isSorted)
+                    inputs[k].depths[i] = std::numeric_limits<float>::quiet_NaN(), ++nonFinite;
+            }
+        std::vector<Pixels> given = inputs;
+        for (int i = 0; i < width * height; ++i)
+            if (!validOfSecond.contains(i % width, i / width)) // not to be read
+                std::fill_n(&given[1].colors[4 * static_cast<std::size_t>(i)], 4, 0.5f);
+        dfb::detail::FaultCounts faults;
+        std::vector<dfb::Fragment> fragments;
+        std::vector<const dfb::Fragment*> pointers;
+        for (std::size_t k = 0; k < layers; ++k)
+            fragments.push_back(given[k].fragment(isSorted, k == 1 ? validOfSecond : valid, &faults));
+        for (const dfb::Fragment& fragment : fragments)
+            pointers.push_back(&fragment);
+        dfb::FragmentCompositor compositor;
+        compositor.start(isSorted ? dfb::BlendRule::SortByDepth : dfb::BlendRule::InOrder, pointers.begin(),
+                         pointers.end());
+        dfb::CompositeRow row;
+        row.wantsDepth = row.wantsGaps = false;
+        row.minTransmittance = least;
+        row.resize(width);
+        for (int y = 0; y < height; ++y) {
+            compositor.nextRow(row);
+            std::vector<bool> isInRun(width);
+            for (const auto& run : compositor.runs())
+                std::fill_n(isInRun.begin() + run.x, run.count, true);
+            for (int x = 0; x < width; ++x) {
+                const std::size_t pixel = static_cast<std::size_t>(y * width + x);
+                const bool isHole = y == flawed && flaw == Flaw::Hole && x >= 40 && x < 120;
+                const bool isThere = valid.contains(x, y) && !isHole;
+                CHECK(isInRun[static_cast<std::size_t>(x)] == isThere);
+                if (!isThere)
+                    continue;
+                const Folded expected = fold(isSorted ? sorted(inputs, pixel) : inOrder(inputs), pixel, least);
+                CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * static_cast<std::size_t>(x)]));
+                CHECK(expected.transmittance == row.transmittance[static_cast<std::size_t>(x)]);
+            }
+        }
+        CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
+        CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
     }
 }
 
