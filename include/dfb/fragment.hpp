@@ -186,12 +186,10 @@ public:
             return findRow(row, result);
         }
         const detail::PixelsInPlace& pixels = parts_->inPlace;
-        if (row < pixels.valid.y0 || row >= pixels.valid.y1)
+        detail::RowPlace first, ahead;
+        if (!findPlaces(row, result.valid, first, ahead))
             return false;
-        const detail::RowPlace first = pixels.at(pixels.valid.x0, row);
-        const int width = pixels.valid.width();
-        pixels.at(pixels.valid.x0, detail::rowAhead(row, pixels.valid.y1, width)).prefetchAll(width, 4);
-        result.valid = {static_cast<std::uint16_t>(pixels.valid.x0), static_cast<std::uint16_t>(width)};
+        ahead.prefetchAll(result.valid.count, 4);
         result.spans = &result.valid;
         result.spanCount = 1;
         result.bytes = first.color;
@@ -210,15 +208,12 @@ public:
     // Finds the next row, and does not go there: skip(1) does. False if it has gaps for certain, or must be converted.
     bool findFullRow(detail::FullRow& row) const
     {
-        const detail::PixelsInPlace& pixels = parts_->inPlace;
-        if (!isInPlace() || !pixels.activity.byColorAlone() || row_ < pixels.valid.y0 || row_ >= pixels.valid.y1)
+        detail::RowPlace first, ahead;
+        if (!isInPlace() || !parts_->inPlace.activity.byColorAlone() || !findPlaces(row_, row.span, first, ahead))
             return false;
-        const int x = pixels.valid.x0, width = pixels.valid.width();
-        const detail::RowPlace first = pixels.at(x, row_);
-        row.span = {static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(width)};
         row.color = detail::floatsOf(first.color);
         row.depth = first.depth;
-        row.ahead = detail::floatsOf(pixels.at(x, detail::rowAhead(row_, pixels.valid.y1, width)).color);
+        row.ahead = detail::floatsOf(ahead.color);
         return true;
     }
 
@@ -251,6 +246,20 @@ private:
         for (int i = 0; i < row.spanCount; ++i)
             pixels += row.spans[i].count;
         return pixels;
+    }
+
+    // Of pixels in place: which of a row there are, where the first lies, and where that of the row to load meanwhile
+    // does. False if there are none.
+    bool findPlaces(int row, Span& span, detail::RowPlace& first, detail::RowPlace& ahead) const
+    {
+        const detail::PixelsInPlace& pixels = parts_->inPlace;
+        const Region& valid = pixels.valid;
+        if (row < valid.y0 || row >= valid.y1)
+            return false;
+        span = {static_cast<std::uint16_t>(valid.x0), static_cast<std::uint16_t>(valid.width())};
+        first = pixels.at(valid.x0, row);
+        ahead = pixels.at(valid.x0, detail::rowAhead(row, valid.y1, valid.width()));
+        return true;
     }
 
     // All but the colour, of pixels that are not in place.

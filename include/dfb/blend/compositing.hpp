@@ -349,6 +349,12 @@ inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vec
         order[k] = static_cast<int>(orders[k][3]);
 }
 
+// Whether all layers have a depth, so that they can be sorted.
+inline bool haveDepths(const std::vector<Layer>& layers)
+{
+    return std::all_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth != nullptr; });
+}
+
 // Layers 0, 1, 2 and so on.
 inline void resetOrder(std::vector<int>& order, std::size_t count)
 {
@@ -372,8 +378,7 @@ inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<
 // with that order, and the better that is, the sooner it is done.
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
-    if (layers.size() == 1
-        || std::any_of(layers.begin(), layers.end(), [](const Layer& l) { return l.depth == nullptr; })) {
+    if (layers.size() == 1 || !detail::haveDepths(layers)) {
         blendInOrder(row, x, count, layers, order);
         return;
     }

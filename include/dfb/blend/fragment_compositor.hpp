@@ -260,8 +260,7 @@ private:
     // Sets order_ to the order of layers_. False if that changes within their `count` pixels, or a depth is NaN.
     bool haveOneOrder(int count)
     {
-        const bool isTold = rule_ == BlendRule::InOrder
-                            || std::any_of(layers_.begin(), layers_.end(), [](const Layer& l) { return !l.depth; });
+        const bool isTold = rule_ == BlendRule::InOrder || !detail::haveDepths(layers_);
         if (isTold || order_.size() != layers_.size())
             detail::resetOrder(order_, layers_.size());
         if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
