@@ -13,6 +13,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <future>
 #include <memory>
 #include <mutex>
 #include <optional>
@@ -58,11 +59,11 @@ enum class Defect {
 
 std::atomic<bool> testIsOver{false};
 
-// The handlers of the transports on each of the two ranks, in the order of their start.
+// The handlers of the transports on each of the two ranks of a run, in the order of their start.
 struct Started {
     std::mutex mutex;
     std::array<std::vector<TransportHandler*>, 2> handlers;
-} started;
+};
 
 // One type for all, as each takes a while to compile with the suite.
 class Broken : private TransportHandler {
@@ -71,10 +72,12 @@ public:
     struct Communicator {
         Base::Communicator communicator;
         Defect defect;
+        std::shared_ptr<Started> started; // also for calls that end after the run
     };
 
     Broken(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
-        : defect_(communicator.defect), pool_(pool), base_(communicator.communicator, std::move(pool), progress)
+        : defect_(communicator.defect), started_(communicator.started), pool_(pool),
+          base_(communicator.communicator, std::move(pool), progress)
     {
     }
     ~Broken()
@@ -98,8 +101,8 @@ public:
     {
         handler_ = &handler;
         {
-            const std::lock_guard<std::mutex> lock(started.mutex);
-            started.handlers[own()].push_back(handler_);
+            const std::lock_guard<std::mutex> lock(started_->mutex);
+            started_->handlers[own()].push_back(handler_);
         }
         starting_ = true;
         base_.start(*this);
@@ -144,8 +147,8 @@ public:
             std::this_thread::sleep_for(timeLimit / 2);
         base_.stop(orderly && !has(Defect::ForgetsWhatItHoldsInStop));
         {
-            const std::lock_guard<std::mutex> lock(started.mutex);
-            auto& handlers = started.handlers[own()];
+            const std::lock_guard<std::mutex> lock(started_->mutex);
+            auto& handlers = started_->handlers[own()];
             handlers.erase(std::find(handlers.begin(), handlers.end(), handler_));
         }
         if (has(Defect::CallsAfterStop))
@@ -177,8 +180,8 @@ private:
             handler_->receive(source, std::move(copy));
         }
         if (has(Defect::MixesTransports) && number % 10 == 0 && message.size() >= 64) {
-            const std::lock_guard<std::mutex> lock(started.mutex);
-            started.handlers[own()].back()->receive(source, std::move(message));
+            const std::lock_guard<std::mutex> lock(started_->mutex);
+            started_->handlers[own()].back()->receive(source, std::move(message));
         } else {
             inHandler() = true;
             handler_->receive(source, std::move(message));
@@ -189,6 +192,7 @@ private:
     bool failed() const override { return handler_->failed(); }
 
     Defect defect_;
+    std::shared_ptr<Started> started_;
     std::shared_ptr<MemoryPool> pool_;
     Base base_;
     NapSignal signal_;
@@ -202,20 +206,29 @@ private:
 // holds them back at the receiver.
 enum class Over { Plain, Late, Shuffled };
 
-std::string failuresOf(Defect defect, Over over = Over::Plain, Progress mode = Progress::Caller)
+struct Case {
+    Defect defect;
+    // What must be found: a line that begins with `name` and has `what` in it.
+    std::string name, what;
+    Over over = Over::Plain;
+    Progress mode = Progress::Caller;
+};
+
+std::string failuresOf(const Case& c)
 {
+    const auto started = std::make_shared<Started>();
     ConformanceOptions options;
     options.timeLimit = timeLimit;
     options.largestMessage = std::size_t{1} << 16;
     options.smallMessages = 400;
-    options.modes = {mode};
+    options.modes = {c.mode};
     testing::FaultOptions faults;
-    faults.delay = over == Over::Late ? 1 : 0;
+    faults.delay = c.over == Over::Late ? 1 : 0;
     std::mutex mutex;
     std::string text;
-    const auto seed = over == Over::Shuffled ? std::optional<std::uint64_t>(1) : std::nullopt;
+    const auto seed = c.over == Over::Shuffled ? std::optional<std::uint64_t>(1) : std::nullopt;
     runRanks(2, [&](const InprocCommunicator& communicator) {
-        const Broken::Communicator broken{{{communicator, seed}, faults}, defect};
+        const Broken::Communicator broken{{{communicator, seed}, faults}, c.defect, started};
         const std::string own = testing::describeFailures(testing::checkTransport<Broken>(broken, options));
         const std::lock_guard<std::mutex> lock(mutex);
         text += own;
@@ -235,63 +248,71 @@ bool finds(const std::string& text, const std::string& name, const std::string& 
     return false;
 }
 
-} // namespace
+// All at the same time, as they mostly wait.
+void checkFound(const std::vector<Case>& cases)
+{
+    std::vector<std::future<std::string>> runs;
+    for (const Case& c : cases)
+        runs.push_back(std::async(std::launch::async, [&c] { return failuresOf(c); }));
+    for (std::size_t i = 0; i < cases.size(); ++i) {
+        const std::string text = runs[i].get();
+        INFO(cases[i].what << " is to be found in\n" << text);
+        CHECK(finds(text, cases[i].name, cases[i].what));
+    }
+}
 
-#define CHECK_FINDS(text_, name, what)  \
-    do {                                \
-        const std::string text = text_; \
-        INFO(text);                     \
-        CHECK(finds(text, name, what)); \
-    } while (false)
+} // namespace
 
 TEST_CASE("Messages that are lost, added or changed are found")
 {
-    CHECK_FINDS(failuresOf(Defect::LosesSome), "", "no message from rank ");
-    CHECK_FINDS(failuresOf(Defect::LosesEmptyMessages), "messages of all sizes", "of 0 bytes is missing");
-    CHECK_FINDS(failuresOf(Defect::LosesTheEndOfLargeMessages), "messages of all sizes",
-                "20000 of its 65536 bytes came");
-    CHECK_FINDS(failuresOf(Defect::DeliversTwice), "many small messages", "came twice");
-    CHECK_FINDS(failuresOf(Defect::NamesTheWrongSource), "messages of all sizes", "there can be none from there");
-    CHECK_FINDS(failuresOf(Defect::LosesWhatComesBeforeStart), "messages before start()", "no message from rank ");
-    CHECK_FINDS(failuresOf(Defect::MixesTransports), "", "belongs to another transport");
-    CHECK_FINDS(failuresOf(Defect::ClaimsToNeedNoPolls, Over::Shuffled), "", "nothing heard from rank ");
-    CHECK_FINDS(failuresOf(Defect::ForgetsWhatItHoldsInStop, Over::Late), "stop(true) loses nothing",
-                "no message from rank ");
+    checkFound({
+        {Defect::LosesSome, "", "no message from rank "},
+        {Defect::LosesEmptyMessages, "messages of all sizes", "of 0 bytes is missing"},
+        {Defect::LosesTheEndOfLargeMessages, "messages of all sizes", "20000 of its 65536 bytes came"},
+        {Defect::DeliversTwice, "many small messages", "came twice"},
+        {Defect::NamesTheWrongSource, "messages of all sizes", "there can be none from there"},
+        {Defect::LosesWhatComesBeforeStart, "messages before start()", "no message from rank "},
+        {Defect::MixesTransports, "", "belongs to another transport"},
+        {Defect::ClaimsToNeedNoPolls, "", "nothing heard from rank ", Over::Shuffled},
+        {Defect::ForgetsWhatItHoldsInStop, "stop(true) loses nothing", "no message from rank ", Over::Late},
+    });
 }
 
 TEST_CASE("Calls that do not return, and those that come too late, are found")
 {
     testIsOver = false;
-    CHECK_FINDS(failuresOf(Defect::BlocksInSend), "", "has not ended: a call of the transport does not return");
-    CHECK_FINDS(failuresOf(Defect::BlocksInInterrupt), "", "has not ended: a call of the transport does not return");
+    checkFound({
+        {Defect::BlocksInSend, "", "has not ended: a call of the transport does not return"},
+        {Defect::BlocksInInterrupt, "", "has not ended: a call of the transport does not return"},
+        {Defect::WaitsInAbandon, "stop(false) waits for nobody", "it took "},
+        {Defect::CallsAfterStop, "", "the handler was called after stop()"},
+    });
     testIsOver = true;
-    CHECK_FINDS(failuresOf(Defect::WaitsInAbandon), "stop(false) waits for nobody", "it took ");
-    CHECK_FINDS(failuresOf(Defect::CallsAfterStop), "", "the handler was called after stop()");
 }
 
 TEST_CASE("Naps that are too long or too short are found")
 {
-    const char* const limits = "nap() ends by its limit and by interrupt()";
-    CHECK_FINDS(failuresOf(Defect::Oversleeps), limits, "nap(10 ms) took ");
-    CHECK_FINDS(failuresOf(Defect::HardlySleeps), limits, "it hardly sleeps");
-    CHECK_FINDS(failuresOf(Defect::IsNotInterrupted), limits, ", interrupted after ");
-    CHECK_FINDS(failuresOf(Defect::ForgetsAnEarlyInterrupt), limits, " just after interrupt() took ");
-    CHECK_FINDS(failuresOf(Defect::SleepsOverSendsAndArrivals, Over::Late, Progress::Thread), "send() ends the nap",
-                "messages sent during a nap of ");
-    CHECK_FINDS(failuresOf(Defect::SleepsOverSendsAndArrivals, Over::Shuffled, Progress::Thread),
-                "arrival ends the nap", "nap() is said to end on arrival");
+    const std::string limits = "nap() ends by its limit and by interrupt()";
+    checkFound({
+        {Defect::Oversleeps, limits, "nap(10 ms) took "},
+        {Defect::HardlySleeps, limits, "it hardly sleeps"},
+        {Defect::IsNotInterrupted, limits, ", interrupted after "},
+        {Defect::ForgetsAnEarlyInterrupt, limits, " just after interrupt() took "},
+        {Defect::SleepsOverSendsAndArrivals, "send() ends the nap", "messages sent during a nap of ", Over::Late,
+         Progress::Thread},
+        {Defect::SleepsOverSendsAndArrivals, "arrival ends the nap", "nap() is said to end on arrival", Over::Shuffled,
+         Progress::Thread},
+    });
 }
 
 TEST_CASE("Wrong answers are found")
 {
-    CHECK_FINDS(failuresOf(Defect::HasAnotherRankEachTime), "ranks and sizes",
-                "in another transport on this communicator");
-    CHECK_FINDS(failuresOf(Defect::AlwaysSaysThatItMoved, Over::Shuffled), "poll() and quiet() come to rest",
-                "poll() returned true");
-    CHECK_FINDS(failuresOf(Defect::LiesAboutQuiet, Over::Late), "what was sent needs no polls after quiet()",
-                "no message from rank ");
-    CHECK_FINDS(failuresOf(Defect::IsNeverQuiet), "what was sent needs no polls after quiet()",
-                "quiet() has not come true");
+    checkFound({
+        {Defect::HasAnotherRankEachTime, "ranks and sizes", "in another transport on this communicator"},
+        {Defect::AlwaysSaysThatItMoved, "poll() and quiet() come to rest", "poll() returned true", Over::Shuffled},
+        {Defect::LiesAboutQuiet, "what was sent needs no polls after quiet()", "no message from rank ", Over::Late},
+        {Defect::IsNeverQuiet, "what was sent needs no polls after quiet()", "quiet() has not come true"},
+    });
 }
 
 } // namespace broken_cases
