@@ -156,6 +156,7 @@ private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
     static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
+    static constexpr std::size_t mostFullRows = 32;
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
@@ -219,7 +220,7 @@ private:
 #if defined(DFB_HAS_AVX2_CLONES)
         if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
             return false;
-        std::array<detail::FullRow, detail::BlendGroup::mostLayers> found, rows;
+        std::array<detail::FullRow, mostFullRows> found, rows;
         if (!findFullRows(found) || !haveOneOrder(found.front().span.count))
             return false;
         for (std::size_t k = 0; k < order_.size(); ++k)
@@ -241,7 +242,7 @@ private:
     }
 
     // Finds the rows of all inputs, and sets layers_. False if they do not cover the same pixels.
-    bool findFullRows(std::array<detail::FullRow, detail::BlendGroup::mostLayers>& rows)
+    bool findFullRows(std::array<detail::FullRow, mostFullRows>& rows)
     {
         if (cursors_.size() < 2 || cursors_.size() > rows.size())
             return false;

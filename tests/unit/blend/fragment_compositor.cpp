@@ -172,7 +172,7 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
         const int x1 = round % 13 == 12 ? x0 + 1 + round % 3 : round % 3 == 0 ? width : width - 1 - round % 40;
         const dfb::Region valid{x0, y0, x1, height};
         const dfb::Region validOfSecond{x0, y0, round % 11 == 10 ? std::max(x0 + 1, x1 - 1) : x1, height};
-        const std::size_t layers = 2 + random() % 8; // also more than are blended at once
+        const std::size_t layers = 2 + random() % (round % 20 == 0 ? 36 : 12); // also more than are blended at once
         std::vector<Pixels> inputs;
         for (std::size_t k = 0; k < layers; ++k)
             inputs.emplace_back(random, 1u << 30, false);             // without colours
