@@ -156,7 +156,7 @@ private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
     static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
-    static constexpr std::size_t mostFullRows = 32;
+    static constexpr std::size_t mostFullRows = 32; // inputs, in compositeFullRow()
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
