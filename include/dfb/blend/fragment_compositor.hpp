@@ -156,7 +156,7 @@ private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
     static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
-    static constexpr std::size_t mostFullRows = 32; // inputs, in compositeFullRow()
+    static constexpr std::size_t mostFullRows = 32;
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
@@ -220,15 +220,14 @@ private:
 #if defined(DFB_HAS_AVX2_CLONES)
         if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
             return false;
-        std::array<detail::FullRow, mostFullRows> found, rows;
-        if (!findFullRows(found) || !haveOneOrder(found.front().span.count))
+        if (!findFullRows() || !haveOneOrder(fullRows_.front().span.count))
             return false;
         for (std::size_t k = 0; k < order_.size(); ++k)
-            rows[k] = found[static_cast<std::size_t>(order_[k])];
-        const int x = rows.front().span.x, count = rows.front().span.count;
+            ordered_[k] = fullRows_[static_cast<std::size_t>(order_[k])];
+        const int x = ordered_.front().span.x, count = ordered_.front().span.count;
         const auto blend =
             row.minTransmittance > 0 ? detail::blendFullRowsAvx2<true> : detail::blendFullRowsAvx2<false>;
-        if (!blend(rows.data(), static_cast<int>(order_.size()), row.minTransmittance, row.rgba.data() + 4 * x,
+        if (!blend(ordered_.data(), static_cast<int>(order_.size()), row.minTransmittance, row.rgba.data() + 4 * x,
                    row.transmittance.data() + x))
             return false;
         clearGap(row, 0, x);
@@ -241,19 +240,19 @@ private:
 #endif
     }
 
-    // Finds the rows of all inputs, and sets layers_. False if they do not cover the same pixels.
-    bool findFullRows(std::array<detail::FullRow, mostFullRows>& rows)
+    // Sets fullRows_, of all inputs, and layers_. False if they do not cover the same pixels.
+    bool findFullRows()
     {
-        if (cursors_.size() < 2 || cursors_.size() > rows.size())
+        if (cursors_.size() < 2 || cursors_.size() > fullRows_.size())
             return false;
         layers_.resize(cursors_.size());
         for (std::size_t k = 0; k < cursors_.size(); ++k) {
-            if (!cursors_[k].findFullRow(rows[k]))
+            if (!cursors_[k].findFullRow(fullRows_[k]))
                 return false;
-            const Span &span = rows[k].span, &first = rows.front().span;
+            const Span &span = fullRows_[k].span, &first = fullRows_.front().span;
             if (span.x != first.x || span.count != first.count || span.count < 4)
                 return false;
-            layers_[k] = {rows[k].color, rows[k].depth, nullptr};
+            layers_[k] = {fullRows_[k].color, fullRows_[k].depth, nullptr};
         }
         return true;
     }
@@ -421,6 +420,8 @@ private:
     }
 
     BlendRule rule_ = BlendRule::SortByDepth;
+    std::array<detail::FullRow, mostFullRows> fullRows_,
+        ordered_;                // of inputs; and in their order. Not cleared for a row
     bool triesFullRows_ = false; // until one fails: the rows below are likely to, too
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
