@@ -20,10 +20,14 @@ if(REACTION STREQUAL "abort")
   if(code STREQUAL "0")
     message(SEND_ERROR "the job ended with code 0")
   endif()
-  # The first rank that notices ends the job for all. It may name another than the victim, for the reason below; that
-  # each rank names the right one is seen where the reaction is a handler.
-  if(NOT err MATCHES "dfb: transport failure: rank [0-9]+: this rank is lost")
-    message(SEND_ERROR "standard error does not say that a rank is lost")
+  # The first rank that notices ends the job for all. In a frame it may name another than the victim, for the reason
+  # below; that each rank names the right one is seen where the reaction is a handler.
+  set(named ${VICTIM})
+  if(WHERE STREQUAL "frame")
+    set(named "[0-9]+")
+  endif()
+  if(NOT err MATCHES "dfb: transport failure: rank ${named}: this rank is lost")
+    message(SEND_ERROR "standard error does not say that rank ${named} is lost")
   endif()
   if(out MATCHES "mpi_dead: ")
     message(SEND_ERROR "a rank went on")
