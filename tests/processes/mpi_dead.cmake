@@ -38,11 +38,18 @@ else()
     if(rank EQUAL VICTIM AND NOT BACK)
       continue()
     endif()
-    # A rank that ends while it sends may leave a place in the queue of MPI's shared memory that it never fills. Its
-    # receiver then gets nothing of others either, and may name one of those. With a handler it was seen only there.
+    # A rank that ends or is stopped while it sends may leave a place in the queue of MPI's shared memory that it never
+    # fills. Its receiver then gets nothing of others either, and may name one of those. That is one rank at most.
     set(named ${VICTIM})
-    if(WHERE STREQUAL "shared" AND "${out}" MATCHES "mpi_dead: rank ${rank} told of rank ([0-9]+) ")
-      set(named ${CMAKE_MATCH_1})
+    if(WHERE MATCHES "^(pixels|shared)$" AND NOT NETWORK
+        AND "${out}" MATCHES "mpi_dead: rank ${rank} told of rank ([0-9]+) [^\n]* Rank ([0-9]+) has heard nothing"
+        AND NOT CMAKE_MATCH_1 EQUAL VICTIM AND NOT CMAKE_MATCH_2 EQUAL VICTIM)
+      if(NOT DEFINED deaf)
+        set(deaf ${CMAKE_MATCH_2})
+      endif()
+      if(CMAKE_MATCH_2 EQUAL deaf)
+        set(named ${CMAKE_MATCH_1})
+      endif()
     endif()
     set(pattern "told of rank ${named} after ([0-9]+) ms, gone after ([0-9]+) ms: dfb: transport failure: rank ${named}: this rank is lost")
     if(NETWORK)
