@@ -280,8 +280,7 @@ private:
         text += " --size " + std::to_string(settings_.width) + 'x' + std::to_string(settings_.height);
         if (samples > 1)
             text += " --spp " + std::to_string(samples);
-        if (settings_.aoRays > 0)
-            text += " --ao " + std::to_string(settings_.aoRays);
+        text += " --ao " + std::to_string(settings_.aoRays); // also 0, which is no default for files
         return text + " --background " + number(params_.background[0]) + ',' + number(params_.background[1]) + ','
                + number(params_.background[2]);
     }
