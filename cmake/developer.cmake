@@ -4,11 +4,17 @@
 # dfb_developer_headers  these, and the library as headers alone
 option(DFB_DEVELOP_HEADER_ONLY "Compile dfb's own tests and programs without dfb::compiled" OFF)
 
+# GCC would spend 10 to 30 % of its time on saving memory. Without that a file of ours takes up to 1.5 GB, not 1.2.
+set(DFB_QUICK_COMPILE "")
+if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
+  set(DFB_QUICK_COMPILE --param=ggc-min-heapsize=1000000) # in kB: what it may use before it looks for garbage
+endif()
+
 add_library(dfb_developer_flags INTERFACE)
 target_link_libraries(dfb_developer_flags INTERFACE dfb::strict_fp)
 if(NOT MSVC)
   target_compile_options(dfb_developer_flags INTERFACE
-    -Wall -Wextra -Wpedantic -Wshadow -Woverloaded-virtual
+    ${DFB_QUICK_COMPILE} -Wall -Wextra -Wpedantic -Wshadow -Woverloaded-virtual
     $<$<BOOL:${DFB_WARNINGS_AS_ERRORS}>:-Werror>)
 endif()
 target_link_libraries(dfb_compiled PRIVATE dfb_developer_flags)

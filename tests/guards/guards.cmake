@@ -10,7 +10,7 @@ if(CMAKE_CXX_COMPILER_ID STREQUAL "GNU")
 else()
   set(_terse -fno-caret-diagnostics)
 endif()
-set(_compile ${CMAKE_CXX_COMPILER} -std=c++17 -fsyntax-only ${_terse})
+set(_compile ${CMAKE_CXX_COMPILER} -std=c++17 -fsyntax-only ${DFB_QUICK_COMPILE} ${_terse})
 set(_include ${PROJECT_SOURCE_DIR}/include)
 set(_testing_include ${PROJECT_SOURCE_DIR}/tests/include)
 

@@ -31,7 +31,7 @@ function(dfb_add_package_test name)
   list(TRANSFORM A_WITHOUT REPLACE "(.+)" "-DCMAKE_DISABLE_FIND_PACKAGE_\\1=ON")
   set(arguments -DHOW=${A_HOW} -DVERSION=${A_VERSION} -DCOMPONENTS=${components} -DEXPECT=${expect}
     -DCMAKE_CXX_COMPILER=${CMAKE_CXX_COMPILER} -DCMAKE_CXX_COMPILER_LAUNCHER=${CMAKE_CXX_COMPILER_LAUNCHER}
-    ${A_WITHOUT} ${A_OPTIONS})
+    -DCMAKE_CXX_FLAGS=${DFB_QUICK_COMPILE} ${A_WITHOUT} ${A_OPTIONS})
   if(A_HOW STREQUAL "find_package")
     list(APPEND arguments -Ddfb_ROOT=${CMAKE_CURRENT_BINARY_DIR}/${A_STAGE})
   elseif(A_HOW STREQUAL "add_subdirectory")
