@@ -125,12 +125,13 @@ struct ByteRow : FragmentRow {
 
 namespace detail {
 
-// A row of pixels in place that are probably all active. Others may still change them.
-struct FullRow {
+// A row of pixels in place, active where they have a colour. Others may still change them.
+struct RowInPlace {
     Span span;
     const float* color = nullptr;
     const float* depth = nullptr; // null: not wanted
-    const float* ahead = nullptr; // colours to load into the cache meanwhile, for a later row
+    // Of a later row, to load into the cache meanwhile.
+    const float *colorAhead = nullptr, *depthAhead = nullptr;
 };
 
 } // namespace detail
@@ -205,15 +206,16 @@ public:
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
 
-    // Finds the next row, and does not go there: skip(1) does. False if it has gaps for certain, or must be converted.
-    bool findFullRow(detail::FullRow& row) const
+    // Finds the next row, and does not go there: skip(1) does. False if it has no pixels, or must be converted.
+    bool findInPlace(detail::RowInPlace& row) const
     {
         detail::RowPlace first, ahead;
         if (!isInPlace() || !parts_->inPlace.activity.byColorAlone() || !findPlaces(row_, row.span, first, ahead))
             return false;
         row.color = detail::floatsOf(first.color);
         row.depth = first.depth;
-        row.ahead = detail::floatsOf(ahead.color);
+        row.colorAhead = detail::floatsOf(ahead.color);
+        row.depthAhead = ahead.depth;
         return true;
     }
 

@@ -197,6 +197,11 @@ struct Avx2Pixel {
         through = _mm256_sub_pd(_mm256_set1_pd(1.0), _mm256_permute4x64_pd(v, 0xff));
         close(minTransmittance);
     }
+    DFB_AVX2 DFB_INLINE void clear()
+    {
+        sum = _mm256_setzero_pd();
+        through = _mm256_set1_pd(1.0);
+    }
     DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* transmittance)
     {
         sum = _mm256_loadu_pd(rgba);
@@ -230,6 +235,10 @@ struct Avx2Colors {
     DFB_AVX2 DFB_INLINE void load(const float* color)
     {
         _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
+        take(color);
+    }
+    DFB_AVX2 DFB_INLINE void take(const float* color)
+    {
         a = _mm_loadu_ps(color), b = _mm_loadu_ps(color + 4), c = _mm_loadu_ps(color + 8), d = _mm_loadu_ps(color + 12);
     }
     // Each of its own layer, of which `colors` are those of the first pixel.
@@ -255,6 +264,7 @@ struct Avx2Block {
         a.add(v.a, minTransmittance), b.add(v.b, minTransmittance);
         c.add(v.c, minTransmittance), d.add(v.d, minTransmittance);
     }
+    DFB_AVX2 DFB_INLINE void clear() { a.clear(), b.clear(), c.clear(), d.clear(); }
     DFB_AVX2 DFB_INLINE void load(const double* rgba, const double* t)
     {
         a.load(rgba, t), b.load(rgba + 4, t + 1), c.load(rgba + 8, t + 2), d.load(rgba + 12, t + 3);

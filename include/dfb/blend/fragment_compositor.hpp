@@ -15,21 +15,25 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
+inline constexpr int mostInPlace = 32; // of so many inputs rows in place are blended without copying
+
 #if defined(DFB_HAS_AVX2_CLONES)
-// Reads four pixels of a row in place, each value once, and checks them.
-DFB_AVX2 DFB_INLINE void read(const FullRow& row, std::ptrdiff_t pixel, Avx2Colors& colors, Avx2ColorCheck& check)
+// Reads four pixels of a row in place, each value once, and checks them. False if all are 0.
+DFB_AVX2 DFB_INLINE bool read(const RowInPlace& row, std::ptrdiff_t pixel, Avx2Colors& colors, Avx2ColorCheck& check)
 {
-    prefetch(reinterpret_cast<const std::byte*>(row.ahead + 4 * pixel), 64);
+    prefetch(reinterpret_cast<const std::byte*>(row.colorAhead + 4 * pixel), 64);
     const __m256 ab = _mm256_loadu_ps(row.color + 4 * pixel), cd = _mm256_loadu_ps(row.color + 4 * pixel + 8);
     check.add(ab), check.add(cd);
     colors.a = _mm256_castps256_ps128(ab), colors.b = _mm256_extractf128_ps(ab, 1);
     colors.c = _mm256_castps256_ps128(cd), colors.d = _mm256_extractf128_ps(cd, 1);
+    const __m256i withoutSign = _mm256_set1_epi32(0x7fffffff);
+    return _mm256_testz_si256(_mm256_castps_si256(_mm256_or_ps(ab, cd)), withoutSign) == 0;
 }
 
 // Blends rows of 4 pixels or more, the front one first, to what blendGroup() makes of them. False if that is not so: a
 // value is not finite, an alpha not within [0, 1], or four neighbours have nothing in any row.
 template <bool HasLeast>
-DFB_AVX2 bool blendFullRowsAvx2(const FullRow* rows, int layers, double minTransmittance, double* rgba,
+DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
                                 double* transmittance)
 {
     const std::ptrdiff_t count = rows->span.count;
@@ -50,6 +54,86 @@ DFB_AVX2 bool blendFullRowsAvx2(const FullRow* rows, int layers, double minTrans
         hasGap |= block.isEmpty();
     }
     return !hasGap && check.isGood();
+}
+
+// Four pixels of the rows that have anything there, to be sorted.
+struct SparseFour {
+    alignas(16) float colors[mostInPlace][16];
+    alignas(16) float depths[mostInPlace][4];
+    int layers = 0;
+
+    DFB_AVX2 DFB_INLINE void add(const Avx2Colors& four, __m128 depth)
+    {
+        float* const to = colors[layers];
+        _mm_store_ps(to, four.a), _mm_store_ps(to + 4, four.b);
+        _mm_store_ps(to + 8, four.c), _mm_store_ps(to + 12, four.d);
+        _mm_store_ps(depths[layers++], depth);
+    }
+    // Whether each pixel of a layer is before that of the next.
+    DFB_AVX2 DFB_INLINE bool areSorted() const
+    {
+        __m128 wrong = _mm_setzero_ps();
+        for (int k = 0; k + 1 < layers; ++k)
+            wrong = _mm_or_ps(wrong, _mm_cmpnle_ps(_mm_load_ps(depths[k]), _mm_load_ps(depths[k + 1])));
+        return _mm_movemask_ps(wrong) == 0;
+    }
+    template <bool HasLeast>
+    DFB_AVX2 void blendSorted(double* rgba, double* transmittance, double minTransmittance) const
+    {
+        const float *colorsOf[mostInPlace], *depthsOf[mostInPlace];
+        for (int k = 0; k < layers; ++k)
+            colorsOf[k] = colors[k], depthsOf[k] = depths[k];
+        FourOrders orders;
+        sortFourAvx2(depthsOf, SortNetwork::of(layers), orders);
+        blendFourAvx2<HasLeast>(rgba, transmittance, colorsOf, orders, layers, minTransmittance);
+    }
+};
+
+// Does so for pixels [begin, begin + 256) of rows that may have gaps, and returns a bit for each four that have
+// anything in any row. With Sorts pixels are sorted by (depth, row). Sets `isGood` to false where a value is not
+// finite, an alpha not within [0, 1], or a depth that counts is NaN.
+template <bool HasLeast, bool Sorts>
+DFB_AVX2 std::uint64_t blendSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
+                                           double* rgba, double* transmittance, bool& isGood)
+{
+    const std::ptrdiff_t width = rows->span.count, end = std::min<std::ptrdiff_t>(begin + 256, width);
+    Avx2ColorCheck check;
+    check.clear();
+    __m128 nan = _mm_setzero_ps();
+    std::uint64_t active = 0, bit = 1;
+    SparseFour some;
+    for (std::ptrdiff_t four = begin; four < end; four += 4, bit <<= 1) {
+        const std::ptrdiff_t i = std::min(four, width - 4);
+        Avx2Block<HasLeast> block;
+        block.clear();
+        some.layers = 0;
+        for (int k = 0; k < layers; ++k) {
+            Avx2Colors colors;
+            if (!read(rows[k], i, colors, check))
+                continue;
+            active |= bit;
+            if constexpr (Sorts) {
+                prefetch(reinterpret_cast<const std::byte*>(rows[k].depthAhead + i), 64);
+                const __m128 depth = _mm_loadu_ps(rows[k].depth + i);
+                nan = _mm_or_ps(nan, _mm_cmpunord_ps(depth, depth));
+                some.add(colors, depth);
+            } else {
+                block.add(colors, minTransmittance);
+            }
+        }
+        if (Sorts && !some.areSorted()) {
+            some.blendSorted<HasLeast>(rgba + 4 * i, transmittance + i, minTransmittance);
+            continue;
+        }
+        for (int k = 0; k < some.layers; ++k) {
+            Avx2Colors colors;
+            colors.take(some.colors[k]);
+            block.add(colors, minTransmittance);
+        }
+        block.store(rgba + 4 * i, transmittance + i);
+    }
+    isGood = isGood && check.isGood() && _mm_movemask_ps(nan) == 0;
+    return active;
 }
 #endif
 
@@ -73,7 +157,7 @@ public:
     {
         rule_ = rule;
         cursors_.clear();
-        triesFullRows_ = true;
+        inPlace_ = InPlace::Full;
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         std::size_t made = 0;
         for (; begin != end; ++begin)
@@ -97,9 +181,9 @@ public:
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
-        if (triesFullRows_ && !wantsAux && compositeFullRow(row))
+        if (inPlace_ != InPlace::BySpan && !wantsAux && compositeInPlace(row))
             return;
-        triesFullRows_ = false;
+        inPlace_ = InPlace::BySpan;
         const bool isOneRun = takeRows(wantsAux) && !wantsAux;
         const int width = static_cast<int>(row.transmittance.size());
         if (active_.empty()) {
@@ -116,10 +200,12 @@ public:
             compositeSpans(row, active_.front());
         } else {
             findEdges(width);
-            if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && areRunsShort())
+            if (rule_ == BlendRule::InOrder && !wantsAux && row.rgbaLow.empty() && areRunsShort()) {
                 compositeLayers(row);
-            else
+            } else {
                 compositeRuns(row, wantsAux);
+            }
+            inPlace_ = InPlace::Sparse;
         }
     }
 
@@ -156,7 +242,6 @@ private:
     static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
     static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
     static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
-    static constexpr std::size_t mostFullRows = 32;
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
@@ -213,26 +298,18 @@ private:
         return isOneRun;
     }
 
-    // Composites the next row if all inputs lie in place, cover the same pixels without gaps, and have one order there:
-    // then each colour is read once, and not copied. Else does nothing and returns false.
-    bool compositeFullRow([[maybe_unused]] CompositeRow& row)
+    // Composites the next row if all inputs lie in place and may have anything in the same pixels: then each colour is
+    // read once, and not copied. Returns false if it must be composited otherwise.
+    bool compositeInPlace([[maybe_unused]] CompositeRow& row)
     {
 #if defined(DFB_HAS_AVX2_CLONES)
         if (rule_ == BlendRule::Nearest || row.wantsDepth || !row.rgbaLow.empty() || !detail::cpuHasAvx2())
             return false;
-        if (!findFullRows() || !haveOneOrder(fullRows_.front().span.count))
+        if (!findInPlace() || !(row.minTransmittance > 0 ? blendInPlace<true>(row) : blendInPlace<false>(row)))
             return false;
-        for (std::size_t k = 0; k < order_.size(); ++k)
-            ordered_[k] = fullRows_[static_cast<std::size_t>(order_[k])];
-        const int x = ordered_.front().span.x, count = ordered_.front().span.count;
-        const auto blend =
-            row.minTransmittance > 0 ? detail::blendFullRowsAvx2<true> : detail::blendFullRowsAvx2<false>;
-        if (!blend(ordered_.data(), static_cast<int>(order_.size()), row.minTransmittance, row.rgba.data() + 4 * x,
-                   row.transmittance.data() + x))
-            return false;
-        clearGap(row, 0, x);
-        clearGap(row, x + count, static_cast<int>(row.transmittance.size()));
-        joinRun(x, count);
+        const Span span = rows_.front().span;
+        clearGap(row, 0, span.x);
+        clearGap(row, span.x + span.count, static_cast<int>(row.transmittance.size()));
         skipRows(1);
         return true;
 #else
@@ -240,27 +317,62 @@ private:
 #endif
     }
 
-    // Sets fullRows_, of all inputs, and layers_. False if they do not cover the same pixels.
-    bool findFullRows()
+#if defined(DFB_HAS_AVX2_CLONES)
+    // Blends rows_. False if nothing is known of the row then.
+    template <bool HasLeast>
+    bool blendInPlace(CompositeRow& row)
     {
-        if (cursors_.size() < 2 || cursors_.size() > fullRows_.size())
+        const Span span = rows_.front().span;
+        const int x = span.x, count = span.count, layers = static_cast<int>(cursors_.size());
+        double* const rgba = row.rgba.data() + 4 * x;
+        double* const transmittance = row.transmittance.data() + x;
+        const bool isTold = rule_ == BlendRule::InOrder || !detail::haveDepths(layers_);
+        if (inPlace_ == InPlace::Full) {
+            if (!haveOneOrder(count, isTold))
+                return false;
+            for (std::size_t k = 0; k < order_.size(); ++k)
+                ordered_[k] = rows_[static_cast<std::size_t>(order_[k])];
+            if (!detail::blendFullRowsAvx2<HasLeast>(ordered_.data(), layers, row.minTransmittance, rgba,
+                                                     transmittance))
+                return false;
+            joinRun(x, count);
+            return true;
+        }
+        const auto blend =
+            isTold ? detail::blendSparseRowsAvx2<HasLeast, false> : detail::blendSparseRowsAvx2<HasLeast, true>;
+        bool isGood = true;
+        for (int begin = 0; begin < count; begin += 256)
+            detail::forEachRun(blend(rows_.data(), layers, begin, row.minTransmittance, rgba, transmittance, isGood),
+                               [&](int at, int fours) {
+                                   const int first = begin + 4 * at;
+                                   joinRun(x + first, std::min(4 * fours, count - first));
+                               });
+        if (!isGood)
+            runs_.clear();
+        return isGood;
+    }
+#endif
+
+    // Sets rows_, of all inputs, and layers_. False if they do not cover the same pixels.
+    bool findInPlace()
+    {
+        if (cursors_.size() < 2 || cursors_.size() > rows_.size())
             return false;
         layers_.resize(cursors_.size());
         for (std::size_t k = 0; k < cursors_.size(); ++k) {
-            if (!cursors_[k].findFullRow(fullRows_[k]))
+            if (!cursors_[k].findInPlace(rows_[k]))
                 return false;
-            const Span &span = fullRows_[k].span, &first = fullRows_.front().span;
+            const Span &span = rows_[k].span, &first = rows_.front().span;
             if (span.x != first.x || span.count != first.count || span.count < 4)
                 return false;
-            layers_[k] = {fullRows_[k].color, fullRows_[k].depth, nullptr};
+            layers_[k] = {rows_[k].color, rows_[k].depth, nullptr};
         }
         return true;
     }
 
     // Sets order_ to the order of layers_. False if that changes within their `count` pixels, or a depth is NaN.
-    bool haveOneOrder(int count)
+    bool haveOneOrder(int count, bool isTold)
     {
-        const bool isTold = rule_ == BlendRule::InOrder || !detail::haveDepths(layers_);
         if (isTold || order_.size() != layers_.size())
             detail::resetOrder(order_, layers_.size());
         if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
@@ -420,9 +532,14 @@ private:
     }
 
     BlendRule rule_ = BlendRule::SortByDepth;
-    std::array<detail::FullRow, mostFullRows> fullRows_,
-        ordered_;                // of inputs; and in their order. Not cleared for a row
-    bool triesFullRows_ = false; // until one fails: the rows below are likely to, too
+    std::array<detail::RowInPlace, detail::mostInPlace> rows_,
+        ordered_; // of inputs; and in their order. Not cleared for a row
+    // How the next row in place is read. In a tile it begins with the first, and goes on as the rows have shown.
+    enum class InPlace {
+        Full,   // without gaps, of many inputs
+        BySpan, // each input is searched for what is there
+        Sparse  // all inputs together: gaps are found meanwhile
+    } inPlace_ = InPlace::BySpan;
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;

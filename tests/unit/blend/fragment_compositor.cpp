@@ -17,7 +17,7 @@ namespace fragment_compositor_cases {
 namespace {
 
 constexpr float infinity = std::numeric_limits<float>::infinity();
-constexpr int width = 150, height = 12;
+constexpr int width = 290, height = 12;
 
 // The pixels of a fragment, in spans of about so many.
 struct Pixels {
@@ -231,6 +231,76 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
                 if (!isThere)
                     continue;
                 const Folded expected = fold(isSorted ? sorted(inputs, pixel) : inOrder(inputs), pixel, least);
+                CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * static_cast<std::size_t>(x)]));
+                CHECK(expected.transmittance == row.transmittance[static_cast<std::size_t>(x)]);
+            }
+        }
+        CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
+        CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
+    }
+}
+
+TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and sorted", "[compositing]")
+{
+    std::mt19937 random(17);
+    for (int round = 0; round < 200; ++round) {
+        const bool isSorted = round % 2 == 1, hasDepth = isSorted && round % 10 != 9;
+        const double least = round % 7 == 0 ? 0.05 : 0;
+        const dfb::Region valid{round % 3 == 0 ? 0 : 5, 0, round % 3 == 1 ? width : width - round % 40, height};
+        const std::size_t layers = 2 + random() % (round % 20 == 0 ? 36 : 8);
+        std::vector<Pixels> inputs;
+        for (std::size_t k = 0; k < layers; ++k)
+            inputs.emplace_back(random, round % 3 == 0 ? 4 : round % 3 == 1 ? 20 : 60, false);
+        // Now and then something that a row must not have, be it beside a gap: it is composited otherwise, and counted.
+        std::uint64_t nonFinite = 0, alphaOutside = 0;
+        for (Pixels& input : inputs)
+            for (std::size_t i = 0; i < input.depths.size(); ++i) {
+                const bool isRead = valid.contains(static_cast<int>(i) % width, static_cast<int>(i) / width);
+                float* const color = &input.colors[4 * i];
+                if (!isRead)
+                    std::fill_n(color, 4, 0.5f);
+                if (!isRead || random() % 2000 != 0)
+                    continue;
+                if (const auto flaw = random() % 3; flaw == 0 && least == 0)
+                    color[random() % 3] = random() % 2 ? infinity : -infinity, ++nonFinite;
+                else if (flaw == 1)
+                    color[3] = random() % 2 ? 1.25f : -0.25f, ++alphaOutside;
+                else if (hasDepth)
+                    nonFinite += input.isActive(i), input.depths[i] = std::numeric_limits<float>::quiet_NaN();
+            }
+        dfb::detail::FaultCounts faults;
+        std::vector<dfb::Fragment> fragments;
+        std::vector<const dfb::Fragment*> pointers;
+        for (const Pixels& input : inputs)
+            fragments.push_back(input.fragment(hasDepth, valid, &faults));
+        for (const dfb::Fragment& fragment : fragments)
+            pointers.push_back(&fragment);
+        dfb::FragmentCompositor compositor;
+        compositor.start(isSorted ? dfb::BlendRule::SortByDepth : dfb::BlendRule::InOrder, pointers.begin(),
+                         pointers.end());
+        dfb::CompositeRow row;
+        row.wantsDepth = row.wantsGaps = false;
+        row.minTransmittance = least;
+        row.resize(width);
+        for (int y = 0; y < height; ++y) {
+            compositor.nextRow(row);
+            std::vector<bool> isInRun(width);
+            int end = -1000;
+            for (const auto& run : compositor.runs()) {
+                CHECK(run.x > end); // a run ends where there is nothing
+                end = run.x + run.count;
+                std::fill_n(isInRun.begin() + run.x, run.count, true);
+            }
+            for (int x = 0; x < width; ++x) {
+                const std::size_t pixel = static_cast<std::size_t>(y * width + x);
+                const bool isInside = valid.contains(x, y), isThere = isInRun[static_cast<std::size_t>(x)];
+                const Folded expected = fold(hasDepth ? sorted(inputs, pixel) : inOrder(inputs), pixel, least);
+                if (!isInside)
+                    CHECK_FALSE(isThere);
+                if (isInside && expected.layers > 0)
+                    REQUIRE(isThere);
+                if (!isThere)
+                    continue;
                 CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * static_cast<std::size_t>(x)]));
                 CHECK(expected.transmittance == row.transmittance[static_cast<std::size_t>(x)]);
             }
