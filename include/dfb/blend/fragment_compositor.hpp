@@ -15,7 +15,7 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-inline constexpr int mostInPlace = 32; // of so many inputs rows in place are blended without copying
+inline constexpr int mostInPlace = 32; // so many inputs in place at most are blended as they are read
 
 #if defined(DFB_HAS_AVX2_CLONES)
 // Reads four pixels of a row in place, each value once, and checks them. False if all are 0.
@@ -534,11 +534,12 @@ private:
     BlendRule rule_ = BlendRule::SortByDepth;
     std::array<detail::RowInPlace, detail::mostInPlace> rows_,
         ordered_; // of inputs; and in their order. Not cleared for a row
-    // How the next row in place is read. In a tile it begins with the first, and goes on as the rows have shown.
+    // How inputs in place are read in the next row. A tile begins with Full. A row with gaps makes it BySpan, and a row
+    // in which several inputs have something, but not in the same pixels, makes it Sparse.
     enum class InPlace {
-        Full,   // without gaps, of many inputs
-        BySpan, // each input is searched for what is there
-        Sparse  // all inputs together: gaps are found meanwhile
+        Full,   // all inputs together, as if each had something in each pixel
+        BySpan, // each input is searched for what is there, and that is copied
+        Sparse  // all inputs together, four pixels at a time: those with nothing are passed by
     } inPlace_ = InPlace::BySpan;
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
