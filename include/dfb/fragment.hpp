@@ -123,19 +123,6 @@ struct ByteRow : FragmentRow {
     Span valid; // in which all pixels of a fragment in place are
 };
 
-namespace detail {
-
-// A row of pixels in place, active where they have a colour. Others may still change them.
-struct RowInPlace {
-    Span span;
-    const float* color = nullptr;
-    const float* depth = nullptr; // null: not wanted
-    // Of a later row, to load into the cache meanwhile.
-    const float *colorAhead = nullptr, *depthAhead = nullptr;
-};
-
-} // namespace detail
-
 // Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
 class FragmentCursor {
 public:

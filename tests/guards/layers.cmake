@@ -15,8 +15,8 @@ set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/mpi_ranks.hpp comm/
             comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp
             trace_file.hpp)
 set(level_5 comm/connection.hpp testing/transport_conformance.hpp tile.hpp wire/active_pixels.hpp)
-set(level_6 comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp dependency_tracker.hpp fragment.hpp
-            tile_layout.hpp)
+set(level_6 blend/in_place_kernels.hpp comm/inproc_transport.hpp comm/mailbox.hpp comm/mpi_transport.hpp
+            dependency_tracker.hpp fragment.hpp tile_layout.hpp)
 set(level_7 blend/fragment_compositor.hpp frame.hpp testing/fault_transport.hpp tile_op.hpp
             wire/sparse_planes.hpp wire/wire_losses.hpp)
 set(level_8 frame/declarations.hpp ops/sort_last.hpp pixel_op.hpp render/link_owners.hpp

@@ -247,6 +247,15 @@ struct RowPlace {
     }
 };
 
+// A row of pixels in place, active where they have a colour. Others may still change them.
+struct RowInPlace {
+    Span span;
+    const float* color = nullptr;
+    const float* depth = nullptr; // null: not wanted
+    // Of a later row, to load into the cache meanwhile.
+    const float *colorAhead = nullptr, *depthAhead = nullptr;
+};
+
 // Which pixels of a row are active.
 struct Activity {
     bool byDepth = false; // those with a depth; else those with a colour

@@ -102,6 +102,41 @@ std::vector<const Pixels*> sorted(const std::vector<Pixels>& inputs, std::size_t
     return all;
 }
 
+// A compositor of inputs, all with the same bounds but the second, and a row for it.
+struct Stack {
+    dfb::detail::FaultCounts faults;
+    std::vector<dfb::Fragment> fragments;
+    dfb::FragmentCompositor compositor;
+    dfb::CompositeRow row;
+
+    Stack(const std::vector<Pixels>& inputs, bool isSorted, bool hasDepth, const dfb::Region& valid,
+          const dfb::Region& validOfSecond, double minTransmittance)
+    {
+        std::vector<const dfb::Fragment*> pointers;
+        for (std::size_t k = 0; k < inputs.size(); ++k)
+            fragments.push_back(inputs[k].fragment(hasDepth, k == 1 ? validOfSecond : valid, &faults));
+        for (const dfb::Fragment& fragment : fragments)
+            pointers.push_back(&fragment);
+        compositor.start(isSorted ? dfb::BlendRule::SortByDepth : dfb::BlendRule::InOrder, pointers.begin(),
+                         pointers.end());
+        row.wantsDepth = row.wantsGaps = false;
+        row.minTransmittance = minTransmittance;
+        row.resize(width);
+    }
+    void checkFaults(std::uint64_t nonFinite, std::uint64_t alphaOutside) const
+    {
+        CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
+        CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
+    }
+    // Pixel x of the row.
+    void check(int x, const Folded& expected) const
+    {
+        const auto at = static_cast<std::size_t>(x);
+        CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * at]));
+        CHECK(expected.transmittance == row.transmittance[at]);
+    }
+};
+
 } // namespace
 
 TEST_CASE("Fragments in order are folded pixel by pixel, in long runs and in short ones", "[compositing]")
@@ -204,24 +239,11 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
         for (int i = 0; i < width * height; ++i)
             if (!validOfSecond.contains(i % width, i / width)) // not to be read
                 std::fill_n(&given[1].colors[4 * static_cast<std::size_t>(i)], 4, 0.5f);
-        dfb::detail::FaultCounts faults;
-        std::vector<dfb::Fragment> fragments;
-        std::vector<const dfb::Fragment*> pointers;
-        for (std::size_t k = 0; k < layers; ++k)
-            fragments.push_back(given[k].fragment(isSorted, k == 1 ? validOfSecond : valid, &faults));
-        for (const dfb::Fragment& fragment : fragments)
-            pointers.push_back(&fragment);
-        dfb::FragmentCompositor compositor;
-        compositor.start(isSorted ? dfb::BlendRule::SortByDepth : dfb::BlendRule::InOrder, pointers.begin(),
-                         pointers.end());
-        dfb::CompositeRow row;
-        row.wantsDepth = row.wantsGaps = false;
-        row.minTransmittance = least;
-        row.resize(width);
+        Stack stack(given, isSorted, isSorted, valid, validOfSecond, least);
         for (int y = 0; y < height; ++y) {
-            compositor.nextRow(row);
+            stack.compositor.nextRow(stack.row);
             std::vector<bool> isInRun(width);
-            for (const auto& run : compositor.runs())
+            for (const auto& run : stack.compositor.runs())
                 std::fill_n(isInRun.begin() + run.x, run.count, true);
             for (int x = 0; x < width; ++x) {
                 const std::size_t pixel = static_cast<std::size_t>(y * width + x);
@@ -231,12 +253,10 @@ TEST_CASE("Rows in place without gaps are folded pixel by pixel, in order and so
                 if (!isThere)
                     continue;
                 const Folded expected = fold(isSorted ? sorted(inputs, pixel) : inOrder(inputs), pixel, least);
-                CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * static_cast<std::size_t>(x)]));
-                CHECK(expected.transmittance == row.transmittance[static_cast<std::size_t>(x)]);
+                stack.check(x, expected);
             }
         }
-        CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
-        CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
+        stack.checkFaults(nonFinite, alphaOutside);
     }
 }
 
@@ -268,25 +288,12 @@ TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and 
                 else if (hasDepth)
                     nonFinite += input.isActive(i), input.depths[i] = std::numeric_limits<float>::quiet_NaN();
             }
-        dfb::detail::FaultCounts faults;
-        std::vector<dfb::Fragment> fragments;
-        std::vector<const dfb::Fragment*> pointers;
-        for (const Pixels& input : inputs)
-            fragments.push_back(input.fragment(hasDepth, valid, &faults));
-        for (const dfb::Fragment& fragment : fragments)
-            pointers.push_back(&fragment);
-        dfb::FragmentCompositor compositor;
-        compositor.start(isSorted ? dfb::BlendRule::SortByDepth : dfb::BlendRule::InOrder, pointers.begin(),
-                         pointers.end());
-        dfb::CompositeRow row;
-        row.wantsDepth = row.wantsGaps = false;
-        row.minTransmittance = least;
-        row.resize(width);
+        Stack stack(inputs, isSorted, hasDepth, valid, valid, least);
         for (int y = 0; y < height; ++y) {
-            compositor.nextRow(row);
+            stack.compositor.nextRow(stack.row);
             std::vector<bool> isInRun(width);
             int end = -1000;
-            for (const auto& run : compositor.runs()) {
+            for (const auto& run : stack.compositor.runs()) {
                 CHECK(run.x > end); // a run ends where there is nothing
                 end = run.x + run.count;
                 std::fill_n(isInRun.begin() + run.x, run.count, true);
@@ -301,12 +308,10 @@ TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and 
                     REQUIRE(isThere);
                 if (!isThere)
                     continue;
-                CHECK(std::equal(expected.rgba, expected.rgba + 4, &row.rgba[4 * static_cast<std::size_t>(x)]));
-                CHECK(expected.transmittance == row.transmittance[static_cast<std::size_t>(x)]);
+                stack.check(x, expected);
             }
         }
-        CHECK(static_cast<std::uint64_t>(faults.nonFinite) == nonFinite);
-        CHECK(static_cast<std::uint64_t>(faults.alphaOutside) == alphaOutside);
+        stack.checkFaults(nonFinite, alphaOutside);
     }
 }
 
