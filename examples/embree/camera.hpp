@@ -6,6 +6,7 @@
 
 #include <dfb/render/cameras.hpp>
 
+#include <cstdint>
 #include <optional>
 #include <variant>
 #include <vector>
@@ -35,6 +36,20 @@ struct View {
     float domeAngle = 180;
 };
 
+struct RenderSettings {
+    int width = 1024, height = 1024; // of the image, in pixels
+    int frames = 1;                  // of one turn of the camera
+    int passes = 1;                  // samples per pixel
+    std::uint64_t seed = 1;
+    int aoRays = 0;             // of ambient occlusion, per hit of a surface or sphere; 0: none
+    float aoDistance = 0.1f;    // how far they look, in units of the scene's largest extent
+    bool shadows = false;       // of the light, as far as that
+    int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
+    float opacity = 1;          // of a surface or sphere
+    float earlyTermination = 0; // a ray ends when less than this passes through it; 0: when nothing does
+    View view;
+};
+
 namespace detail {
 inline constexpr double degree = 3.14159265358979323846 / 180.0;
 
@@ -42,9 +57,9 @@ inline constexpr double degree = 3.14159265358979323846 / 180.0;
 struct OrbitAxes {
     Vec3d up, front, side;
 
-    explicit OrbitAxes(const View& view) : up(unit(Vec3d(view.up)))
+    explicit OrbitAxes(const View& view) : up(unit(toDouble(view.up)))
     {
-        const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d(0, up.z > 0 ? -1 : 1, 0) : Vec3d(0, 0, 1);
+        const Vec3d towards = std::fabs(up.z) > 0.9 ? Vec3d{0, up.z > 0 ? -1.0 : 1.0, 0} : Vec3d{0, 0, 1};
         front = unit(towards - up * dot(towards, up));
         side = cross(up, front);
     }
@@ -69,7 +84,7 @@ inline double cameraDistance(const Focus& focus, const View& view, int width, in
 {
     const Vec3 target = targetOf(focus, view);
     if (view.eye)
-        return length(Vec3d(*view.eye) - Vec3d(target));
+        return length(toDouble(*view.eye) - toDouble(target));
     const double unit = static_cast<double>(focus.box.largestExtent());
     if (view.distance)
         return static_cast<double>(*view.distance) * unit;
@@ -102,7 +117,7 @@ inline View withoutEye(const Focus& focus, View view)
     if (!view.eye)
         return view;
     const detail::OrbitAxes axes(view);
-    const Vec3d arm = Vec3d(*view.eye) - Vec3d(targetOf(focus, view));
+    const Vec3d arm = toDouble(*view.eye) - toDouble(targetOf(focus, view));
     const double far = length(arm);
     if (far > 0) {
         view.elevation = static_cast<float>(std::asin(std::clamp(dot(arm, axes.up) / far, -1.0, 1.0)) / detail::degree);
@@ -129,7 +144,9 @@ public:
     // Where all rays begin, if they do.
     std::optional<Vec3> commonEye() const
     {
-        return std::holds_alternative<dfb::PerspectiveCamera>(camera_) ? pinhole_.commonEye() : std::nullopt;
+        const bool isOne =
+            std::holds_alternative<dfb::PerspectiveCamera>(camera_) || std::holds_alternative<dfb::DomeCamera>(camera_);
+        return isOne ? pinhole_.commonEye() : std::nullopt;
     }
 
     // The ray through a point of the image, in pixels; its direction is 0 where the camera sees nothing.
@@ -158,24 +175,26 @@ private:
     {
         using detail::degree;
         const detail::OrbitAxes axes(view);
-        const Vec3d target(targetOf(focus, view));
+        const Vec3d target = toDouble(targetOf(focus, view));
         const double turn = 360.0 * frame / std::max(1, frameCount);
         const float angle = shownAngle(view);
         if (view.eye) {
-            const Vec3d arm = Vec3d(*view.eye) - target, along = axes.up * dot(arm, axes.up);
+            const Vec3d arm = toDouble(*view.eye) - target, along = axes.up * dot(arm, axes.up);
+            if (length(arm) == 0)
+                throw dfb::InvalidArgument("--eye is where the camera looks: give another --target");
             const Vec3d outward =
                 along + (arm - along) * std::cos(turn * degree) + cross(axes.up, arm) * std::sin(turn * degree);
             const bool isAlongUp = length(cross(axes.up, arm)) <= 1e-4 * length(arm);
-            return dfb::PerspectiveCamera::along(frame == 0 ? *view.eye : rounded(target + outward),
-                                                 rounded(outward * -1.0), rounded(isAlongUp ? axes.front : axes.up),
+            return dfb::PerspectiveCamera::along(frame == 0 ? *view.eye : toFloat(target + outward),
+                                                 toFloat(outward * -1.0), toFloat(isAlongUp ? axes.front : axes.up),
                                                  angle);
         }
         const double azimuth = (static_cast<double>(view.azimuth) + turn) * degree;
         const double elevation = std::clamp(static_cast<double>(view.elevation), -89.9, 89.9) * degree;
         const Vec3d outward = axes.side * (std::cos(elevation) * std::sin(azimuth)) + axes.up * std::sin(elevation)
                               + axes.front * (std::cos(elevation) * std::cos(azimuth));
-        const Vec3 eye = rounded(target + outward * cameraDistance(focus, view, width, height));
-        return dfb::PerspectiveCamera::along(eye, rounded(outward * -1.0), rounded(axes.up), angle);
+        const Vec3 eye = toFloat(target + outward * cameraDistance(focus, view, width, height));
+        return dfb::PerspectiveCamera::along(eye, toFloat(outward * -1.0), toFloat(axes.up), angle);
     }
 
     static AnyCamera cameraOf(const Focus& focus, const View& view, const dfb::PerspectiveCamera& pinhole,

@@ -81,7 +81,7 @@ private:
             return b;
         Box all;
         for (int i = 0; i < 8; ++i)
-            all.grow(rounded(move(Vec3d(b.corner(i)))));
+            all.grow(toFloat(move(toDouble(b.corner(i)))));
         return all;
     }
 
@@ -96,11 +96,11 @@ public:
     // `box`: of the file, in its own coordinates.
     FileToWorld(const Placement& fit, const Box& box, const FileLook& look)
         : fit_(fit), isPlaced_(look.isPlaced() && !box.empty()), scale_(static_cast<double>(look.scale)),
-          translate_(look.translate)
+          translate_(toDouble(look.translate))
     {
         if (!isPlaced_)
             return;
-        center_ = Vec3d(fit.toWorld(box.center()));
+        center_ = toDouble(fit.toWorld(box.center()));
         rotation_ = Rotation(look.rotate, center_);
     }
 
@@ -110,15 +110,15 @@ public:
         const Vec3 world = fit_.toWorld(p);
         if (!isPlaced_)
             return world;
-        return rounded(rotation_.point(center_ + (Vec3d(world) - center_) * scale_) + translate_);
+        return toFloat(rotation_.point(center_ + (toDouble(world) - center_) * scale_) + translate_);
     }
     // A function of the point alone.
     Vec3d toFile(const Vec3& world) const
     {
-        Vec3d p(world);
+        Vec3d p = toDouble(world);
         if (isPlaced_)
             p = center_ + (rotation_.pointBack(p - translate_) - center_) * (1 / scale_);
-        return (p - Vec3d(fit_.offset)) * (1 / static_cast<double>(fit_.scale.x));
+        return (p - toDouble(fit_.offset)) * (1 / static_cast<double>(fit_.scale.x));
     }
 
 private:
@@ -136,7 +136,7 @@ struct Clip {
 
     bool contains(const Vec3& world) const
     {
-        const Vec3 p = rounded(place.toFile(world));
+        const Vec3 p = toFloat(place.toFile(world));
         return p.x >= box.lo.x && p.x <= box.hi.x && p.y >= box.lo.y && p.y <= box.hi.y && p.z >= box.lo.z
                && p.z <= box.hi.z;
     }

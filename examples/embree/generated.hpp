@@ -66,17 +66,17 @@ inline Mesh torusKnot(int along, int around)
 {
     auto center = [](double s) {
         const double r = 0.29 + 0.11 * std::cos(3 * s);
-        return Vec3d(0.5 + r * std::cos(2 * s), 0.5 + r * std::sin(2 * s), 0.5 + 0.2 * std::sin(3 * s));
+        return Vec3d{0.5 + r * std::cos(2 * s), 0.5 + r * std::sin(2 * s), 0.5 + 0.2 * std::sin(3 * s)};
     };
     Mesh mesh;
     for (int i = 0; i < along; ++i) {
         const double s = 2 * pi * i / along;
         const Vec3d c = center(s), tangent = unit(center(s + 1e-4) - center(s - 1e-4));
-        const Vec3d side = unit(cross(tangent, c - Vec3d(0.5, 0.5, 0.5))), other = cross(side, tangent);
+        const Vec3d side = unit(cross(tangent, c - Vec3d{0.5, 0.5, 0.5})), other = cross(side, tangent);
         for (int k = 0; k < around; ++k) {
             const double angle = 2 * pi * k / around;
             const double radius = 0.042 * (1 + 0.12 * std::cos(18 * s + 2 * angle));
-            mesh.positions.push_back(rounded(c + (side * std::cos(angle) + other * std::sin(angle)) * radius));
+            mesh.positions.push_back(toFloat(c + (side * std::cos(angle) + other * std::sin(angle)) * radius));
         }
     }
     const auto vertex = [&](int i, int k) { return static_cast<std::uint32_t>((i % along) * around + k % around); };
@@ -140,7 +140,7 @@ inline Scene demoScene(std::uint64_t seed, const LookOf& lookOf = {})
         const Vec3 p =
             Vec3{static_cast<float>(x) - half, static_cast<float>(y) - half, static_cast<float>(z) - half} * (1 / half);
         const float inside = std::clamp(1.6f * (0.95f - length(p)), 0.0f, 1.0f);
-        return std::min(1.0f, inside * (0.10f + 1.9f * (*waves)(x, y, z)));
+        return inside == 0 ? 0.0f : std::min(1.0f, inside * (0.10f + 1.9f * (*waves)(x, y, z)));
     };
     VolumeSource source = detail::generatedVolume({size, size, size}, cloud);
     if (lookOf)

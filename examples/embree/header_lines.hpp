@@ -84,11 +84,41 @@ public:
     }
     static std::string shortened(std::string_view text) { return std::string(text.substr(0, 60)); }
 
-    // A path in a header is one beside it.
-    std::string pathOfData(const std::string& name) const
+    // `names`: of each type, with | around them.
+    FileType typeOf(const std::string& value, const std::vector<std::pair<std::string, FileType>>& names,
+                    const char* expected) const
     {
+        for (const auto& [all, type] : names)
+            if (all.find('|' + value + '|') != std::string::npos && value.find('|') == std::string::npos)
+                return type;
+        fail("the type '" + shortened(value) + "' cannot be drawn, expected " + expected);
+    }
+    bool isThree(std::string_view text, const std::string& what) const
+    {
+        if (const int dimension = numbers<int, 1>(text, what)[0]; dimension != 3)
+            fail("expected " + what + " 3, got " + std::to_string(dimension));
+        return true;
+    }
+    std::string turnedNote() const
+    {
+        return where()
+               + ": its axes are turned or mirrored in space; it is drawn as it is stored, with x to the right, y down "
+                 "and z to the back";
+    }
+    // Of one data file. A path in a header is one beside it.
+    std::string pathOfData(const std::string& name, const char* what) const
+    {
+        if (name.empty() || name.compare(0, 4, "LIST") == 0 || name.find('%') != std::string::npos)
+            fail(std::string("expected one ") + what + ", got '" + shortened(name)
+                 + "'; slices in files of their own cannot be read");
         const std::size_t folder = name[0] == '/' ? std::string::npos : path_.find_last_of('/');
         return (folder == std::string::npos ? "" : path_.substr(0, folder + 1)) + name;
+    }
+    // Throws std::runtime_error if a line that a header needs is not there.
+    static void need(const std::string& path, bool isThere, const char* name)
+    {
+        if (!isThere)
+            throw std::runtime_error(path + ": the header has no line '" + name + "'");
     }
 
 private:
@@ -100,7 +130,7 @@ private:
         std::snprintf(text, sizeof text, "%g", value);
         return text;
     }
-    static Vec3 vec(const std::array<double, 3>& v) { return rounded(Vec3d(v[0], v[1], v[2])); }
+    static Vec3 vec(const std::array<double, 3>& v) { return toFloat(Vec3d{v[0], v[1], v[2]}); }
 
     std::istream& stream_;
     std::string path_;

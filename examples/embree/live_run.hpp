@@ -81,7 +81,7 @@ private:
         fromAllSides.frames = 36;
         scene_ = std::make_unique<RankScene>(loadRankScene(fromAllSides, loaders));
         o_.view = withoutEye(scene_->info.focus, scene_->view);
-        settings_ = renderSettings(o_);
+        settings_ = o_;
         world_ = worldOf(*scene_);
         params_.maxLayers = static_cast<int>(scene_->bounds.size());
         const std::array<float, 3> behind = o_.background.value_or(std::array<float, 3>{0, 0, 0});
@@ -110,7 +110,7 @@ private:
         scene.axes = {list(side), list(cross(front, side)), list(front)};
         scene.unit = static_cast<double>(scene_->info.focus.box.largestExtent());
         scene.fieldOfView = static_cast<double>(shownAngle(o_.view));
-        scene.mostSamples = std::max(256, o_.spp);
+        scene.mostSamples = std::max(256, o_.passes);
         scene.ranks = fb_.size();
         LiveWishes home;
         home.camera.azimuth = static_cast<double>(o_.view.azimuth);
@@ -119,7 +119,7 @@ private:
         home.camera.target = list(o_.view.target.value_or(scene_->info.focus.box.center()));
         home.width = o_.width;
         home.height = o_.height;
-        home.samples = o_.spp;
+        home.samples = o_.passes;
         view_->open(scene, home);
         std::printf("look at it in a browser on this machine: %s\n", view_->url().c_str());
         std::fflush(stdout);

@@ -95,7 +95,8 @@ inline void finishColors(Mesh& mesh, const std::string& name, Notes* notes)
 // As long as twice the triangle's area.
 inline Vec3d weightedNormal(const Mesh& mesh, const Triangle& t)
 {
-    const Vec3d a(mesh.positions[t[0]]), b(mesh.positions[t[1]]), c(mesh.positions[t[2]]);
+    const Vec3d a = toDouble(mesh.positions[t[0]]), b = toDouble(mesh.positions[t[1]]),
+                c = toDouble(mesh.positions[t[2]]);
     return cross(b - a, c - a);
 }
 
@@ -111,7 +112,7 @@ inline std::vector<Vec3> vertexNormals(const Mesh& mesh)
     std::vector<Vec3> normals;
     normals.reserve(sums.size());
     for (const Vec3d& sum : sums)
-        normals.push_back(rounded(unit(sum)));
+        normals.push_back(toFloat(unit(sum)));
     return normals;
 }
 

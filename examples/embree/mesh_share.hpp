@@ -240,7 +240,7 @@ inline std::vector<Vec3> normalsOf(const MeshPart& part, const std::vector<std::
     std::vector<Vec3> normals;
     normals.reserve(sums.size());
     for (const Vec3d& sum : sums)
-        normals.push_back(rounded(unit(sum)));
+        normals.push_back(toFloat(unit(sum)));
     return lookup.of(normals);
 }
 

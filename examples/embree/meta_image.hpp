@@ -36,7 +36,7 @@ private:
         if (key == "ObjectType" && value != "Image")
             lines_.fail("expected ObjectType = Image, got '" + lines_.shortened(value) + "'");
         else if (key == "NDims")
-            readDimension(value);
+            hasDimension_ = lines_.isThree(value, "NDims =");
         else if (key == "DimSize")
             readSizes(value);
         else if (key == "ElementType")
@@ -69,13 +69,6 @@ private:
             lines_.fail("expected True or False for " + key + ", got '" + lines_.shortened(value) + "'");
         return word == "true" || word == "1";
     }
-    void readDimension(const std::string& value)
-    {
-        const int dimension = lines_.numbers<int, 1>(value, "NDims")[0];
-        if (dimension != 3)
-            lines_.fail("expected NDims = 3, got " + std::to_string(dimension));
-        hasDimension_ = true;
-    }
     void readSizes(const std::string& value)
     {
         if (!hasDimension_)
@@ -84,18 +77,17 @@ private:
     }
     void readType(const std::string& value)
     {
-        static const std::vector<std::pair<const char*, FileType>> names{
-            {"MET_CHAR", FileType::Int8},     {"MET_UCHAR", FileType::UInt8},   {"MET_SHORT", FileType::Int16},
-            {"MET_USHORT", FileType::UInt16}, {"MET_INT", FileType::Int32},     {"MET_UINT", FileType::UInt32},
-            {"MET_FLOAT", FileType::Float32}, {"MET_DOUBLE", FileType::Float64}};
-        for (const auto& [name, type] : names)
-            if (value == name) {
-                file_.format.type = type;
-                hasType_ = true;
-                return;
-            }
-        lines_.fail("the type '" + lines_.shortened(value)
-                    + "' cannot be drawn, expected MET_ and CHAR, UCHAR, SHORT, USHORT, INT, UINT, FLOAT or DOUBLE");
+        file_.format.type = lines_.typeOf(value,
+                                          {{"|MET_CHAR|", FileType::Int8},
+                                           {"|MET_UCHAR|", FileType::UInt8},
+                                           {"|MET_SHORT|", FileType::Int16},
+                                           {"|MET_USHORT|", FileType::UInt16},
+                                           {"|MET_INT|", FileType::Int32},
+                                           {"|MET_UINT|", FileType::UInt32},
+                                           {"|MET_FLOAT|", FileType::Float32},
+                                           {"|MET_DOUBLE|", FileType::Float64}},
+                                          "MET_ and CHAR, UCHAR, SHORT, USHORT, INT, UINT, FLOAT or DOUBLE");
+        hasType_ = true;
     }
     void readSpacing(const std::string& key, const std::string& value)
     {
@@ -106,9 +98,7 @@ private:
     {
         const auto m = lines_.numbers<double, 9>(value, key);
         if (!(m[0] > 0.999 && m[4] > 0.999 && m[8] > 0.999))
-            file_.notes.push_back(lines_.where()
-                                  + ": its axes are turned or mirrored in space; it is drawn as it is "
-                                    "stored, with x to the right, y down and z to the back");
+            file_.notes.push_back(lines_.turnedNote());
     }
     void readHeaderSize(const std::string& value)
     {
@@ -118,20 +108,13 @@ private:
     }
     void readDataFile(const std::string& value)
     {
-        if (value.empty() || value.compare(0, 4, "LIST") == 0 || value.find('%') != std::string::npos)
-            lines_.fail("expected one ElementDataFile, got '" + lines_.shortened(value)
-                        + "'; slices in files of their "
-                          "own cannot be read");
         isLocal_ = value == "LOCAL";
-        file_.data = isLocal_ ? path_ : lines_.pathOfData(value);
+        file_.data = isLocal_ ? path_ : lines_.pathOfData(value, "ElementDataFile");
     }
 
     void finish()
     {
-        const auto need = [this](bool isThere, const char* key) {
-            if (!isThere)
-                throw std::runtime_error(path_ + ": the header has no line '" + key + " = ...'");
-        };
+        const auto need = [this](bool isThere, const char* key) { HeaderLines::need(path_, isThere, key); };
         need(file_.dims[0] > 0, "DimSize");
         need(hasType_, "ElementType");
         need(!file_.data.empty(), "ElementDataFile");

@@ -45,7 +45,7 @@ private:
         if (field == "type")
             readType(value);
         else if (field == "dimension")
-            readDimension(value);
+            hasDimension_ = lines_.isThree(value, "dimension");
         else if (field == "sizes")
             readSizes(value);
         else if (field == "encoding")
@@ -61,7 +61,7 @@ private:
         else if (field == "axis mins" || field == "axismins")
             file_.origin = lines_.origin(lines_.numbers<double, 3>(value, "axis mins"));
         else if (field == "data file" || field == "datafile")
-            readDataFile(value);
+            file_.data = lines_.pathOfData(value, "data file");
         else if (field == "byte skip" || field == "byteskip")
             byteSkip_ = lines_.numbers<std::int64_t, 1>(value, "byte skip")[0];
         else if (field == "line skip" || field == "lineskip")
@@ -74,48 +74,16 @@ private:
 
     void readType(const std::string& value)
     {
-        static const std::vector<std::pair<const char*, FileType>> names{{"signed char", FileType::Int8},
-                                                                         {"int8", FileType::Int8},
-                                                                         {"int8_t", FileType::Int8},
-                                                                         {"uchar", FileType::UInt8},
-                                                                         {"unsigned char", FileType::UInt8},
-                                                                         {"uint8", FileType::UInt8},
-                                                                         {"uint8_t", FileType::UInt8},
-                                                                         {"short", FileType::Int16},
-                                                                         {"short int", FileType::Int16},
-                                                                         {"signed short", FileType::Int16},
-                                                                         {"signed short int", FileType::Int16},
-                                                                         {"int16", FileType::Int16},
-                                                                         {"int16_t", FileType::Int16},
-                                                                         {"ushort", FileType::UInt16},
-                                                                         {"unsigned short", FileType::UInt16},
-                                                                         {"unsigned short int", FileType::UInt16},
-                                                                         {"uint16", FileType::UInt16},
-                                                                         {"uint16_t", FileType::UInt16},
-                                                                         {"int", FileType::Int32},
-                                                                         {"signed int", FileType::Int32},
-                                                                         {"int32", FileType::Int32},
-                                                                         {"int32_t", FileType::Int32},
-                                                                         {"uint", FileType::UInt32},
-                                                                         {"unsigned int", FileType::UInt32},
-                                                                         {"uint32", FileType::UInt32},
-                                                                         {"uint32_t", FileType::UInt32},
-                                                                         {"float", FileType::Float32},
-                                                                         {"double", FileType::Float64}};
-        for (const auto& [name, type] : names)
-            if (value == name) {
-                type_ = type;
-                return;
-            }
-        lines_.fail("the type '" + lines_.shortened(value)
-                    + "' cannot be drawn, expected an integer of up to 32 bits, float or double");
-    }
-    void readDimension(const std::string& value)
-    {
-        const int dimension = lines_.numbers<int, 1>(value, "dimension")[0];
-        if (dimension != 3)
-            lines_.fail("expected dimension 3, got " + std::to_string(dimension));
-        hasDimension_ = true;
+        type_ = lines_.typeOf(value,
+                              {{"|signed char|int8|int8_t|", FileType::Int8},
+                               {"|uchar|unsigned char|uint8|uint8_t|", FileType::UInt8},
+                               {"|short|short int|signed short|signed short int|int16|int16_t|", FileType::Int16},
+                               {"|ushort|unsigned short|unsigned short int|uint16|uint16_t|", FileType::UInt16},
+                               {"|int|signed int|int32|int32_t|", FileType::Int32},
+                               {"|uint|unsigned int|uint32|uint32_t|", FileType::UInt32},
+                               {"|float|", FileType::Float32},
+                               {"|double|", FileType::Float64}},
+                              "an integer of up to 32 bits, float or double");
     }
     void readSizes(const std::string& value)
     {
@@ -156,17 +124,7 @@ private:
         }
         file_.spacing = lines_.spacing(spacings);
         if (isTurned)
-            file_.notes.push_back(lines_.where()
-                                  + ": its axes are turned or mirrored in space; it is drawn as it is "
-                                    "stored, with x to the right, y down and z to the back");
-    }
-    void readDataFile(const std::string& value)
-    {
-        if (value.empty() || value.compare(0, 4, "LIST") == 0 || value.find('%') != std::string::npos)
-            lines_.fail("expected one data file, got '" + lines_.shortened(value)
-                        + "'; slices in files of their own "
-                          "cannot be read");
-        file_.data = lines_.pathOfData(value);
+            file_.notes.push_back(lines_.turnedNote());
     }
 
     // As in (1,0,0) (0,1,0) (0,0,1).
@@ -196,10 +154,7 @@ private:
 
     void finish(bool endsWithFile)
     {
-        const auto need = [this](bool isThere, const char* field) {
-            if (!isThere)
-                throw std::runtime_error(path_ + ": the header has no line '" + field + "'");
-        };
+        const auto need = [this](bool isThere, const char* field) { HeaderLines::need(path_, isThere, field); };
         need(type_.has_value(), "type");
         need(file_.dims[0] > 0, "sizes");
         need(isRaw_, "encoding");

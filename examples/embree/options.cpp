@@ -82,13 +82,16 @@ public:
             refuseContradictions();
             refuseForFiles();
             readScene();
-            app_.get_option("--ao")->default_str(std::to_string(options_.ao));
+            app_.get_option("--ao")->default_str(std::to_string(options_.aoRays));
             options_.values = values(false);
             options_.given = values(true);
         } catch (const CLI::CallForHelp&) {
             return {std::nullopt, 0, app_.help()};
         } catch (const CLI::ParseError& error) {
             std::string message = error.what();
+            const std::string unknown = "INI was not able to parse "; // CLI11 says so of JSON and TOML, too
+            if (message.rfind(unknown, 0) == 0)
+                message = "--config: there is no option --" + message.substr(unknown.size());
             std::replace(message.begin(), message.end(), '\n', ' ');
             return {std::nullopt, exitUsage, "dfb_render: " + message + " (see --help)"};
         }
@@ -214,19 +217,19 @@ private:
         group_ = "Picture";
         text("--size", size_, "WxH", "Of the image in pixels, each side 1 to 65536; default 1024x1024");
         number("--frames", options_.frames, 1, most, "N", "Frames of one turn around the scene; default 1");
-        number("--spp", options_.spp, 1, 65536, "N",
+        number("--spp", options_.passes, 1, 65536, "N",
                "Samples per pixel, one pass each; default 1, in the pixel's centre");
         number("--adaptive", options_.adaptive, 0, 1, "ERR",
                "Render a tile until the standard error of its pixels is at most this, from 8 to --spp samples; default "
                "0: all have --spp");
         number(
-            "--ao", options_.ao, 0, 4096, "N",
+            "--ao", options_.aoRays, 0, 4096, "N",
             "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are no volumes, "
             "without --path; else 0: none. Bricks then hold what is within --ao-distance of them as ghosts");
         number("--ao-distance", options_.aoDistance, 1e-6, 10, "D",
                "How far these rays look and shadows are cast, in units of the scene's largest extent; default 0.1");
         flag("--shadows", options_.shadows, "Shadows of surfaces and spheres on each other, as far as --ao-distance");
-        number("--path", options_.path, 0, 1000, "N",
+        number("--path", options_.pathBounces, 0, 1000, "N",
                "Path-trace opaque surfaces and spheres under a bright sky, N bounces at most; volumes are left out; "
                "needs --mode image; default 0: off");
         text("--wall", wall_, "CxR",
@@ -291,7 +294,7 @@ private:
         if (options_.interleave > 1 && app_.count("--deep") == 0)
             options_.deep = options_.interleave; // as many pieces as a brick can have on a ray
         if (options_.live && app_.count("--spp") == 0)
-            options_.spp = 16; // while the camera rests
+            options_.passes = 16; // while the camera rests
         if (app_.count("--size") > 0)
             detail::parseSize("--size", size_, 65536, options_.width, options_.height);
         if (app_.count("--wall") > 0)
@@ -329,8 +332,9 @@ private:
         for (const char* other : {"--adaptive", "--interleave", "--deep", "--wall", "--exposure"})
             refuse(options_.blend != Blending::Sort, other, "does not go with --blend order or nearest");
         refuse(options_.mode == Mode::Image, "--cut", "does not go with --mode image: it has no bricks");
-        refuse(options_.blend == Blending::Order && options_.view.kind != CameraKind::Perspective, "--camera",
-               "does not go with --blend order: one order is not right for all its rays");
+        const CameraKind kind = options_.view.kind;
+        refuse(options_.blend == Blending::Order && kind != CameraKind::Perspective && kind != CameraKind::Dome,
+               "--camera", "does not go with --blend order: one order is not right for all its rays");
         refuse(options_.mode != Mode::Mixed, "--replicate", "needs --mode mixed");
         refuse(options_.mode != Mode::Mixed, "--balance", "needs --mode mixed");
         refuse(options_.mode != Mode::Image, "--distribution", "needs --mode image");
@@ -343,9 +347,16 @@ private:
         refuse(options_.interleave > 1 || options_.deep > 0, "--exposure", "does not go with --interleave or --deep");
         refuse(options_.adaptive > 0, "--wall", "does not go with --adaptive");
         refuse(options_.adaptive > 0, "--exposure", "does not go with --adaptive");
-        refuse(options_.adaptive > 0 && options_.spp < 8, "--adaptive",
+        refuse(options_.adaptive > 0 && options_.passes < 8, "--adaptive",
                "needs --spp 8 or more: the most samples per pixel");
         refuse(options_.errorBudget > 0, "--wire", "does not go with --error-budget");
+        refuse(kind != CameraKind::DepthOfField, "--aperture", "needs --camera dof");
+        refuse(kind != CameraKind::DepthOfField && kind != CameraKind::Stereo, "--focus",
+               "needs --camera dof or stereo");
+        refuse(kind != CameraKind::MotionBlur, "--shutter", "needs --camera motion");
+        refuse(kind != CameraKind::Stereo, "--eyes", "needs --camera stereo");
+        refuse(kind != CameraKind::Dome, "--dome-angle", "needs --camera dome");
+        refuse(options_.wallColumns == 0, "--bezel", "needs --wall");
     }
 
     void refuseForFiles()
@@ -407,8 +418,8 @@ private:
             LookOptions::requireTransfer(file.look.transfer, "scene", "'" + word + "': transfer: ");
             file.look = merged(file.look, options_.look);
             options_.files.push_back(file);
-            if (app_.count("--ao") == 0 && !isVolume && options_.path == 0)
-                options_.ao = options_.live ? 4 : 16; // samples accumulate in a live view
+            if (app_.count("--ao") == 0 && !isVolume && options_.pathBounces == 0)
+                options_.aoRays = options_.live ? 4 : 16; // samples accumulate in a live view
         }
     }
 

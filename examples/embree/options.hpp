@@ -41,7 +41,7 @@ struct OutputFiles {
     }
 };
 
-struct Options : OutputFiles {
+struct Options : OutputFiles, RenderSettings {
     std::vector<std::string> scene; // `synthetic`, `demo`, or files, as the user wrote them
     std::vector<SceneFile> files;   // of these, with what holds of each
     bool fit = true;
@@ -68,19 +68,8 @@ struct Options : OutputFiles {
     int peerTimeout = static_cast<int>(dfb::defaultPeerTimeout.count() / 1000); // seconds; 0: off
     OwnerMap ownerMap = OwnerMap::Auto;
 
-    int width = 1024, height = 1024;
-    int frames = 1;
-    int spp = 1;
-    float adaptive = 0; // 0: off
-    std::uint64_t seed = 1;
-    int ao = 0, path = 0; // 0: off
-    float aoDistance = 0.1f;
-    bool shadows = false;
-    View view;
-    FileLook look; // of files that do not say themselves
-
-    float opacity = 1;
-    float earlyTermination = 0;                     // 0: off
+    float adaptive = 0;                             // 0: off
+    FileLook look;                                  // of files that do not say themselves
     float exposure = 0;                             // 0: off
     std::optional<std::array<float, 3>> background; // linear RGB, opaque; none: transparent black
     bool dither = false;

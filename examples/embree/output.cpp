@@ -194,17 +194,15 @@ void writePng16(const std::string& path, int width, int height, const float* rgb
     const std::size_t channels = hasAlpha ? 4 : 3;
     std::vector<std::uint8_t> row(2 * channels * static_cast<std::size_t>(width));
     const auto encoded = [](double linear) {
-        const double v = std::clamp(linear, 0.0, 1.0); // NaN: 0
+        const double v = linear > 0 ? std::min(linear, 1.0) : 0.0; // also of NaN
         return v <= 0.0031308 ? 12.92 * v : 1.055 * std::pow(v, 1 / 2.4) - 0.055;
     };
     const auto fill = [&](const float* pixels) {
         std::size_t at = 0;
         for (int x = 0; x < width; ++x, pixels += 4) {
-            const double alpha = hasAlpha ? std::min(static_cast<double>(pixels[3]), 1.0) : 1.0;
+            const double alpha = !hasAlpha ? 1.0 : pixels[3] > 0 ? std::min(static_cast<double>(pixels[3]), 1.0) : 0.0;
             for (std::size_t c = 0; c < channels; ++c) {
-                const double v = c == 3      ? std::clamp(alpha, 0.0, 1.0)
-                                 : alpha > 0 ? encoded(static_cast<double>(pixels[c]) / alpha)
-                                             : 0.0;
+                const double v = c == 3 ? alpha : alpha > 0 ? encoded(static_cast<double>(pixels[c]) / alpha) : 0.0;
                 const unsigned level = static_cast<unsigned>(v * 65535 + 0.5);
                 row[at++] = static_cast<std::uint8_t>(level >> 8); // big-endian
                 row[at++] = static_cast<std::uint8_t>(level & 255);

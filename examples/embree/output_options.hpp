@@ -18,73 +18,40 @@ class OutputOptions {
 public:
     OutputOptions(CLI::App& app, OutputFiles& files) : app_(app)
     {
-        const char* group = "Files to write";
-        app_.add_option(
-                "--output", files.output,
-                "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over "
-                "black in a .pfm; linear colour, alpha and --layers in an .exr. %d, or %04d for 4 digits, in the name "
-                "stands for the number of the frame, from 0 "
-                "on; without it the last frame is written. Also in the next three; default none")
-            ->check(detail::ending({".png", ".pfm", ".exr"}))
-            ->option_text("FILE")
-            ->group(group);
+        add("--output", files.output, "FILE", {".png", ".pfm", ".exr"},
+            "The image: sRGB in a .png, with straight alpha unless --background is given; linear colour over black in "
+            "a .pfm; linear colour, alpha and --layers in an .exr. %d, or %04d for 4 digits, in the name stands for "
+            "the number of the frame, from 0 on; without it the last frame is written. Also in the next three; default "
+            "none");
         app_.add_option("--png-bits", files.pngBits, "Bits of each channel of a .png: 8 or 16; default 8")
             ->check([](const std::string& text) {
                 return text == "8" || text == "16" ? std::string() : "'" + text + "' is not 8 or 16";
             })
             ->option_text("8|16")
             ->group(group);
-        app_.add_option(
-                "--layers", layers_,
-                "What an .exr has beside colour and alpha: none, all, or some of depth (channel Z), normal (N), "
-                "albedo, position (P), ids (id.primitive, id.instance), with commas between; default depth")
-            ->option_text("LAYER[,LAYER...]")
-            ->group(group);
-        app_.add_option(
-                "--cinema", files.cinema,
-                "Write the frames of a turn into this folder as a Cinema database, whose data.csv has phi, theta and "
-                "the picture of each; default none")
-            ->option_text("DIR.cdb")
-            ->group(group);
-        app_.add_option("--alpha", files.alpha, "The opacity, as a greyscale .pfm; default none")
-            ->check(detail::ending({".pfm"}))
-            ->option_text("FILE")
-            ->group(group);
-        app_.add_option("--depth", files.depth,
-                        "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is "
-                        "nothing; default none")
-            ->check(detail::ending({".pfm"}))
-            ->option_text("FILE")
-            ->group(group);
-        app_.add_option("--aux", files.aux,
-                        "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
-                        ".instance.png with a colour for each id; default none")
-            ->option_text("PREFIX")
-            ->group(group);
-        app_.add_option("--stats", files.stats,
-                        "Where the time has gone, in ms, on each rank and the slowest: total = load + render + "
-                        "compositing (with "
-                        "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of "
-                        "the image, "
-                        "the options; default none")
-            ->check(detail::ending({".json"}))
-            ->option_text("FILE")
-            ->group(group);
-        app_.add_option(
-                "--trace", files.trace,
-                "What each thread of each rank did for the frames, and when, for ui.perfetto.dev and speedscope; "
-                "default none")
-            ->check(detail::ending({".json"}))
-            ->option_text("FILE")
-            ->group(group);
-
-        app_.add_option(
-                "--save-options", files.saveOptions,
-                "The options of this run and its scene, for --config: {\"scene\": [\"a.ply\"], \"spp\": 4}; default "
-                "none")
-            ->check(detail::ending({".json"}))
-            ->option_text("FILE")
-            ->group(group);
+        add("--layers", layers_, "LAYER[,LAYER...]", {},
+            "What an .exr has beside colour and alpha: none, all, or some of depth (channel Z), normal (N), albedo, "
+            "position (P), ids (id.primitive, id.instance), with commas between; default depth");
+        add("--cinema", files.cinema, "DIR.cdb", {},
+            "Write the frames of a turn into this folder as a Cinema database, whose data.csv has phi, theta and the "
+            "picture of each; default none");
+        add("--alpha", files.alpha, "FILE", {".pfm"}, "The opacity, as a greyscale .pfm; default none");
+        add("--depth", files.depth, "FILE", {".pfm"},
+            "The distance from the camera along the ray, as a greyscale .pfm, infinite where there is nothing; default "
+            "none");
+        add("--aux", files.aux, "PREFIX", {},
+            "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
+            ".instance.png with a colour for each id; default none");
+        add("--stats", files.stats, "FILE", {".json"},
+            "Where the time has gone, in ms, on each rank and the slowest: total = load + render + compositing (with "
+            "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of the image, "
+            "the options; default none");
+        add("--trace", files.trace, "FILE", {".json"},
+            "What each thread of each rank did for the frames, and when, for ui.perfetto.dev and speedscope; default "
+            "none");
+        add("--save-options", files.saveOptions, "FILE", {".json"},
+            "The options of this run and its scene, for --config: {\"scene\": [\"a.ply\"], \"spp\": 4}; default "
+            "none");
     }
 
     // To be called when the command line is parsed. Throws CLI::ValidationError.
@@ -120,15 +87,24 @@ public:
                 throw CLI::ValidationError(name, wrong.what());
             }
         }
-        if (files.stats.find('%') != std::string::npos)
-            throw CLI::ValidationError("--stats", "'" + files.stats + "': one file for all frames, without %");
-        if (files.trace.find('%') != std::string::npos)
-            throw CLI::ValidationError("--trace", "'" + files.trace + "': one file for all frames, without %");
-        if (files.saveOptions.find('%') != std::string::npos)
-            throw CLI::ValidationError("--save-options", "'" + files.saveOptions + "': one file, without %");
+        for (const auto& [name, text] : {std::pair{"--stats", &files.stats}, std::pair{"--trace", &files.trace},
+                                         std::pair{"--save-options", &files.saveOptions}})
+            if (text->find('%') != std::string::npos)
+                throw CLI::ValidationError(name, "'" + *text + "': one file for all frames, without %");
     }
 
 private:
+    static constexpr const char* group = "Files to write";
+
+    // `endings`: one of which the text must have; none: any.
+    void add(const char* name, std::string& text, const char* form, const std::vector<std::string>& endings,
+             const char* what)
+    {
+        CLI::Option* option = app_.add_option(name, text, what)->option_text(form)->group(group);
+        if (!endings.empty())
+            option->check(detail::ending(endings));
+    }
+
     CLI::App& app_;
     std::string layers_;
 };

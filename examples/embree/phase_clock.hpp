@@ -4,7 +4,6 @@
 #include <array>
 #include <chrono>
 #include <cstddef>
-#include <cstdint>
 
 namespace example {
 
@@ -17,31 +16,28 @@ public:
     // Begins with loading.
     PhaseClock() : begin_(Clock::now()), since_(begin_) {}
 
-    // From now on time counts for `phase`. Returns how long the phase before has lasted, in ns.
-    std::int64_t enter(Phase phase)
+    // From now on time counts for `phase`. Returns how long the phase before has lasted, in ms.
+    double enter(Phase phase)
     {
         const Clock::time_point now = Clock::now();
-        const std::int64_t lasted = nanoseconds(now - since_);
-        ns_[static_cast<std::size_t>(phase_)] += lasted;
+        const double lasted = Milliseconds(now - since_).count();
+        ms_[static_cast<std::size_t>(phase_)] += lasted;
         since_ = now;
         phase_ = phase;
         return lasted;
     }
 
     // Of a phase, without what has passed since the last enter().
-    std::int64_t ns(Phase phase) const { return ns_[static_cast<std::size_t>(phase)]; }
+    double ms(Phase phase) const { return ms_[static_cast<std::size_t>(phase)]; }
     // By the clock, from the beginning to now.
-    std::int64_t totalNs() const { return nanoseconds(Clock::now() - begin_); }
+    double totalMs() const { return Milliseconds(Clock::now() - begin_).count(); }
 
 private:
-    static std::int64_t nanoseconds(Clock::duration time)
-    {
-        return std::chrono::duration_cast<std::chrono::nanoseconds>(time).count();
-    }
+    using Milliseconds = std::chrono::duration<double, std::milli>;
 
     Clock::time_point begin_, since_;
     Phase phase_ = Phase::Load;
-    std::array<std::int64_t, 4> ns_{};
+    std::array<double, 4> ms_{};
 };
 
 } // namespace example

@@ -21,7 +21,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <cstdio>
-#include <cstring>
 #include <exception>
 #include <memory>
 #include <optional>
@@ -77,10 +76,6 @@ public:
     }
 
 private:
-    // This rank's part of a frame.
-    struct FrameCounts {
-        std::int64_t renderNs = 0, compositingNs = 0, writeNs = 0, tiles = 0, work = 0;
-    };
     // A rank could not write a file of an earlier frame. Thrown on all ranks at the end of the same frame.
     struct CannotWrite {};
     // Of Frame::addFigure(), for that. No brick and tile have it.
@@ -104,12 +99,12 @@ private:
         const Loaders loaders = loadersOf(*fb_);
         work_.scene = std::make_unique<RankScene>(loadRankScene(o_, loaders));
         o_.view = work_.scene->view;
-        bytesRead_ = static_cast<std::int64_t>(loaders.bytesRead());
+        bytesRead_ = loaders.bytesRead();
     }
 
     void prepare(ProgressLine& progress)
     {
-        work_.settings = renderSettings(o_);
+        work_.settings = o_;
         work_.world = worldOf(*work_.scene);
         if (o_.mode != Mode::Image)
             work_.shared.emplace(*fb_, work_.world);
@@ -118,7 +113,7 @@ private:
             workDone_ += work;
             progress.tileDone();
         };
-        params_.passes = o_.spp;
+        params_.passes = o_.passes;
         params_.maxLayers = static_cast<int>(work_.scene->bounds.size()) * std::max(1, o_.deep);
         if (o_.background)
             params_.background = {(*o_.background)[0], (*o_.background)[1], (*o_.background)[2], 1.0f};
@@ -137,7 +132,7 @@ private:
         } catch (const std::exception& e) {
             writeError_ = e.what();
         }
-        frames_[static_cast<std::size_t>(frame)].writeNs = clock_.enter(Phase::Compositing);
+        frames_[static_cast<std::size_t>(frame)].times.writeMs = clock_.enter(Phase::Compositing);
     }
 
     void renderFrames(ProgressLine& progress)
@@ -154,8 +149,8 @@ private:
                     endFirst();
                 start(frame, params_);
             }
-            frames_[static_cast<std::size_t>(frame)].tiles = tiles_;
-            frames_[static_cast<std::size_t>(frame)].work = workDone_;
+            frames_[static_cast<std::size_t>(frame)].tilesRendered = static_cast<std::uint64_t>(tiles_);
+            frames_[static_cast<std::size_t>(frame)].work = static_cast<std::uint64_t>(workDone_);
         }
         while (fb_->openCount() > 0)
             endFirst();
@@ -165,18 +160,18 @@ private:
     std::int64_t tilesAhead(int frame) const
     {
         if (isSingle(compositing_))
-            return static_cast<std::int64_t>(fb_->layout().tileCount()) * o_.spp / fb_->size();
+            return static_cast<std::int64_t>(fb_->layout().tileCount()) * o_.passes / fb_->size();
         const FrameCamera camera = frameCamera(work_.scene->info, work_.settings, frame);
         const std::size_t visible = dfb::visibleTiles(work_.world, camera, fb_->layout()).size();
         const int copies = o_.mode == Mode::Mixed ? std::min(o_.replicate, fb_->size()) : 1;
-        return static_cast<std::int64_t>(visible) * o_.spp / copies;
+        return static_cast<std::int64_t>(visible) * o_.passes / copies;
     }
 
     void start(int frame, const dfb::FrameConfig& params)
     {
         clock_.enter(Phase::Render);
         fb_->start(frame, work_, params);
-        frames_[static_cast<std::size_t>(frame)].renderNs += clock_.enter(Phase::Compositing);
+        frames_[static_cast<std::size_t>(frame)].times.renderMs += clock_.enter(Phase::Compositing);
     }
 
     // Ends the oldest frame that is open, which is this one.
@@ -186,7 +181,7 @@ private:
             fb_->addFigure(cannotWriteKey, 1);
         clock_.enter(Phase::Compositing);
         dfb::FrameReport report = fb_->end();
-        frames_[static_cast<std::size_t>(frame)].compositingNs += clock_.enter(Phase::Compositing);
+        frames_[static_cast<std::size_t>(frame)].times.compositingMs += clock_.enter(Phase::Compositing);
         if (std::any_of(report.figures.begin(), report.figures.end(),
                         [](const dfb::Figure& figure) { return figure.key == cannotWriteKey; }))
             throw CannotWrite();
@@ -203,7 +198,7 @@ private:
     dfb::FrameReport renderAdaptively(int frame)
     {
         if (!sampler_)
-            sampler_.emplace(fb_->layout(), dfb::SamplingConfig{o_.adaptive, std::min(8, o_.spp), o_.spp, 64});
+            sampler_.emplace(fb_->layout(), dfb::SamplingConfig{o_.adaptive, std::min(8, o_.passes), o_.passes, 64});
         else
             sampler_->reset();
         std::optional<dfb::FrameReport> sum;
@@ -222,20 +217,6 @@ private:
         return *sum;
     }
 
-    // The numbers of each rank, which has as many of them as this one.
-    std::vector<std::vector<std::int64_t>> gathered(const std::vector<std::int64_t>& numbers)
-    {
-        const auto* first = reinterpret_cast<const std::byte*>(numbers.data());
-        std::vector<std::vector<std::int64_t>> all;
-        for (const auto& bytes : fb_->allGather({first, first + numbers.size() * sizeof(std::int64_t)})) {
-            if (bytes.size() != numbers.size() * sizeof(std::int64_t))
-                throw std::runtime_error("ranks have counted different numbers of frames");
-            all.emplace_back(numbers.size());
-            std::memcpy(all.back().data(), bytes.data(), bytes.size());
-        }
-        return all;
-    }
-
     bool finish()
     {
         if (!onAllRanks([&] {
@@ -246,16 +227,14 @@ private:
         if (trace_ && !onAllRanks([&] { trace_->write(*fb_, o_.trace); }))
             return false;
         clock_.enter(Phase::Compositing);
-        std::vector<std::int64_t> numbers{clock_.totalNs(),
-                                          clock_.ns(Phase::Load),
-                                          clock_.ns(Phase::Render),
-                                          clock_.ns(Phase::Compositing),
-                                          clock_.ns(Phase::Write),
-                                          threads_,
-                                          bytesRead_};
-        for (const FrameCounts& f : frames_)
-            numbers.insert(numbers.end(), {f.renderNs, f.compositingNs, f.writeNs, f.tiles, f.work});
-        const auto ofRanks = gathered(numbers);
+        const RankStats mine{
+            {clock_.ms(Phase::Load), clock_.ms(Phase::Render), clock_.ms(Phase::Compositing), clock_.ms(Phase::Write)},
+            clock_.totalMs(),
+            threads_,
+            bytesRead_};
+        const Loaders ranks = loadersOf(*fb_);
+        const auto ofRanks = ranks.gatherOf<RankStats>([&] { return std::vector<RankStats>{mine}; });
+        const auto framesOfRanks = ranks.gatherOf<RankFrameStats>([&] { return frames_; });
         const dfb::testing::ErrorReport checked = verification_.report();
         const auto verified =
             fb_->allReduce({checked.values + checked.bytes, checked.ulps[0] + checked.bytes - checked.wrongBytes,
@@ -264,7 +243,7 @@ private:
         return onAllRanks([&] {
             if (!fb_->isDisplayRank())
                 return;
-            const RunStats stats = statsOf(ofRanks);
+            const RunStats stats = statsOf(ofRanks, framesOfRanks);
             files_.write(stats);
             say(stats);
             if (o_.verify)
@@ -276,16 +255,11 @@ private:
         });
     }
 
-    // `ofRanks`: what finish() gathers.
-    RunStats statsOf(const std::vector<std::vector<std::int64_t>>& ofRanks) const
+    // `frames`: of one rank behind the other.
+    RunStats statsOf(const std::vector<RankStats>& ranks, const std::vector<RankFrameStats>& frames) const
     {
-        const auto ms = [](std::int64_t ns) { return static_cast<double>(ns) / 1e6; };
         RunStats stats;
-        for (const auto& n : ofRanks)
-            stats.ranks.push_back({{ms(n[1]), ms(n[2]), ms(n[3]), ms(n[4])},
-                                   ms(n[0]),
-                                   static_cast<int>(n[5]),
-                                   static_cast<std::uint64_t>(n[6])});
+        stats.ranks = ranks;
         stats.scene = o_.scene;
         stats.options = o_.values;
         stats.version = std::to_string(DFB_VERSION_MAJOR) + '.' + std::to_string(DFB_VERSION_MINOR) + '.'
@@ -297,18 +271,14 @@ private:
         stats.runMs = runMs_;
         for (std::size_t i = 0; i < reports_.size(); ++i) {
             FrameStats s;
-            for (const auto& n : ofRanks) {
-                const std::int64_t* f = n.data() + 7 + 5 * i;
-                s.ranks.push_back({{0, ms(f[0]), ms(f[1]), ms(f[2])},
-                                   static_cast<std::uint64_t>(f[3]),
-                                   static_cast<std::uint64_t>(f[4])});
-            }
+            for (std::size_t rank = 0; rank < ranks.size(); ++rank)
+                s.ranks.push_back(frames[rank * frames_.size() + i]);
             s.report = reports_[i];
             stats.frames.push_back(std::move(s));
         }
         const std::int64_t pixels = static_cast<std::int64_t>(o_.width) * o_.height;
-        stats.samplesTaken = static_cast<std::uint64_t>(sampler_ ? sampler_->samplesTaken() : pixels * o_.spp);
-        stats.samplesSaved = static_cast<std::uint64_t>(pixels * o_.spp) - stats.samplesTaken;
+        stats.samplesTaken = static_cast<std::uint64_t>(sampler_ ? sampler_->samplesTaken() : pixels * o_.passes);
+        stats.samplesSaved = static_cast<std::uint64_t>(pixels * o_.passes) - stats.samplesTaken;
         if (fb_->image().format() == dfb::OutputFormat::RGBA32F) {
             stats.imageHash = hashPixels(fb_->image().rgba32f(), fb_->image().pixelCount());
             stats.meanAlpha = meanAlpha(fb_->image().rgba32f(), fb_->image().pixelCount());
@@ -329,7 +299,7 @@ private:
             std::printf("%.1f %% of the samples of --spp %d were taken\n",
                         100.0 * static_cast<double>(stats.samplesTaken)
                             / (static_cast<double>(stats.samplesTaken) + static_cast<double>(stats.samplesSaved)),
-                        o_.spp);
+                        o_.passes);
         if (compositing_ == Compositing::Deep)
             std::printf("order undefined at %lld pixels; merging changed none by more than %.3g\n",
                         static_cast<long long>(last.report.orderUndefinedPixels), last.report.mergeErrorBound);
@@ -352,8 +322,8 @@ private:
     dfb::FrameConfig params_;
     std::optional<dfb::AdaptiveSampler> sampler_;
     std::atomic<std::int64_t> tiles_{0}, workDone_{0}; // of this rank in this frame
-    std::vector<FrameCounts> frames_;
-    std::int64_t bytesRead_ = 0;
+    std::vector<RankFrameStats> frames_;
+    std::uint64_t bytesRead_ = 0;
     std::string writeError_; // empty if there is none
     double runMs_ = 0;
     std::vector<dfb::FrameReport> reports_;

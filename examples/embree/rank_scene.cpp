@@ -59,28 +59,10 @@ bool cutsByContent(const Options& options, const Scene& scene)
 {
     if (options.cut != CutBy::Auto)
         return options.cut == CutBy::Content;
-    return scene.grid[0] == 0 && (!scene.volumes.empty() || options.ao > 0 || options.shadows);
+    return scene.grid[0] == 0 && (!scene.volumes.empty() || options.aoRays > 0 || options.shadows);
 }
 
 } // namespace
-
-RenderSettings renderSettings(const Options& options)
-{
-    RenderSettings settings;
-    settings.width = options.width;
-    settings.height = options.height;
-    settings.frames = options.frames;
-    settings.passes = options.spp;
-    settings.aoRays = options.ao;
-    settings.aoDistance = options.aoDistance;
-    settings.shadows = options.shadows;
-    settings.pathBounces = options.path;
-    settings.seed = options.seed;
-    settings.opacity = options.opacity;
-    settings.earlyTermination = options.earlyTermination;
-    settings.view = options.view;
-    return settings;
-}
 
 RankScene loadRankScene(const Options& options, const Loaders& loaders)
 {
@@ -88,7 +70,7 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
     const bool isImage = options.mode == Mode::Image;
     const int sceneBricks = options.bricks > 0 ? options.bricks : rankCount, brickCount = isImage ? 1 : sceneBricks;
     Scene scene = makeScene(options, sceneBricks, loaders);
-    RenderSettings settings = renderSettings(options);
+    RenderSettings settings = options;
     RankScene result{SceneInfo(scene), {}, {}, {}, scene.notes, {}};
     if (!settings.view.isUpGiven && stands(scene)) {
         settings.view.up = {0, 0, -1};
@@ -102,7 +84,7 @@ RankScene loadRankScene(const Options& options, const Loaders& loaders)
                                               std::pair{"--isovalue", !options.look.isovalues.empty()}})
             if (isGiven)
                 result.notes.push_back(std::string(option) + " is for volumes, and there are none");
-    if (options.path > 0 && !scene.volumes.empty())
+    if (options.pathBounces > 0 && !scene.volumes.empty())
         result.notes.push_back(scene.meshes.empty() && scene.spheres.empty()
                                    ? "there is nothing to see: --path leaves volumes out, and there are no surfaces"
                                    : "--path leaves volumes out");

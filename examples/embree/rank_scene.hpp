@@ -11,8 +11,6 @@
 
 namespace example {
 
-RenderSettings renderSettings(const Options& options);
-
 // The ranks of a framebuffer, which outlives them. No frame may be open while they load.
 template <class FrameBuffer>
 Loaders loadersOf(FrameBuffer& fb)

@@ -61,10 +61,10 @@ std::size_t mostHits(const RenderSettings& settings, float opacity)
 Vec3 cosineDirection(const Vec3& normal, double u, double v)
 {
     const double angle = 2 * 3.14159265358979323846 * v, r = std::sqrt(u);
-    const Vec3d n(normal);
-    const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d(0, 1, 0) : Vec3d(1, 0, 0);
+    const Vec3d n = toDouble(normal);
+    const Vec3d other = std::fabs(n.x) > 0.6 ? Vec3d{0, 1, 0} : Vec3d{1, 0, 0};
     const Vec3d a = unit(cross(n, other)), b = cross(n, a);
-    return rounded(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
+    return toFloat(unit(a * (r * std::cos(angle)) + b * (r * std::sin(angle)) + n * std::sqrt(1 - u)));
 }
 
 // That of number `index`.

@@ -17,20 +17,6 @@
 
 namespace example {
 
-struct RenderSettings {
-    int width = 1, height = 1; // of the image, in pixels
-    int frames = 1;            // of one turn of the camera
-    int passes = 1;            // samples per pixel
-    std::uint64_t seed = 0;
-    int aoRays = 0;             // of ambient occlusion, per hit of a surface or sphere; 0: none
-    float aoDistance = 0.1f;    // how far they look, in units of the scene's largest extent
-    bool shadows = false;       // of the light, as far as that
-    int pathBounces = 0;        // above 0: surfaces and spheres are opaque and lit by the sky, over so many bounces
-    float opacity = 0.6f;       // of a surface or sphere
-    float earlyTermination = 0; // a ray ends when less than this passes through it; 0: when nothing does
-    View view;
-};
-
 // Facts about the whole scene that every renderer needs.
 struct SceneInfo {
     Box bounds;
@@ -63,16 +49,8 @@ public:
     // Throws std::runtime_error if Embree does. A brick from loadBrick().
     Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings);
 
-    // Takes view, frames of a turn, image size and passes of `settings` for the tiles that are rendered from now on.
-    // Not while one is.
-    void look(const RenderSettings& settings)
-    {
-        settings_.view = settings.view;
-        settings_.frames = settings.frames;
-        settings_.width = settings.width;
-        settings_.height = settings.height;
-        settings_.passes = settings.passes;
-    }
+    // For the tiles that are rendered from now on: other views, sizes and passes. Not while one is.
+    void look(const RenderSettings& settings) { settings_ = settings; }
 
     // Renders the brick into the channels that the tile has (tile.region, tile.sample); the tile comes cleared, and
     // pixels where the brick has nothing stay so. Returns what it has cost: samples of volumes and secondary rays, and

@@ -50,7 +50,7 @@ struct VolumeObject {
             const Vec3 center = upright().center();
             placement.scale = placement.scale * look.scale;
             placement.offset = center + (placement.offset - center) * look.scale + look.translate;
-            rotation = Rotation(look.rotate, Vec3d(upright().center()));
+            rotation = Rotation(look.rotate, toDouble(upright().center()));
         }
         for (int axis = 0; axis < 3; ++axis)
             if (!(std::max(std::fabs(component(upright().lo, axis)), std::fabs(component(upright().hi, axis)))
@@ -75,7 +75,7 @@ struct VolumeObject {
                                      + textOf(inFile.toWorld({0, 0, 0})) + " to " + textOf(inFile.toWorld(last)));
     }
 
-    Vec3 toWorld(const Vec3& voxel) const { return rounded(rotation.point(Vec3d(placement.toWorld(voxel)))); }
+    Vec3 toWorld(const Vec3& voxel) const { return toFloat(rotation.point(toDouble(placement.toWorld(voxel)))); }
     // The part of the domain that is shown. The domain is between the centres of the outer voxels.
     Box bounds() const { return rotation.box(upright()); }
     // The same before the rotation.

@@ -255,9 +255,9 @@ private:
     // Where the ray meets the triangle's plane, as a distance and as weights of the second and third vertex.
     static double distanceTo(const Query& query, const Mesh& mesh, const Triangle& triangle, double& u, double& v)
     {
-        const Vec3d a(mesh.positions[triangle[0]]);
-        const Vec3d ab = Vec3d(mesh.positions[triangle[1]]) - a, ac = Vec3d(mesh.positions[triangle[2]]) - a;
-        const Vec3d o(query.origin), d(query.direction);
+        const Vec3d a = toDouble(mesh.positions[triangle[0]]);
+        const Vec3d ab = toDouble(mesh.positions[triangle[1]]) - a, ac = toDouble(mesh.positions[triangle[2]]) - a;
+        const Vec3d o = toDouble(query.origin), d = toDouble(query.direction);
         const Vec3d p = cross(d, ac), q = cross(o - a, ab);
         const double determinant = dot(ab, p);
         u = determinant != 0 ? dot(o - a, p) / determinant : 0;
@@ -273,8 +273,8 @@ private:
         const std::vector<Vec3>& colors = part.mesh.colors;
         if (colors.empty())
             return part.color;
-        return rounded(Vec3d(colors[triangle[0]]) * (1 - u - v) + Vec3d(colors[triangle[1]]) * u
-                       + Vec3d(colors[triangle[2]]) * v);
+        return toFloat(toDouble(colors[triangle[0]]) * (1 - u - v) + toDouble(colors[triangle[1]]) * u
+                       + toDouble(colors[triangle[2]]) * v);
     }
 
     // Notes the hit and rejects it, so that Embree goes on to the next one.
@@ -290,12 +290,12 @@ private:
 
         double u = 0, v = 0;
         const double distance = distanceTo(query, part.mesh, triangle, u, v);
-        const Vec3d normal = Vec3d(part.normals[triangle[0]]) * (1 - u - v) + Vec3d(part.normals[triangle[1]]) * u
-                             + Vec3d(part.normals[triangle[2]]) * v;
+        const Vec3d normal = toDouble(part.normals[triangle[0]]) * (1 - u - v) + toDouble(part.normals[triangle[1]]) * u
+                             + toDouble(part.normals[triangle[2]]) * v;
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[index];
-        hit.normal = rounded(unit(normal));
+        hit.normal = toFloat(unit(normal));
         hit.color = colorAt(part, triangle, u, v);
         hit.opacity = part.opacity;
         query.keep(distance, hit, part.clip);
@@ -321,7 +321,7 @@ private:
         const Query& query = *reinterpret_cast<const Query*>(arguments->context);
         const auto& part = *static_cast<const BrickSpheres*>(arguments->geometryUserPtr);
         const Sphere& sphere = part.spheres[arguments->primID];
-        const Vec3d toCenter = Vec3d(sphere.center) - Vec3d(query.origin), d(query.direction);
+        const Vec3d toCenter = toDouble(sphere.center) - toDouble(query.origin), d = toDouble(query.direction);
         const double radius = static_cast<double>(sphere.radius), dd = dot(d, d), along = dot(toCenter, d) / dd;
         const Vec3d off = toCenter - d * along;
         const double rest = radius * radius - dot(off, off);
@@ -357,7 +357,7 @@ private:
         const auto& part = *static_cast<const BrickSpheres*>(arguments->geometryUserPtr);
         const Sphere& sphere = part.spheres[arguments->primID];
 
-        const Vec3d toCenter = Vec3d(sphere.center) - Vec3d(query.origin), d(query.direction);
+        const Vec3d toCenter = toDouble(sphere.center) - toDouble(query.origin), d = toDouble(query.direction);
         const double radius = static_cast<double>(sphere.radius), dd = dot(d, d), along = dot(toCenter, d) / dd;
         const Vec3d off = toCenter - d * along; // from the point of closest approach to the centre
         const double rest = radius * radius - dot(off, off);
@@ -368,7 +368,7 @@ private:
         Hit hit;
         hit.geometry = part.geometry;
         hit.primitive = part.primitives[arguments->primID];
-        hit.normal = rounded(unit(d * t - toCenter));
+        hit.normal = toFloat(unit(d * t - toCenter));
         hit.color = sphere.color;
         hit.opacity = part.opacity;
         query.keep(t, hit, part.clip);

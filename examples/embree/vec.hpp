@@ -1,5 +1,4 @@
 // Vec3: the library's vectors, boxes, and the few pure functions on them that every rank must compute to the same bit.
-// Vec3d: the same in double, where digits matter.
 #pragma once
 
 #include <dfb/render/world.hpp>
@@ -11,36 +10,15 @@
 
 namespace example {
 
+using dfb::toDouble;
+using dfb::toFloat;
 using dfb::Vec3;
+using dfb::Vec3d;
 
 inline float& component(Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
 inline float component(const Vec3& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }
 inline float length(const Vec3& a) { return std::sqrt(dot(a, a)); }
 
-struct Vec3d {
-    double x = 0, y = 0, z = 0;
-
-    Vec3d() = default;
-    Vec3d(double xValue, double yValue, double zValue) : x(xValue), y(yValue), z(zValue) {}
-    explicit Vec3d(const Vec3& v)
-        : x(static_cast<double>(v.x)), y(static_cast<double>(v.y)), z(static_cast<double>(v.z))
-    {
-    }
-};
-
-inline Vec3 rounded(const Vec3d& v)
-{
-    return {static_cast<float>(v.x), static_cast<float>(v.y), static_cast<float>(v.z)};
-}
-
-inline Vec3d operator+(const Vec3d& a, const Vec3d& b) { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vec3d operator-(const Vec3d& a, const Vec3d& b) { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vec3d operator*(const Vec3d& a, double s) { return {a.x * s, a.y * s, a.z * s}; }
-inline double dot(const Vec3d& a, const Vec3d& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec3d cross(const Vec3d& a, const Vec3d& b)
-{
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
 inline double length(const Vec3d& a) { return std::sqrt(dot(a, a)); }
 
 inline double& component(Vec3d& v, int axis) { return axis == 0 ? v.x : axis == 1 ? v.y : v.z; }

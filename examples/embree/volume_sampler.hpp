@@ -52,7 +52,7 @@ public:
     {
         const Vec3& scale = volume_.placement.scale;
         const Vec3 along =
-            volume_.rotation.isNone() ? direction : rounded(volume_.rotation.directionBack(Vec3d(direction)));
+            volume_.rotation.isNone() ? direction : toFloat(volume_.rotation.directionBack(toDouble(direction)));
         return {1 / along.x * scale.x / step, 1 / along.y * scale.y / step, 1 / along.z * scale.z / step};
     }
 
@@ -137,14 +137,14 @@ private:
             Vec3d one;
             component(one, i) = 1;
             const double inverse = 1 / static_cast<double>(component(volume_.placement.scale, i));
-            axes_[i] = rounded(volume_.rotation.direction(one) * inverse);
-            Vec3d origin = volume_.rotation.pointBack({0, 0, 0}) - Vec3d(volume_.placement.offset);
+            axes_[i] = toFloat(volume_.rotation.direction(one) * inverse);
+            Vec3d origin = volume_.rotation.pointBack({0, 0, 0}) - toDouble(volume_.placement.offset);
             component(shift_, i) = static_cast<float>(component(origin, i) * inverse);
         }
     }
     Vec3 inWorld(const Vec3& direction) const
     {
-        return volume_.rotation.isNone() ? direction : rounded(volume_.rotation.direction(Vec3d(direction)));
+        return volume_.rotation.isNone() ? direction : toFloat(volume_.rotation.direction(toDouble(direction)));
     }
 
     float last(int axis) const { return static_cast<float>(info().dims[static_cast<std::size_t>(axis)] - 1); }

@@ -72,7 +72,7 @@ struct XyzColumns {
             else if (column >= place && column < place + 3)
                 ok = ok && parseNumber(next, component(at, column - place));
         }
-        sphere.center = rounded(at);
+        sphere.center = toFloat(at);
         const int element = elementNumber(word);
         sphere.radius = atomRadius(element);
         sphere.color = atomColor(element);

@@ -184,6 +184,25 @@ TEST_CASE("No kind of camera cuts off a scene by default", "[framing]")
     }
 }
 
+TEST_CASE("An eye in the middle of the scene needs a target", "[framing]")
+{
+    Scene scene;
+    scene.add(corners({0, 0, 0}, {9, 9, 9}, 1), false);
+    example::View view;
+    view.eye = scene.focus().box.center();
+    const auto outcome = [&] {
+        try {
+            example::FrameCamera(scene.focus(), view, 0, 1, 64, 64);
+            return std::string("fine");
+        } catch (const dfb::InvalidArgument& e) {
+            return std::string(e.what());
+        }
+    };
+    CHECK(outcome().find("--eye is where the camera looks") != std::string::npos);
+    view.target = Vec3{0, 0, 0};
+    CHECK(outcome() == "fine");
+}
+
 TEST_CASE("A very narrow image has a camera at a distance that can be reckoned with", "[framing]")
 {
     Scene scene;

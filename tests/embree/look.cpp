@@ -534,7 +534,7 @@ TEST_CASE("A placement scales and turns about the file's centre and then moves i
     CHECK(near(place.toWorld({4, 1, 1}), {12, 5, 0})); // x to y
     CHECK(place.size() == 2.0f);
     for (const Vec3& p : {Vec3{0, 0, 0}, Vec3{4, 1, 2}, Vec3{-1, 5, 7}})
-        CHECK(near(rounded(place.toFile(place.toWorld(p))), p));
+        CHECK(near(toFloat(place.toFile(place.toWorld(p))), p));
     Scene scene;
     scene.add(square(), false, lookWith({{"rotate", "90,0,0"}}));
     CHECK(scene.bounds.extent().y < 1e-4f);

@@ -70,7 +70,7 @@ TEST_CASE("Without options they have the values that the help says", "[options]"
     CHECK(o.width == 1024);
     CHECK(o.height == 1024);
     CHECK(o.frames == 1);
-    CHECK(o.spp == 1);
+    CHECK(o.passes == 1);
     CHECK(o.seed == 1);
     CHECK(o.earlyTermination == 0.0f);
     CHECK_FALSE(o.background);
@@ -146,7 +146,7 @@ TEST_CASE("Every option arrives", "[options]")
     CHECK(o.width == 1);
     CHECK(o.height == 65536);
     CHECK(o.frames == 36);
-    CHECK(o.spp == 4);
+    CHECK(o.passes == 4);
     CHECK(o.seed == 9007199254740991u);
     CHECK(o.view.azimuth == -90.0f);
     CHECK(o.view.elevation == 45.5f);
@@ -278,7 +278,7 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
                  "1,1,1",        "--output", "a.png",    "--dither", "--mode=data", "--spp=3", "--size", "7x6",
                  "--background", "0,0.5,0",  "--dither", "--output", "b_%03d.png"});
     CHECK(o.scene == std::vector<std::string>{"demo"});
-    CHECK(o.spp == 3);
+    CHECK(o.passes == 3);
     CHECK(o.width == 7);
     CHECK(o.height == 6);
     CHECK(o.mode == Mode::Data);
@@ -310,10 +310,6 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
                                                                   {"--camera", "dof"},
                                                                   {"--aperture", "1"},
                                                                   {"--focus", "1"},
-                                                                  {"--shutter", "1"},
-                                                                  {"--eyes", "1"},
-                                                                  {"--dome-angle", "90"},
-                                                                  {"--bezel", "0"},
                                                                   {"--seed", "2"},
                                                                   {"--azimuth", "2"},
                                                                   {"--elevation", "2"},
@@ -341,6 +337,17 @@ TEST_CASE("Of an option that is given twice the last counts", "[options]")
         for (const auto& [name, value] : values)
             all.insert(all.end(), {name, value});
     options(all);
+    for (const std::vector<std::string>& words :
+         std::vector<std::vector<std::string>>{{"--camera", "motion", "--shutter", "1", "--shutter", "2"},
+                                               {"--camera", "stereo", "--eyes", "1", "--eyes", "2"},
+                                               {"--camera", "dome", "--dome-angle", "90", "--dome-angle", "91"},
+                                               {"--wall", "2x1", "--bezel", "0", "--bezel", "2"}}) {
+        std::vector<std::string> with{"demo"};
+        with.insert(with.end(), words.begin(), words.end());
+        options(with);
+        // Without what they belong to they would do nothing.
+        checkRefused({words[2], words[3]});
+    }
 }
 
 TEST_CASE("The options are there as they count, for the record", "[options]")
@@ -367,12 +374,12 @@ TEST_CASE("The options are there as they count, for the record", "[options]")
 
 TEST_CASE("Surfaces from files have ambient occlusion, unless the user says otherwise", "[options]")
 {
-    CHECK(options({"demo"}).ao == 0);
-    CHECK(options({"v_2x2x2_uint8.raw"}).ao == 0);
-    CHECK(options({"a.ply"}).ao == 16);
-    CHECK(options({"v_2x2x2_uint8.raw", "a.xyz"}).ao == 16);
-    CHECK(options({"a.ply", "--ao", "0"}).ao == 0);
-    CHECK(options({"a.ply", "--mode", "image", "--path", "2"}).ao == 0);
+    CHECK(options({"demo"}).aoRays == 0);
+    CHECK(options({"v_2x2x2_uint8.raw"}).aoRays == 0);
+    CHECK(options({"a.ply"}).aoRays == 16);
+    CHECK(options({"v_2x2x2_uint8.raw", "a.xyz"}).aoRays == 16);
+    CHECK(options({"a.ply", "--ao", "0"}).aoRays == 0);
+    CHECK(options({"a.ply", "--mode", "image", "--path", "2"}).aoRays == 0);
     for (const auto& [name, value] : options({"a.ply"}).values)
         if (name == "ao")
             CHECK(value == "16");

@@ -207,14 +207,14 @@ TEST_CASE("The options of a run are read again as they were", "[options][config]
     // The command line counts more, and TOML will do.
     const ParsedOptions other = parse({"--config", path, "--spp", "5"});
     REQUIRE(other.options);
-    CHECK(other.options->spp == 5);
+    CHECK(other.options->passes == 5);
     const std::string toml =
         folder.write("run.toml", "scene = [\"a.ply\", \"b.xyz\"]\nspp = 4\nshadows = true\nsize = \"30x20\"\n");
     const ParsedOptions read = parse({"--config", toml});
     INFO(read.message);
     REQUIRE(read.options);
     CHECK(read.options->scene == std::vector<std::string>{"a.ply", "b.xyz"});
-    CHECK(read.options->spp == 4);
+    CHECK(read.options->passes == 4);
     CHECK(read.options->shadows);
     CHECK(read.options->width == 30);
     const ParsedOptions named = parse({"c.ply", "--config", toml});

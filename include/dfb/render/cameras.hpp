@@ -41,22 +41,22 @@ public:
             for (Plane& row : rows_)
                 row = {-1 * row.normal, -row.offset};
         const Plane &x = rows_[0], &y = rows_[1], &last = isOrthographic_ ? rows_[2] : rows_[3];
-        const double volume = detail::dot(detail::cross(x.normal, y.normal), last.normal),
+        const double volume = dot(cross(x.normal, y.normal), last.normal),
                      size = detail::length(x.normal) * detail::length(y.normal) * detail::length(last.normal);
         if (!(std::fabs(volume) > 1e-12 * size) || (isOrthographic_ && !(rows_[3].offset > 0)))
             detail::failArgument("the camera's matrices are singular: they make no image");
         if (!isOrthographic_)
             eye_ = meetingPoint(x, y, last);
         // An orthographic camera looks along -z of its view.
-        const detail::Point3 ahead = isOrthographic_ ? detail::Point3{-view[2], -view[6], -view[10]} : last.normal;
-        side_ = detail::dot(detail::cross(x.normal, y.normal), ahead) < 0 ? -1 : 1;
+        const Vec3d ahead = isOrthographic_ ? Vec3d{-view[2], -view[6], -view[10]} : last.normal;
+        side_ = dot(cross(x.normal, y.normal), ahead) < 0 ? -1 : 1;
     }
 
     // Whether all rays have one direction.
     bool isOrthographic() const noexcept { return isOrthographic_; }
 
     // Where all rays begin. Of no use for an orthographic camera.
-    Vec3 eye() const noexcept { return detail::vecOf(eye_); }
+    Vec3 eye() const noexcept { return toFloat(eye_); }
     // See dfb/render/visibility.hpp.
     std::optional<Vec3> commonEye() const
     {
@@ -74,10 +74,10 @@ public:
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
     {
         const Plane column = through(rows_[0], 2 * x / width - 1), row = through(rows_[1], 1 - 2 * y / height);
-        const detail::Point3 direction = side_ * detail::normalized(detail::cross(column.normal, row.normal));
+        const Vec3d direction = side_ * normalize(cross(column.normal, row.normal));
         if (!isOrthographic_)
-            return {eye(), detail::vecOf(direction)};
-        return {detail::vecOf(meetingPoint(column, row, nearPlane())), detail::vecOf(direction)};
+            return {eye(), toFloat(direction)};
+        return {toFloat(meetingPoint(column, row, nearPlane())), toFloat(direction)};
     }
 
     // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
@@ -88,8 +88,8 @@ public:
                               * std::max(detail::length(rows_[0].normal) * width,
                                          detail::length(rows_[1].normal) * height); // per unit, times w
         const double unit = isOrthographic_ ? 1 : detail::length(w.normal);         // w at distance 1
-        return detail::footprintOf(bounds, width, height, [&](const detail::Point3& p) {
-            const detail::Point3 d = p - eye_;
+        return detail::footprintOf(bounds, width, height, [&](const Vec3d& p) {
+            const Vec3d d = p - eye_;
             const double depth = w.at(p);
             const double way = isOrthographic_ ? std::fabs(nearPlane().at(p)) / detail::length(nearPlane().normal) : 0;
             const double largest = detail::length(p) + detail::length(eye_) + 2 * way;
@@ -104,10 +104,10 @@ public:
 private:
     // The points p with dot(normal, p) + offset == 0; also a row of a matrix.
     struct Plane {
-        detail::Point3 normal;
+        Vec3d normal;
         double offset = 0;
 
-        double at(const detail::Point3& p) const { return detail::dot(normal, p) + offset; }
+        double at(const Vec3d& p) const { return dot(normal, p) + offset; }
     };
 
     // Where `row` is `k` times w.
@@ -117,15 +117,14 @@ private:
     }
     Plane nearPlane() const { return through(rows_[2], -1); }
 
-    static detail::Point3 meetingPoint(const Plane& a, const Plane& b, const Plane& c)
+    static Vec3d meetingPoint(const Plane& a, const Plane& b, const Plane& c)
     {
-        const detail::Point3 ab = detail::cross(a.normal, b.normal), bc = detail::cross(b.normal, c.normal),
-                             ca = detail::cross(c.normal, a.normal);
-        return (-1 / detail::dot(a.normal, bc)) * (a.offset * bc + b.offset * ca + c.offset * ab);
+        const Vec3d ab = cross(a.normal, b.normal), bc = cross(b.normal, c.normal), ca = cross(c.normal, a.normal);
+        return (-1 / dot(a.normal, bc)) * (a.offset * bc + b.offset * ca + c.offset * ab);
     }
 
     Plane rows_[4]; // of the product of both matrices: x, y, z, w
-    detail::Point3 eye_;
+    Vec3d eye_;
     double side_ = 1;
     bool isOrthographic_ = false;
 };
@@ -147,10 +146,10 @@ public:
 
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
     {
-        const detail::Point3 sharp = focus_ * pose_.through(x, y, width, height);
+        const Vec3d sharp = focus_ * pose_.through(x, y, width, height);
         const double r = radius_ * std::sqrt(sample.lensU), angle = 2 * detail::pi * sample.lensV;
-        const detail::Point3 onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
-        return {detail::vecOf(pose_.eye + onLens), detail::vecOf(detail::normalized(sharp - onLens))};
+        const Vec3d onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
+        return {toFloat(pose_.eye + onLens), toFloat(normalize(sharp - onLens))};
     }
 
     Footprint project(const Box3& bounds, int width, int height) const
@@ -182,9 +181,9 @@ public:
         const bool right = x >= 0.5 * width;
         const double scale = 2 * pose_.tangent / height, offset = right ? 0.5 * separation_ : -0.5 * separation_;
         const double u = (x - (right ? 0.75 : 0.25) * width) * scale, v = (0.5 * height - y) * scale;
-        const detail::Point3 aside = offset * pose_.right;
-        const detail::Point3 to = convergence_ * (pose_.forward + u * pose_.right + v * pose_.up);
-        return {detail::vecOf(pose_.eye + aside), detail::vecOf(detail::normalized(to - aside))};
+        const Vec3d aside = offset * pose_.right;
+        const Vec3d to = convergence_ * (pose_.forward + u * pose_.right + v * pose_.up);
+        return {toFloat(pose_.eye + aside), toFloat(normalize(to - aside))};
     }
 
     // One per eye, each in its half.
@@ -211,7 +210,7 @@ private:
 // `angle` / 2 off it; nothing is seen outside.
 class DomeCamera {
 public:
-    // Throws InvalidArgument for an angle that is not in (0, 360] degrees.
+    // Throws InvalidArgument for an angle that is not in (0, 360] degrees, or if `view` is 0 or `up` is along it.
     DomeCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float angle = 180)
         : pose_(detail::poseOf(eye, view, up)), border_(0.5 * static_cast<double>(angle) * detail::pi / 180)
     {
@@ -224,26 +223,27 @@ public:
         const double radius = 0.5 * std::min(width, height), px = (x - 0.5 * width) / radius,
                      py = (0.5 * height - y) / radius, r = std::hypot(px, py);
         if (r > 1)
-            return {detail::vecOf(pose_.eye), {0, 0, 0}};
+            return {toFloat(pose_.eye), {0, 0, 0}};
         const double angle = r * border_, aside = r > 0 ? std::sin(angle) / r : 0;
-        const detail::Point3 d = std::cos(angle) * pose_.forward + px * aside * pose_.right + py * aside * pose_.up;
-        return {detail::vecOf(pose_.eye), detail::vecOf(detail::normalized(d))};
+        const Vec3d d = std::cos(angle) * pose_.forward + px * aside * pose_.right + py * aside * pose_.up;
+        return {toFloat(pose_.eye), toFloat(normalize(d))};
     }
+
+    std::optional<Vec3> commonEye() const { return toFloat(pose_.eye); }
 
     // Around the sphere that holds the box. Angles along a radius come out to scale; across, angles at theta off the
     // view are stretched by theta / sin(theta).
     Footprint project(const Box3& bounds, int width, int height) const
     {
-        const detail::Point3 lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
-        const detail::Point3 to = 0.5 * (lower + upper) - pose_.eye;
+        const Vec3d lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
+        const Vec3d to = 0.5 * (lower + upper) - pose_.eye;
         const double sphere = 0.5 * detail::length(upper - lower)
                               + 1e-6 * (detail::length(upper) + detail::length(pose_.eye)),
                      distance = detail::length(to);
         if (distance <= sphere)
             return Footprint::whole(width, height);
-        const double half = std::asin(sphere / distance), x = detail::dot(to, pose_.right),
-                     y = detail::dot(to, pose_.up),
-                     theta = std::atan2(std::hypot(x, y), detail::dot(to, pose_.forward)), farthest = theta + half;
+        const double half = std::asin(sphere / distance), x = dot(to, pose_.right), y = dot(to, pose_.up),
+                     theta = std::atan2(std::hypot(x, y), dot(to, pose_.forward)), farthest = theta + half;
         if (theta - half > border_)
             return {};
         if (farthest > 2.6) // near the point behind, which is stretched to a circle
@@ -271,18 +271,18 @@ public:
     // 0, `up` is 0 or along it, `fovY` is not in (0, 180), the axis has length 0, or `degrees` is not within +-360.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
-        : pose_(detail::poseOf(eye, view, up, fovY)), center_(detail::pointOf(center)), axis_(detail::pointOf(axis)),
+        : pose_(detail::poseOf(eye, view, up, fovY)), center_(toDouble(center)), axis_(toDouble(axis)),
           angle_(static_cast<double>(degrees) * detail::pi / 180)
     {
         if (!(detail::length(axis_) > 0) || !(std::fabs(angle_) <= 2 * detail::pi))
             detail::failArgument("the camera turns around an axis, by a full turn at most");
-        axis_ = detail::normalized(axis_);
+        axis_ = normalize(axis_);
     }
 
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
     {
         const detail::Pose pose = at(sample.time);
-        return {detail::vecOf(pose.eye), detail::vecOf(detail::normalized(pose.through(x, y, width, height)))};
+        return {toFloat(pose.eye), toFloat(normalize(pose.through(x, y, width, height)))};
     }
 
     // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho
@@ -291,7 +291,7 @@ public:
     {
         double rho = 0;
         for (int corner = 0; corner < 8; ++corner)
-            rho = std::max(rho, detail::length(detail::cross(detail::cornerOf(bounds, corner) - center_, axis_)));
+            rho = std::max(rho, detail::length(cross(detail::cornerOf(bounds, corner) - center_, axis_)));
         const int parts = 1 + static_cast<int>(std::fabs(angle_) * 32);
         const auto pad = static_cast<float>(rho * 0.5 * std::fabs(angle_) / parts * 1.000001);
         const Box3 padded{bounds.lower - Vec3{pad, pad, pad}, bounds.upper + Vec3{pad, pad, pad}};
@@ -302,10 +302,9 @@ public:
     }
 
 private:
-    detail::Point3 turned(const detail::Point3& v, double angle) const // Rodrigues
+    Vec3d turned(const Vec3d& v, double angle) const // Rodrigues
     {
-        return std::cos(angle) * v + std::sin(angle) * detail::cross(axis_, v)
-               + (1 - std::cos(angle)) * detail::dot(axis_, v) * axis_;
+        return std::cos(angle) * v + std::sin(angle) * cross(axis_, v) + (1 - std::cos(angle)) * dot(axis_, v) * axis_;
     }
     detail::Pose at(double time) const
     {
@@ -315,7 +314,7 @@ private:
     }
 
     detail::Pose pose_;
-    detail::Point3 center_, axis_;
+    Vec3d center_, axis_;
     double angle_;
 };
 

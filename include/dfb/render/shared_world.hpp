@@ -4,7 +4,6 @@
 
 #include <dfb/base/detect.hpp>
 #include <dfb/compiled.hpp>
-#include <dfb/render/cameras.hpp>
 #include <dfb/render/visibility.hpp>
 #include <dfb/tile.hpp>
 
@@ -183,8 +182,8 @@ private:
 
 } // namespace detail
 
-// Returns the bricks, by their place in SharedWorld::bricks(), such that no ray from `eye` meets one before another
-// that stands earlier in the list. Takes time with the square of their number. Throws InvalidArgument if two overlap,
+// Returns the bricks front to back as seen from `eye`, by their place in SharedWorld::bricks(). Takes time with the
+// square of their number. Any thread. Waits for nothing. Throws InvalidArgument if two overlap,
 // or if there is no such order: three boxes can each be in front of the next.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
 {
@@ -194,10 +193,14 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
     return bricks.order();
 }
 
-// Returns this order for all rays of a camera, also of an orthographic one. Throws likewise.
-inline std::vector<int> visibilityOrder(const SharedWorld& world, const MatrixCamera& camera)
+// Returns this order for all rays of a camera that has commonEye(), also of an orthographic one. Throws likewise.
+template <class Camera, std::enable_if_t<detail::has_common_eye_v<Camera>, int> = 0>
+std::vector<int> visibilityOrder(const SharedWorld& world, const Camera& camera)
 {
-    return visibilityOrder(world, *camera.commonEye());
+    const std::optional<Vec3> eye = camera.commonEye();
+    if (!eye)
+        detail::failArgument("the rays of this camera have no common eye: there is no order for all of them");
+    return visibilityOrder(world, *eye);
 }
 
 DFB_NAMESPACE_END

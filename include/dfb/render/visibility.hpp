@@ -128,20 +128,9 @@ DFB_COMPILED_ONCE std::vector<PixelPoint> Footprint::hullOf(std::vector<PixelPoi
 
 namespace detail {
 
-struct Point3 {
-    double x = 0, y = 0, z = 0;
-};
-inline Point3 operator+(const Point3& a, const Point3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Point3 operator-(const Point3& a, const Point3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Point3 operator*(double s, const Point3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
-inline double dot(const Point3& a, const Point3& b) noexcept { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Point3 cross(const Point3& a, const Point3& b) noexcept
-{
-    return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
-}
-inline double length(const Point3& a) noexcept { return std::sqrt(dot(a, a)); }
+inline double length(const Vec3d& a) noexcept { return std::sqrt(dot(a, a)); }
 
-inline Point3 cornerOf(const Box3& b, int corner) noexcept
+inline Vec3d cornerOf(const Box3& b, int corner) noexcept
 {
     const auto pick = [corner](int bit, float lower, float upper) {
         return static_cast<double>(corner & bit ? upper : lower);
@@ -151,20 +140,13 @@ inline Point3 cornerOf(const Box3& b, int corner) noexcept
 
 inline constexpr double pi = 3.14159265358979323846;
 
-inline Point3 pointOf(const Vec3& v) { return {v.x, v.y, v.z}; }
-inline Vec3 vecOf(const Point3& p)
-{
-    return {static_cast<float>(p.x), static_cast<float>(p.y), static_cast<float>(p.z)};
-}
-inline Point3 normalized(const Point3& p) { return (1 / length(p)) * p; }
-
 // Where the eye is and how it looks; the axes are orthonormal.
 struct Pose {
-    Point3 eye, forward, right, up;
+    Vec3d eye, forward, right, up;
     double tangent = 0; // of half the vertical angle of view
 
     // From the eye to a point of the image that is 1 away along `forward`.
-    Point3 through(double x, double y, int width, int height) const
+    Vec3d through(double x, double y, int width, int height) const
     {
         const double scale = 2 * tangent / height;
         return forward + (x - 0.5 * width) * scale * right + (0.5 * height - y) * scale * up;
@@ -174,13 +156,13 @@ struct Pose {
 // Throws InvalidArgument if the view or `up` are none.
 inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 {
-    const Point3 v = pointOf(view), side = cross(v, pointOf(up));
+    const Vec3d v = toDouble(view), side = cross(v, toDouble(up));
     if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
         failArgument("the camera's view or up vector is degenerate");
     Pose pose;
-    pose.eye = pointOf(eye);
-    pose.forward = normalized(v);
-    pose.right = normalized(side);
+    pose.eye = toDouble(eye);
+    pose.forward = normalize(v);
+    pose.right = normalize(side);
     pose.up = cross(pose.right, pose.forward);
     return pose;
 }
@@ -251,8 +233,8 @@ DFB_COMPILED_ONCE Footprint projectBox(const Box3& bounds, const Pose& pose, int
                                        double lensRadius, double focusDistance)
 {
     const double pixelsPerUnit = 0.5 * height / pose.tangent; // at distance 1
-    return footprintOf(bounds, width, height, [&](const Point3& p) {
-        const Point3 d = p - pose.eye;
+    return footprintOf(bounds, width, height, [&](const Vec3d& p) {
+        const Vec3d d = p - pose.eye;
         const double depth = dot(d, pose.forward);
         return SeenCorner{depth,
                           1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)), // the axes are rounded to float
@@ -287,23 +269,24 @@ public:
     }
 
     // Looks along `view`, of any length: also where the eye is so far from the origin that no target near it is exact.
+    // Throws as above.
     static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
     {
         return PerspectiveCamera(detail::poseOf(eye, view, up, fovY));
     }
 
-    Vec3 eye() const noexcept { return detail::vecOf(pose_.eye); }
+    Vec3 eye() const noexcept { return toFloat(pose_.eye); }
     std::optional<Vec3> commonEye() const noexcept { return eye(); } // see the top of this file
 
     // The axes of the camera: unit vectors at right angles to each other.
-    Vec3 forward() const noexcept { return detail::vecOf(pose_.forward); }
-    Vec3 right() const noexcept { return detail::vecOf(pose_.right); }
-    Vec3 up() const noexcept { return detail::vecOf(pose_.up); }
+    Vec3 forward() const noexcept { return toFloat(pose_.forward); }
+    Vec3 right() const noexcept { return toFloat(pose_.right); }
+    Vec3 up() const noexcept { return toFloat(pose_.up); }
 
     // The unit direction from the eye through point (x, y) of the image, in pixels; pixel centres are at .5.
     Vec3 direction(double x, double y, int width, int height) const
     {
-        return detail::vecOf(detail::normalized(pose_.through(x, y, width, height)));
+        return toFloat(normalize(pose_.through(x, y, width, height)));
     }
     Ray ray(double x, double y, int width, int height, const LensSample& = {}) const
     {

@@ -11,20 +11,39 @@
 
 DFB_NAMESPACE_BEGIN
 
-struct Vec3 {
-    float x = 0, y = 0, z = 0;
-};
+// Three coordinates. Real: float or double.
+template <class Real>
+struct Vector3 {
+    Real x = 0, y = 0, z = 0;
 
-inline Vec3 operator+(const Vec3& a, const Vec3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
-inline Vec3 operator-(const Vec3& a, const Vec3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
-inline Vec3 operator*(float s, const Vec3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
-inline Vec3 operator*(const Vec3& a, float s) noexcept { return s * a; }
-inline float dot(const Vec3& a, const Vec3& b) noexcept { return a.x * b.x + a.y * b.y + a.z * b.z; }
-inline Vec3 cross(const Vec3& a, const Vec3& b) noexcept
+    friend Vector3 operator+(const Vector3& a, const Vector3& b) noexcept { return {a.x + b.x, a.y + b.y, a.z + b.z}; }
+    friend Vector3 operator-(const Vector3& a, const Vector3& b) noexcept { return {a.x - b.x, a.y - b.y, a.z - b.z}; }
+    friend Vector3 operator*(Real s, const Vector3& a) noexcept { return {s * a.x, s * a.y, s * a.z}; }
+    friend Vector3 operator*(const Vector3& a, Real s) noexcept { return s * a; }
+};
+using Vec3 = Vector3<float>;
+using Vec3d = Vector3<double>;
+
+template <class Real>
+Real dot(const Vector3<Real>& a, const Vector3<Real>& b) noexcept
+{
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+template <class Real>
+Vector3<Real> cross(const Vector3<Real>& a, const Vector3<Real>& b) noexcept
 {
     return {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
 }
-inline Vec3 normalize(const Vec3& a) noexcept { return (1.0f / std::sqrt(dot(a, a))) * a; }
+template <class Real>
+Vector3<Real> normalize(const Vector3<Real>& a) noexcept
+{
+    return (1 / std::sqrt(dot(a, a))) * a;
+}
+inline Vec3d toDouble(const Vec3& v) noexcept { return {v.x, v.y, v.z}; }
+inline Vec3 toFloat(const Vec3d& v) noexcept
+{
+    return {static_cast<float>(v.x), static_cast<float>(v.y), static_cast<float>(v.z)};
+}
 
 // An axis-aligned box, in the user's unit of length. Renderers treat it as half-open, [lower, upper), so that two
 // bricks that share a face share no point.

@@ -177,6 +177,17 @@ TEST_CASE("Without a lens, between the eyes and at rest cameras are the pinhole"
     CHECK(dome.ray(14.9, 45, 120, 90).direction.x == 0.0f);
 }
 
+TEST_CASE("The rays of a dome have one eye", "[cameras]")
+{
+    const dfb::DomeCamera dome(eye, view, up, 300);
+    const auto common = dome.commonEye();
+    REQUIRE(common);
+    for (const double x : {3.0, 60.0, 110.0}) {
+        const dfb::Vec3 off = dome.ray(x, 40, 120, 90).origin - *common;
+        CHECK(dot(off, off) == 0.0f);
+    }
+}
+
 TEST_CASE("A matrix camera's rays meet the points that its matrices project there", "[cameras]")
 {
     const int width = 120, height = 90;
@@ -201,7 +212,7 @@ TEST_CASE("A matrix camera's rays meet the points that its matrices project ther
             const dfb::Box3 box{at - half, at + half};
             float x0 = 1e9f, x1 = -1e9f, y0 = 1e9f, y1 = -1e9f, w = 1;
             for (int corner = 0; corner < 8; ++corner) {
-                const auto c = dfb::detail::vecOf(dfb::detail::cornerOf(box, corner));
+                const auto c = dfb::toFloat(dfb::detail::cornerOf(box, corner));
                 const dfb::Vec3 q = pixelOf(v, p, c, width, height);
                 x0 = std::min(x0, q.x), x1 = std::max(x1, q.x), y0 = std::min(y0, q.y), y1 = std::max(y1, q.y);
                 w = std::min(w, q.z);

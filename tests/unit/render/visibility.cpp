@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <cmath>
 #include <limits>
+#include <optional>
 #include <random>
 #include <set>
 #include <string>
@@ -336,6 +337,8 @@ TEST_CASE("The bricks of a bisection have an order from anywhere", "[visibility_
         withWorld(bricks, [&](const dfb::SharedWorld& world) {
             const std::vector<int> order = dfb::visibilityOrder(world, eye);
             REQUIRE(order.size() == bricks.size());
+            const dfb::PerspectiveCamera camera(eye, {eye.x, eye.y, eye.z - 1}, {0, 1, 0}, 45);
+            CHECK(dfb::visibilityOrder(world, camera) == order);
             int wrong = 0;
             for (int ray = 0; ray < 300; ++ray) {
                 const double d[3] = {uniform(-1, 1), uniform(-1, 1), uniform(-1, 1)};
@@ -392,6 +395,16 @@ TEST_CASE("The bricks of a bisection have an order along any direction", "[visib
             CHECK(hits > 50);
         });
     }
+}
+
+TEST_CASE("For a camera without a common eye there is no order", "[visibility_order]")
+{
+    struct Lens {
+        std::optional<dfb::Vec3> commonEye() const { return std::nullopt; }
+    };
+    withWorld({}, [](const dfb::SharedWorld& world) {
+        CHECK_THROWS_AS(dfb::visibilityOrder(world, Lens()), dfb::InvalidArgument);
+    });
 }
 
 TEST_CASE("Bricks that overlap or stand in a circle have no order", "[visibility_order]")
