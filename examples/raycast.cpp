@@ -54,11 +54,18 @@ Volume volumeOf(const std::string& path)
 // A trefoil knot: how near the point is to it.
 float knot(float x, float y, float z)
 {
+    static const auto points = [] {
+        std::array<dfb::Vec3, 180> all;
+        for (std::size_t i = 0; i < all.size(); ++i) {
+            const float t = 6.2831853f * static_cast<float>(i) / 180;
+            all[i] = {12 * (std::sin(t) + 2 * std::sin(2 * t)), 12 * (std::cos(t) - 2 * std::cos(2 * t)),
+                      -14 * std::sin(3 * t)};
+        }
+        return all;
+    }();
     float nearest = std::numeric_limits<float>::max();
-    for (int i = 0; i < 180; ++i) {
-        const float t = 6.2831853f * static_cast<float>(i) / 180;
-        const dfb::Vec3 way{x - 48 - 12 * (std::sin(t) + 2 * std::sin(2 * t)),
-                            y - 48 - 12 * (std::cos(t) - 2 * std::cos(2 * t)), z - 48 + 14 * std::sin(3 * t)};
+    for (const dfb::Vec3& point : points) {
+        const dfb::Vec3 way = dfb::Vec3{x - 48, y - 48, z - 48} - point;
         nearest = std::min(nearest, dot(way, way));
     }
     return std::exp(-nearest / 60);

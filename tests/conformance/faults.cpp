@@ -320,58 +320,6 @@ TEST_CASE("A message is damaged in up to 8 bytes, or its end is missing")
     CHECK(cut == Approx(500).epsilon(0.1)); // one in four
 }
 
-namespace {
-
-// Sees what has become of the message that faults were asked for last.
-struct Measuring : InprocTransport {
-    using InprocTransport::InprocTransport;
-    void send(int destination, Buffer&& message)
-    {
-        if (message.size() < std::exchange(bytesAsked, 0))
-            ++cutMessages;
-        InprocTransport::send(destination, std::move(message));
-    }
-
-    inline static thread_local std::size_t bytesAsked = 0;
-    inline static std::atomic<int> cutMessages{0};
-};
-
-} // namespace
-
-TEST_CASE("A message without its end is found")
-{
-    FaultOptions faults;
-    faults.corrupt = 0.1;
-    faults.maxLethal = 1;
-    faults.only = [](int, const Buffer& message) {
-        Measuring::bytesAsked = message.size();
-        return message.size() >= 1000;
-    };
-    testing::ConformanceOptions options;
-    options.largestMessage = std::size_t{1} << 16;
-    options.smallMessages = 100;
-    options.modes = {Progress::Caller};
-    options.timeLimit = std::chrono::milliseconds(300);
-    bool found = false;
-    for (faults.seed = 1; !found && faults.seed <= 60; ++faults.seed) {
-        Measuring::cutMessages = 0;
-        faults.counts = std::make_shared<testing::FaultCounts>();
-        std::string text;
-        runRanks(2, [&](const InprocCommunicator& communicator) {
-            const auto failures =
-                testing::checkTransport<testing::FaultTransport<Measuring>>({communicator, faults}, options);
-            if (communicator.rank() == 0)
-                text = testing::describeFailures(failures);
-        });
-        if (Measuring::cutMessages == 0 || faults.counts->corrupted > Measuring::cutMessages)
-            continue;
-        found = true;
-        INFO("seed " << faults.seed << ": " << text);
-        CHECK(text.find(" bytes came") != std::string::npos);
-    }
-    CHECK(found);
-}
-
 TEST_CASE("A nap is not longer than what is held")
 {
     std::chrono::steady_clock::duration time{0};

@@ -130,18 +130,6 @@ TEST_CASE("A lost message is found, and named")
     CHECK(contains(text, " of " + std::to_string(size) + " bytes is missing"));
 }
 
-TEST_CASE("Messages lost at random are found")
-{
-    FaultOptions faults;
-    faults.seed = 1;
-    faults.drop = 0.05;
-    CAPTURE(faults.seed);
-    const std::string text = checkFaulty(2, faults, impatient());
-    INFO(text);
-    CHECK(failedOnAll(text, 2));
-    CHECK(contains(text, "no message from rank "));
-}
-
 TEST_CASE("A message that comes twice is found, unless that is allowed")
 {
     FaultOptions faults;

@@ -38,6 +38,13 @@ set(door_of_mpi comm/mpi_calls.hpp)
 set(door_of_snappy comm/snappy_codec.hpp)
 set(door_of_tbb tbb_executor.hpp)
 
+# The calls of MPI that the library makes. They wait for no other rank: in those that do, MPI libraries spin, hold their
+# lock, and wait for ever for a rank that has failed. MPI_Finalize() is for MpiSession alone. "Request" is a type.
+set(calls_of_mpi
+    Abort Cancel Comm_free Comm_get_attr Comm_idup Comm_rank Comm_set_errhandler Comm_size Error_class Error_string
+    Finalize Get_count Get_processor_name Iallgather Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv Isend Issend
+    Query_thread Request Test Test_cancelled Testall Testsome)
+
 # Who must not see whom, however many includes are in between. Rooms are folders; of the headers at the root those count
 # as pixels that say what a tile is and what is made of it.
 set(pixels "^((image|levels|tile|tile_layout|fragment|dependency_tracker|channels|tile_op|pixel_op)|(blend|ops)/.*)\\.hpp$")
@@ -108,6 +115,18 @@ foreach(header IN LISTS headers)
           "includes point down")
       endif()
     endif()
+  endforeach()
+
+  file(STRINGS ${root_of_${header}}/dfb/${header} lines REGEX "MPI_[A-Z][a-z_]+\\(")
+  foreach(line IN LISTS lines)
+    string(REGEX REPLACE "//.*$|\"[^\"]*\"" "" line "${line}")
+    string(REGEX MATCHALL "MPI_[A-Z][a-z_]+\\(" calls "${line}")
+    foreach(call IN LISTS calls)
+      string(REGEX REPLACE "MPI_(.*)\\(" "\\1" call "${call}")
+      if(NOT call IN_LIST calls_of_mpi)
+        message(SEND_ERROR "${header}: MPI_${call} may wait for other ranks")
+      endif()
+    endforeach()
   endforeach()
 
   file(STRINGS ${root_of_${header}}/dfb/${header} found REGEX "^[ \t]*using[ \t]+namespace")

@@ -43,7 +43,7 @@ _add_live_job(interrupt.np3 interrupt ${_mpi} 3 ${_render} --live 0)
 _add_live_job(interrupt.busy.np2 interrupt ${_mpi} 2 ${_render} --path 64 --mode image --size 1024x768 --spp 4096 --live 0)
 _add_live_job(interrupt.in_situ.np2 interrupt ${_mpi} 2 $<TARGET_FILE:in_situ> ${MPIEXEC_POSTFLAGS} --size 32 --live 0)
 _add_live_job(rest.np2 rest ${_mpi} 2 ${_render} --spp 4 --live 0)
-set_tests_properties(live.job.rest.np2 PROPERTIES RUN_SERIAL ON) # it measures processor time, which others need not have
+set_tests_properties(live.job.rest.np2 PROPERTIES ${_undisturbed}) # it measures processor time, which others need not have
 _add_live_job(fire.np2 fire ${_mpi} 2 ${_render} --live 0)
 add_test(NAME live.taken COMMAND ${_limit} $<TARGET_FILE:dfb_live_job> taken $<TARGET_FILE:dfb_render> demo --size 16x16
   --ranks 1 --live 0)
@@ -55,7 +55,7 @@ add_test(NAME live.browser COMMAND ${CMAKE_COMMAND} -E env
   DFB_RENDER=$<TARGET_FILE:dfb_render> DFB_IN_SITU=$<TARGET_FILE:in_situ> "DFB_MPIEXEC=${_mpi}"
   "DFB_LIVE_NODE_MODULES=${DFB_LIVE_NODE_MODULES}"
   sh ${CMAKE_CURRENT_SOURCE_DIR}/live/browser.sh --only-if-installed ${CMAKE_CURRENT_BINARY_DIR}/live_browser)
-set_tests_properties(live.browser PROPERTIES LABELS example TIMEOUT 300 RUN_SERIAL ON SKIP_RETURN_CODE 77)
+set_tests_properties(live.browser PROPERTIES LABELS example TIMEOUT 300 COST 1000 SKIP_RETURN_CODE 77)
 
 # A trace in speedscope, with the same browser: see speedscope.sh.
 add_test(NAME render.speedscope COMMAND ${CMAKE_COMMAND} -E env DFB_RENDER=$<TARGET_FILE:dfb_render>

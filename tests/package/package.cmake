@@ -82,7 +82,7 @@ foreach(_component IN LISTS _others)
     COMPONENTS ${_component} EXPECT ${_component} WITHOUT ${_without})
 endforeach()
 
-# The library compiled once, by the stranger's project: of the package, with core alone, and of the sources.
+# The library compiled once, by the stranger's project: of the package, and, with core alone, of the sources.
 # With MPI it also builds what a stranger writes from the documentation alone.
 set(_door "")
 if(TARGET dfb::mpi)
@@ -96,8 +96,6 @@ if(_door)
     COMMAND ${CMAKE_CURRENT_BINARY_DIR}/package/find_package_compiled/door)
   set_tests_properties(package.door.np1 package.door.np3 PROPERTIES FIXTURES_REQUIRED dfb_door)
 endif()
-dfb_add_package_test(find_package_core_compiled HOW find_package COMPONENTS core WITHOUT MPI TBB Snappy
-  OPTIONS -DFRAME=ON -DCOMPILED=ON)
 dfb_add_package_test(add_subdirectory_compiled HOW add_subdirectory WITHOUT MPI TBB Snappy
   OPTIONS -DDFB_WITH_MPI=OFF -DDFB_WITH_TBB=OFF -DDFB_WITH_SNAPPY=OFF -DFRAME=ON -DCOMPILED=ON)
 
