@@ -45,24 +45,22 @@ inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
     return static_cast<std::uint8_t>(below + (overTie.high > 0 ? 1 : 0));
 }
 
-// srgbThresholds()[k] is the least double whose sRGB level is k + 1: the decision is a comparison and so exact, where
-// evaluating the curve would be off near every boundary.
-inline const std::array<double, 255>& srgbThresholds()
+// The linear value of so many half levels, to about 100 bits.
+inline DoubleDouble srgbInverse(int halves) noexcept
 {
-    static const std::array<double, 255> table = [] {
-        std::array<double, 255> t{};
-        for (int k = 0; k < 255; ++k) {
-            const long double s = (static_cast<long double>(k) + 0.5L) / 255.0L;
-            const long double exact = s <= 0.04045L ? s / 12.92L : std::pow((s + 0.055L) / 1.055L, 2.4L);
-            auto least = static_cast<double>(exact);
-            if (static_cast<long double>(least) < exact)
-                least = std::nextafter(least, 1.0);
-            t[static_cast<std::size_t>(k)] = least;
-        }
-        return t;
-    }();
-    return table;
+    const DoubleDouble s = DoubleDouble{static_cast<double>(halves), 0} / 510;
+    if (s.high < 0.04045)
+        return s * DoubleDouble{100, 0} / 1292;
+    const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
+    const DoubleDouble base3 = base * base * base, base12 = base3 * base3 * base3 * base3;
+    // t^5 = base^12: one step of Newton's from a double doubles the digits.
+    const DoubleDouble t{std::pow(base.high, 2.4), 0}, t2 = t * t, t4 = t2 * t2, t5 = t4 * t;
+    const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
+    return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
 }
+
+// Where level k ends and the next begins.
+inline DoubleDouble srgbBoundary(int k) noexcept { return srgbInverse(2 * k + 1); }
 
 // The thresholds as a table by the upper bits of the value: the exponent from 2^-13 on and 7 bits of the mantissa give
 // one of 13 * 128 + 1 cells. No cell has more than one threshold, and none is near a cell's edge. So one comparison
@@ -78,8 +76,11 @@ public:
 
     SrgbCells()
     {
-        const auto& t = srgbThresholds();
-        std::copy(t.begin(), t.end(), thresholds_.begin());
+        for (int k = 0; k < 255; ++k) { // the least double of the level after k: so a comparison decides
+            const DoubleDouble boundary = srgbBoundary(k);
+            thresholds_[static_cast<std::size_t>(k)] =
+                boundary.low > 0 ? std::nextafter(boundary.high, 2.0) : boundary.high;
+        }
         thresholds_.back() = 2; // never reached nor near
         std::size_t level = 0;
         for (std::size_t cell = 0; cell < count; ++cell) {
@@ -132,23 +133,6 @@ inline std::uint8_t toSrgb8(double linear) noexcept
     bool isNear = false;
     return srgbCells().levelOf(linear, isNear);
 }
-
-// The linear value of so many half levels, to about 100 bits.
-inline DoubleDouble srgbInverse(int halves) noexcept
-{
-    const DoubleDouble s = DoubleDouble{static_cast<double>(halves), 0} / 510;
-    if (s.high < 0.04045)
-        return s * DoubleDouble{100, 0} / 1292;
-    const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
-    const DoubleDouble base3 = base * base * base, base12 = base3 * base3 * base3 * base3;
-    // t^5 = base^12: one step of Newton's from a double doubles the digits.
-    const DoubleDouble t{std::pow(base.high, 2.4), 0}, t2 = t * t, t4 = t2 * t2, t5 = t4 * t;
-    const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
-    return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
-}
-
-// Where level k ends and the next begins.
-inline DoubleDouble srgbBoundary(int k) noexcept { return srgbInverse(2 * k + 1); }
 
 // The sRGB level of a value that is known to about 100 bits.
 inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept

@@ -64,13 +64,13 @@ constexpr bool checkPixelOp()
 {
     static_assert(std::is_copy_constructible_v<T>, "dfb: PixelOp must provide a copy constructor");
     static_assert(has_process_v<T>, "dfb: PixelOp must provide void process(PixelTile&) const");
+    static_assert(std::is_same_v<typename FrameDataOf<T>::type, NoFrameData> || has_pixel_new_frame_v<T>,
+                  "dfb: a PixelOp with a FrameData must provide void newFrame(const FrameData&)");
     return is_pixel_op_v<T>;
 }
 
 } // namespace detail
 
-// The pixel operations that come with dfb: tone mapping, and a chain of two.
-//
 // Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
 // (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. Pixels of
 // alpha 0 are treated as if it were 1, so that emission is kept.

@@ -22,13 +22,15 @@ public:
     static constexpr int maxImageSize = 1 << 16; // pixels a side
 
     TileLayout() = default;
-    // Throws InvalidArgument for a size outside [1, 65536].
+    // Throws InvalidArgument for an image size outside [1, 65536], or a tile size below 1.
     TileLayout(int width, int height, int tileSize) : TileLayout(width, height, tileSize, tileSize) {}
     TileLayout(int width, int height, int tileWidth, int tileHeight)
         : width_(width), height_(height), tileWidth_(tileWidth), tileHeight_(tileHeight)
     {
         if (width < 1 || height < 1 || width > maxImageSize || height > maxImageSize)
             detail::failArgument("the image size is %dx%d, it must be 1 to 65536 pixels a side", width, height);
+        if (tileWidth < 1 || tileHeight < 1)
+            detail::failArgument("the tile size is %dx%d, it must be 1 or more", tileWidth, tileHeight);
         tilesX_ = (width + tileWidth - 1) / tileWidth;
         tilesY_ = (height + tileHeight - 1) / tileHeight;
     }
@@ -42,6 +44,7 @@ public:
     int tilesY() const noexcept { return tilesY_; }
     int tileCount() const noexcept { return tilesX_ * tilesY_; }
 
+    // Nobody checks these arguments.
     int column(int tile) const noexcept { return tile % tilesX_; }
     int row(int tile) const noexcept { return tile / tilesX_; }
     int tileAt(int column, int row) const noexcept { return row * tilesX_ + column; }

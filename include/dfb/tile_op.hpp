@@ -1,9 +1,9 @@
 // The contract of a tile operation (TileOp): how the inputs of one tile become a finished tile.
 //
-// A TileOp is a default-constructible type. A rank keeps one object for each tile that it owns, for each frame in
-// flight. Calls for one tile come one after the other, from any worker, so the operation needs no mutex; calls for
-// different tiles come at once. It does not know the framebuffer, messages or threads. An exception makes the frame
-// fail on all ranks, with its text.
+// A TileOp is a default-constructible type. A rank makes an object when a tile that it owns first needs one, for each
+// frame in flight. If owners change, an object without keepsState may serve another tile later. Calls for one tile come
+// one after the other, from any worker, so the operation needs no mutex; calls for different tiles come at once. It
+// does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
 // TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order, empty ones too:
@@ -20,14 +20,15 @@
 //   static constexpr ChannelMask neededChannels; what must travel even if the output does not have it;
 //                                                default: all of `channels`. Depth travels as well where positions
 //                                                or ids of several passes are compared, see channels.hpp
-//   using FrameData = ...;                       copyable per-frame data, given to the framebuffer's begin()
+//   using FrameData = ...;                       per-frame data, given to the framebuffer's begin(): a type that is
+//                                                default-constructible and copy-assignable
 //   static constexpr bool activeByDepth = true;  a pixel of an input is active if its depth is below +infinity,
 //                                                whatever its colour; depth must be among neededChannels. Otherwise it
 //                                                is active if one of its four colour channels is not 0, whatever its
 //                                                depth. Only active pixels are sent and reach add()
-//   bool isComplete() const;                     asked after each add(). True: the tile is finished at once, without
-//                                                the inputs still announced. When these come, they are checked and
-//                                                counted, but not given to add()
+//   bool isComplete() const;                     asked after each add(). True: it needs no more inputs. The tile is
+//                                                finished at once, without the inputs still announced. When these
+//                                                come, they are checked and counted, but not given to add()
 //   static constexpr bool readsInPlace = true;   inputs may come as views of a renderer's memory
 //                                                (FragmentEncoding::InPlace) or as bytes: they are read with
 //                                                forEachPixel() or a FragmentCursor, in finish(), and not through
@@ -38,9 +39,9 @@
 //                                                for them
 //   static constexpr bool keepsState = true;     the object keeps values of its tile from frame to frame. A tile may
 //                                                then have no pass in a frame: the image keeps its pixels. TileInfo
-//                                                tells which samples come now. If all samples before were empty,
-//                                                the object was not called for them: TileInfo::emptySamples is
-//                                                their number
+//                                                tells which samples come now. While all samples of a tile are
+//                                                empty, its object is not called; the first newFrame() then has
+//                                                their number in TileInfo::emptySamples
 //   static constexpr bool emptyIsBackground = true;   inputs without any pixel give the background: finish() is then
 //                                                not called and nothing is sent, if the pixel operation is pointwise
 //   void report(TileReport&) const;              after finish(): figures of the tile
@@ -358,11 +359,13 @@ template <class T>
 constexpr bool checkTileOp()
 {
     static_assert(std::is_default_constructible_v<T>,
-                  "dfb: TileOp must provide a default constructor (the framebuffer makes one per owned tile)");
+                  "dfb: TileOp must provide a default constructor (the framebuffer makes its objects)");
     static_assert(has_channels_v<T>, "dfb: TileOp must provide static constexpr ChannelMask channels");
     static_assert(has_new_frame_v<T> || has_new_frame_with_data_v<T>,
                   "dfb: TileOp must provide void newFrame(const TileInfo&) "
                   "or void newFrame(const TileInfo&, const FrameData&)");
+    static_assert(std::is_same_v<typename FrameDataOf<T>::type, NoFrameData> || has_new_frame_with_data_v<T>,
+                  "dfb: a TileOp with a FrameData must provide void newFrame(const TileInfo&, const FrameData&)");
     static_assert(tile_size_v<T> >= 8 && tile_size_v<T> <= 256,
                   "dfb: the tile size of a TileOp must be 8 to 256 pixels");
     static_assert(has_add_v<T>, "dfb: TileOp must provide void add(Fragment&&)");

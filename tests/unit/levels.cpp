@@ -27,7 +27,15 @@ struct Levels {
 // The level by search, and whether a neighbour is within 2^-35 of the value.
 std::uint8_t searchedSrgb8(double value, bool& isNear)
 {
-    const auto& t = dfb::detail::srgbThresholds();
+    static const auto t = [] {
+        std::array<double, 255> all{}; // the least value of each level from 1 on
+        for (int k = 0; k < 255; ++k) {
+            const auto boundary = dfb::detail::srgbBoundary(k);
+            all[static_cast<std::size_t>(k)] =
+                boundary.low > 0 ? std::nextafter(boundary.high, 2.0) : boundary.high;
+        }
+        return all;
+    }();
     const std::ptrdiff_t level = value >= t.front() ? std::upper_bound(t.begin(), t.end(), value) - t.begin() : 0;
     const auto at = [&](std::ptrdiff_t k) { return t[static_cast<std::size_t>(k)]; };
     value = std::min(value, 2.0); // infinity is far from any
@@ -148,7 +156,7 @@ int wrongAround()
     Alone<Real> alone;
     for (int k = 0; k < 255; ++k) {
         alone.addAround((k + 0.5) / 255);
-        alone.addAround(dfb::detail::srgbThresholds()[static_cast<std::size_t>(k)]);
+        alone.addAround(dfb::detail::srgbBoundary(k).high);
     }
     return alone.wrong;
 }

@@ -47,6 +47,12 @@ TEST_CASE("The largest images", "[layout]")
         CHECK_THROWS_AS(dfb::TileLayout(width, height, 64), dfb::InvalidArgument);
 }
 
+TEST_CASE("Tiles without pixels are refused", "[layout]")
+{
+    for (const auto& [width, height] : std::vector<std::pair<int, int>>{{0, 8}, {8, 0}, {-8, 8}})
+        CHECK_THROWS_AS(dfb::TileLayout(5, 5, width, height), dfb::InvalidArgument);
+}
+
 TEST_CASE("tilesIn names exactly the tiles that meet a region", "[layout]")
 {
     const dfb::TileLayout layout(45, 29, 8, 5);

@@ -156,9 +156,13 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
 inline void closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
-    if (row.minTransmittance > 0)
-        for (int i = 0; i < count; ++i)
-            t[i] = t[i] < row.minTransmittance ? 0.0 : t[i];
+    double* low = row.transmittanceLow.empty() ? nullptr : row.transmittanceLow.data() + x;
+    for (int i = 0; row.minTransmittance > 0 && i < count; ++i)
+        if (t[i] < row.minTransmittance) {
+            t[i] = 0;
+            if (low)
+                low[i] = 0;
+        }
 }
 
 // Blends the auxiliary channels that `row` has. Call it before over(), since it needs the alpha from before. `aux`: of

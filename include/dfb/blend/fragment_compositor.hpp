@@ -33,7 +33,7 @@ public:
     {
         rule_ = rule;
         cursors_.clear();
-        inPlace_ = InPlace::Full;
+        isFull_ = true;
         order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         std::size_t made = 0;
         for (; begin != end; ++begin)
@@ -57,9 +57,8 @@ public:
         const bool wantsAux = !row.reach.empty() || !row.aux.normal.empty() || !row.aux.albedo.empty()
                               || !row.aux.position.empty() || !row.aux.primitiveId.empty()
                               || !row.aux.instanceId.empty();
-        if (inPlace_ != InPlace::BySpan && !wantsAux && compositeInPlace(row))
+        if (!wantsAux && compositeInPlace(row))
             return;
-        inPlace_ = InPlace::BySpan;
         const bool isOneRun = takeRows(wantsAux) && !wantsAux;
         const int width = static_cast<int>(row.transmittance.size());
         if (active_.empty()) {
@@ -81,7 +80,6 @@ public:
             } else {
                 compositeRuns(row, wantsAux);
             }
-            inPlace_ = InPlace::Sparse;
         }
     }
 
@@ -111,7 +109,7 @@ public:
         int x = 0, count = 0;
         const float* color = nullptr; // of a single layer, and not in the row; or null
     };
-    // Of the last row: in order, not overlapping. Narrow gaps between them are in the row.
+    // Of the last row: in order, not overlapping. Narrow gaps, and up to 3 empty pixels at either end, belong to them.
     const std::vector<Run>& runs() const noexcept { return runs_; }
 
 private:
@@ -203,17 +201,16 @@ private:
         double* const rgba = row.rgba.data() + 4 * x;
         double* const transmittance = row.transmittance.data() + x;
         const bool isTold = rule_ == BlendRule::InOrder || !detail::haveDepths(layers_);
-        if (inPlace_ == InPlace::Full) {
-            if (!haveOneOrder(count, isTold))
-                return false;
+        if (isFull_ && haveOneOrder(count, isTold)) {
             for (std::size_t k = 0; k < order_.size(); ++k)
                 ordered_[k] = rows_[static_cast<std::size_t>(order_[k])];
-            if (!detail::blendFullRowsAvx2<HasLeast>(ordered_.data(), layers, row.minTransmittance, rgba,
-                                                     transmittance))
-                return false;
-            joinRun(x, count);
-            return true;
+            if (detail::blendFullRowsAvx2<HasLeast>(ordered_.data(), layers, row.minTransmittance, rgba,
+                                                    transmittance)) {
+                joinRun(x, count);
+                return true;
+            }
         }
+        isFull_ = false;
         const auto blend =
             isTold ? detail::blendSparseRowsAvx2<HasLeast, false> : detail::blendSparseRowsAvx2<HasLeast, true>;
         bool isGood = true;
@@ -410,13 +407,7 @@ private:
     BlendRule rule_ = BlendRule::SortByDepth;
     std::array<detail::RowInPlace, detail::mostInPlace> rows_,
         ordered_; // of inputs; and in their order. Not cleared for a row
-    // How inputs in place are read in the next row. A tile begins with Full. A row with gaps makes it BySpan, and a row
-    // in which several inputs have something, but not in the same pixels, makes it Sparse.
-    enum class InPlace {
-        Full,   // all inputs together, as if each had something in each pixel
-        BySpan, // each input is searched for what is there, and that is copied
-        Sparse  // all inputs together, four pixels at a time: those with nothing are passed by
-    } inPlace_ = InPlace::BySpan;
+    bool isFull_ = false; // rows in place had one order and no gaps so far
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
     std::vector<FragmentRow> active_;

@@ -8,6 +8,7 @@
 #include <dfb/tile_op.hpp>
 
 #include <algorithm>
+#include <cmath>
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -547,7 +548,8 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     const int step = out.isDithered() ? 4 : 1; // then of alpha alone
     for (int i = step - 1; i < 4 * out.width(); i += step) {
         const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
-        out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
+        if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
+            out.setLevel(y, i, out.format() == OutputFormat::SRGBA8 && i % 4 < 3 ? toSrgb8(value) : toUnorm8(value));
     }
 }
 

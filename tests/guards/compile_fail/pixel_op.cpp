@@ -13,6 +13,11 @@ struct Op {
 #else
     void process(dfb::PixelTile&) const;
 #endif
+
+#if defined(CASE_CHANGES_FRAME_DATA) // expect: dfb: a PixelOp with a FrameData must provide void newFrame(const FrameData&)
+    struct FrameData {};
+    void newFrame(FrameData&);
+#endif
 };
 
 template class dfb::DistributedFrameBuffer<dfb::AlphaBlend, Op, dfb::InprocTransport>;

@@ -26,6 +26,10 @@ struct Op {
     void newFrame(const dfb::TileInfo&);
 #endif
 
+#if defined(CASE_LEAVES_FRAME_DATA) // expect: dfb: a TileOp with a FrameData must provide void newFrame(const TileInfo&, const FrameData&)
+    struct FrameData {};
+#endif
+
 #if defined(CASE_NO_ADD) // expect: dfb: TileOp must provide void add(Fragment&&)
 #elif defined(CASE_WRONG_ADD) // expect: dfb: TileOp must provide void add(Fragment&&)
     void add(dfb::Fragment&);

@@ -502,6 +502,30 @@ TEST_CASE("8 bits are the exact result rounded also next to a tie", "[ops]")
         }
 }
 
+TEST_CASE("A tie in a row does not change the levels of other pixels", "[ops]")
+{
+    // The level of red at a pixel with these layers of red and alpha, beside one of 1/2, a tie, or of 0.3.
+    const auto levelBeside = [](float neighbour, const std::vector<std::array<float, 2>>& layers, float least) {
+        TileInputs<8> in;
+        for (std::size_t i = 0; i < layers.size(); ++i) {
+            auto& tile = in.add(0, static_cast<std::uint32_t>(i));
+            tile.color[0] = layers[i][0];
+            tile.color[3] = layers[i][1];
+            tile.depth[0] = static_cast<float>(i);
+        }
+        std::fill_n(in.tiles[0]->pixel(1, 0), 4, neighbour);
+        in.tiles[0]->depth[1] = 0;
+        const dfb::testing::TileWire wire{{}, least};
+        return dfb::testing::runTileOp<dfb::BasicAlphaBlend<8>>(in, in.order(), dfb::OutputFormat::RGBA8, true, wire)
+            .color[0];
+    };
+    // Less than 1/100 comes through the first three, so that the last is left out, with all its light.
+    const std::vector<std::array<float, 2>> cut{{0.1f, 0.91f}, {0.1f, 0.73f}, {0.1f, 0.67f}, {1e25f, 0.5f}};
+    CHECK(levelBeside(0.5f, cut, 0.01f) == levelBeside(0.3f, cut, 0.01f));
+    const std::vector<std::array<float, 2>> infinite{{infinity, 0.25f}, {0.25f, 0.25f}};
+    CHECK(levelBeside(0.5f, infinite, 0) == levelBeside(0.3f, infinite, 0));
+}
+
 TEST_CASE("Where colour is dithered alpha is the exact result rounded all the same, and not exceeded", "[ops]")
 {
     // Alpha is 1/2, a tie, less something far below the last bit of a double.

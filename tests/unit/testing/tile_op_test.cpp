@@ -79,6 +79,11 @@ private:
     std::vector<double> background_;
 };
 
+struct WithFrameData : Strongest<Fault::None> {
+    struct FrameData {};
+    void newFrame(const dfb::TileInfo& info, const FrameData&) { Strongest::newFrame(info); }
+};
+
 template <Fault fault>
 bool finds(const char* sentence)
 {
@@ -90,6 +95,7 @@ bool finds(const char* sentence)
 TEST_CASE("checkTileOp() finds nothing wrong with good operations", "[tile_op_test]")
 {
     CHECK(checkTileOp<Strongest<Fault::None>>() == "");
+    CHECK(checkTileOp<WithFrameData>() == "");
     CHECK(checkTileOp<dfb::AlphaBlend>() == "");
     CHECK(checkTileOp<dfb::DepthComposite>() == "");
     const auto inOrder = [](dfb::TileHeader& header, int layer) {

@@ -111,7 +111,10 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     const d::WireCoder coder(wire.precision, d::active_by_depth_v<Op>);
     const auto wanted = static_cast<ChannelMask>(d::needed_channels_v<Op> | (withDepth ? depthChannel : 0));
     TileOutput out;
-    op.newFrame(info);
+    if constexpr (d::has_new_frame_with_data_v<Op>)
+        op.newFrame(info, typename Op::FrameData{});
+    else
+        op.newFrame(info);
     for (const std::size_t i : order) {
         Buffer message =
             d::encodeFragment(*pool, *in.tiles[i], wanted, 0, wire.codec, coder, wire.precision.color, out.faults);
