@@ -113,11 +113,7 @@ public:
         std::int64_t expected = 0, got = 0;
         std::vector<Declared> inputs; // those that are known by name, because they were declared
         // Else: the inputs that announced those of this generation, and those of it that have come.
-        struct Known {
-            std::uint32_t source;
-            int rank; // -1: not known
-        };
-        std::vector<Known> announcers, arrived;
+        std::vector<Declared> announcers, arrived;
 
         std::string text() const
         {
@@ -141,9 +137,9 @@ public:
         }
         for (const Input& input : inputs_) {
             if (input.generation == current_ - 1 && input.children > 0)
-                m.announcers.push_back({input.source, input.rank});
+                m.announcers.push_back({input.source, input.part, input.rank});
             else if (input.generation == current_)
-                m.arrived.push_back({input.source, input.rank});
+                m.arrived.push_back({input.source, input.part, input.rank});
         }
         return m;
     }

@@ -25,6 +25,7 @@ class DisplayWall;
 struct ToWall {
     DisplayWall* wall = nullptr; // outlives the framebuffer
 
+    void newFrame(const NoFrameData&);
     void process(PixelTile& tile) const;
 };
 
@@ -51,7 +52,7 @@ public:
 
     DisplayWall(const DisplayWall&) = delete;
     DisplayWall& operator=(const DisplayWall&) = delete;
-    // Collective. Destroy the framebuffers that send to it first.
+    // Collective. Destroy the framebuffers that send to it first. The last object of a connection waits for all ranks.
     ~DisplayWall();
 
     const WallLayout& layout() const noexcept { return layout_; }
@@ -67,11 +68,12 @@ public:
     }
 
     // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective,
-    // after the frame has ended. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all
-    // ranks: TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the
-    // ranks have not sent all of it, because it failed or was partial; MalformedMessage if a part of it cannot be
-    // right. The displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument
-    // on a thread that may not call MPI.
+    // after the frame has ended, in the order of the frames, once for each. All frames of a wall are of one
+    // framebuffer. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks: TimedOut
+    // if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent
+    // all of it, because it failed or was partial; MalformedMessage if a part of it cannot be right. The displays then
+    // keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread that may not
+    // call MPI, or for a frame that is not later than the last.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before
@@ -82,7 +84,8 @@ public:
     // calls finish().
     std::int64_t imageFrame() const noexcept;
 
-    // Called by ToWall, from any thread.
+    // Called by ToWall: in each begin(), and from any thread.
+    void begin();
     void put(const PixelTile& tile);
 
 private:
@@ -90,6 +93,7 @@ private:
     std::unique_ptr<detail::Wall> wall_;
 };
 
+inline void ToWall::newFrame(const NoFrameData&) { wall->begin(); }
 inline void ToWall::process(PixelTile& tile) const { wall->put(tile); }
 
 static_assert(is_pixel_op_v<ToWall>);
@@ -118,6 +122,7 @@ DFB_COMPILED_ONCE void DisplayWall::finish(std::int64_t frame, std::chrono::mill
 }
 DFB_COMPILED_ONCE const Image& DisplayWall::image(int display) const { return wall_->image(display); }
 DFB_COMPILED_ONCE std::int64_t DisplayWall::imageFrame() const noexcept { return wall_->imageFrame(); }
+DFB_COMPILED_ONCE void DisplayWall::begin() { wall_->begin(); }
 DFB_COMPILED_ONCE void DisplayWall::put(const PixelTile& tile) { wall_->put(tile); }
 
 DFB_NAMESPACE_END

@@ -21,8 +21,8 @@
 DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
-// the constructor, begin(), end() and what is collective below. All of these throw InvalidArgument, on this rank alone,
-// on a thread that may not call MPI (see Progress).
+// the constructor, begin(), end() and what is collective below. On a thread that may not call MPI (see Progress) all of
+// these throw InvalidArgument, on this rank alone; a constructor that is given a communicator throws TransportError.
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
     static_assert(detail::checkTileOp<TileOp>());
@@ -44,7 +44,7 @@ public:
 
     // A frame that has begun. If it is destroyed without end(), the frame fails on all ranks, and the destructor waits
     // until all ranks have ended it.
-    class Frame {
+    class [[nodiscard]] Frame {
     public:
         Frame(Frame&& other) noexcept
             : fb_(other.fb_), engine_(other.engine_), number_(other.number_),
@@ -124,11 +124,11 @@ public:
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
         }
-        // Whether another rank has said mayHide() about an input, and its word has not come yet. Any thread. Waits for
-        // nothing.
+        // Whether another rank has said mayHide() about an input, and neither hide() nor show() yet. Any thread. Waits
+        // for nothing.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
-        // Waits until heard() returns true or the frame has failed. heard() is called again after each hide(),
-        // mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
+        // Waits until heard() returns true or the frame has failed. heard() is called first, and again after each
+        // hide(), mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
         // FrameBufferConfig::quiet: then render without waiting. One thread at a time; with Progress::Caller one that
         // may call MPI. Throws TransportError.
         bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
@@ -230,8 +230,8 @@ public:
 
         // Makes the frame fail on all ranks, with the text of this exception. `tileIndex`: the tile that it concerns,
         // which the error names, or -1. With FrameConfig::allowPartial the frame goes on without that tile. Any thread.
-        // Waits for nothing.
-        void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(reason, tileIndex); }
+        // Does nothing after end(). Waits for nothing.
+        void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(number_, reason, tileIndex); }
 
         // Makes the frame fail on all ranks with ErrorKind::Cancelled, because nobody needs it any more. Call end() all
         // the same. Tiles that are set later are dropped. Does nothing after end(). Any thread, also during end().
@@ -248,7 +248,7 @@ public:
         // frame is still open then.
         FrameReport end()
         {
-            engine_->requireProgress();
+            requireOpen();
             isOpen_ = false;
             const FrameReport report = engine_->end();
             fb_->lastEnded_ = engine_;
@@ -262,7 +262,7 @@ public:
         // moment if the frame timed out or is partial. Throws InvalidArgument as end() does.
         bool isDone()
         {
-            engine_->requireProgress();
+            requireOpen();
             return engine_->isDone();
         }
 
@@ -273,6 +273,13 @@ public:
     private:
         friend class DistributedFrameBuffer;
         Frame(DistributedFrameBuffer* fb, Engine* engine) : fb_(fb), engine_(engine), number_(engine->frame()) {}
+        void requireOpen() const
+        {
+            if (!isOpen_)
+                detail::failArgument("frame %lld has ended, or its Frame was moved from",
+                                     static_cast<long long>(number_));
+            engine_->requireProgress();
+        }
         DistributedFrameBuffer* fb_;
         Engine* engine_;
         std::int64_t number_;
@@ -342,7 +349,7 @@ public:
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
 
-    // On the display rank: whether image() has that tile. After a frame that ended well it has all; see
+    // On the display rank: whether image() has that finished tile. After a frame that ended well it has all; see
     // FrameConfig::allowPartial. Thread as above.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
@@ -354,15 +361,14 @@ public:
 
     // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
     // same order: setTile() may wait for room at a rank, and there is none before that rank has begun the frame. Copies
-    // `tileData` and `pixelData`. Waits for no other rank. Throws InvalidArgument, with nothing sent, if
-    // config.framesInFlight frames are open, if a field of `params` is out of range, or on a thread that may not call
-    // MPI (see Progress). Throws TransportError if the connection has failed.
+    // `tileData` and `pixelData`. Waits for no other rank. Throws InvalidArgument, with nothing sent, if the frame that
+    // was begun config.framesInFlight frames ago is open, if a field of `params` is out of range, or on a thread that
+    // may not call MPI (see Progress). Throws TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
         Engine& engine = *engines_[next_];
-        operations_[next_]->offer(tileData, pixelData);
-        engine.begin(params);
+        engine.begin(params, [&] { operations_[next_]->newFrame(tileData, pixelData); });
         next_ = (next_ + 1) % engines_.size();
         return Frame(this, &engine);
     }
@@ -379,6 +385,7 @@ public:
         Config config = this->config();
         config.image.width = width;
         config.image.height = height;
+        engine().allGather({}, "resize()"); // the new engines do not hear of other calls
         makeEngines(config);
     }
 
@@ -415,6 +422,11 @@ private:
         for (std::size_t slot = 0; slot < operations_.size(); ++slot)
             engines.push_back(detail::makeEngine(connection_, config, *operations_[slot], static_cast<int>(slot)));
         engines_ = std::move(engines);
+        std::vector<Engine*> together;
+        for (const auto& engine : engines_)
+            together.push_back(engine.get());
+        for (Engine* engine : together)
+            engine->setTogether(together);
         next_ = 0;
         lastEnded_ = engines_.front().get();
     }

@@ -1,7 +1,7 @@
 // The errors of dfb: a record of each error and its place, and the exceptions that carry it.
 //
-// InvalidArgument is thrown at once by the call that was wrong, before anything is sent. An error in the background of
-// a frame comes out of Frame::end() as FrameError, the same on every rank.
+// InvalidArgument is thrown by the call that was wrong; collective calls throw it on all ranks. An error in the
+// background of a frame comes out of Frame::end() as FrameError, the same on every rank.
 #pragma once
 
 #include <dfb/compiled.hpp>
@@ -160,7 +160,7 @@ private:
     std::shared_ptr<const void> whileThrown_;
 };
 
-// A wrong argument, or a call that is not allowed now or on this thread. Nothing was sent, the object is unchanged.
+// A wrong argument, or a call that is not allowed now or on this thread. Nothing has changed.
 class InvalidArgument : public Error {
 public:
     using Error::Error;

@@ -36,7 +36,7 @@ public:
     // Whether tasks run by themselves. False: only threads in help() or parallelFor() run them.
     virtual bool hasWorkers() const noexcept { return true; }
 
-    // From any thread.
+    // From any thread. The task must not throw. May throw std::bad_alloc.
     void submit(Task task)
     {
         {

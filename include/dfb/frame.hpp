@@ -57,7 +57,8 @@ struct FrameBufferConfig {
     ImageConfig image;
     MessageConfig messages;
     // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, HalfLevel, or a Precision. The default is
-    // exact. Other channels always travel exactly, and finished tiles in image.format. All ranks must give the same.
+    // exact. Depth, positions and ids always travel exactly; normals and albedo are scaled to the rounded alpha.
+    // Finished tiles travel in image.format. All ranks must give the same.
     Precision precision{};
     // For AlphaBlend, OrderedBlend and DeepBlend. If the layers of a pixel let through less than this part of the
     // light, the layers behind them are left out. The pixel changes by no more than this times the largest colour.
@@ -69,14 +70,15 @@ struct FrameBufferConfig {
     // Runs rendering and compositing on this rank. Null: a ThreadExecutor with Connection::threadShare() threads. A
     // CallerExecutor makes no threads. Ranks may give different ones.
     std::shared_ptr<Executor> executor{};
-    // Called on the display rank for each tile that had an input, when its pixels are in the image of the open frame:
+    // Called on the display rank for each tile that is composited, when its pixels are in the image of the open frame.
+    // With the operations of the library these are the tiles that have an active pixel.
     // onTile(tile index, its pixels, image). For windows that show a frame as it comes. Called by worker threads, the
     // progress thread or a thread in end(), for several tiles at once, while other pixels of the image are written. It
     // must be quick. An exception makes the frame fail. Tiles of ranks on the display rank's node may all come at the
     // end.
     TileCallback onTile{};
-    // end() waits this long before it checks whether any rank still has something under way, and checks again at
-    // growing intervals. If nobody has, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs
+    // After this time in end(), ranks check whether anything is still under way; then again, less and less often. If
+    // nothing is, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs
     // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then
     // renders it. Ranks may give different ones.
     std::chrono::milliseconds quiet{2000};
@@ -114,14 +116,15 @@ struct FrameConfig {
     // rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(), or if
-    // setTile() waits this long for room. The error says what is missing and from whom. If the verdict does not come
-    // within twice the time either, end() throws TransportError. 0: no limit. An input that is never sent needs no
-    // time-out: the frame fails with ErrorKind::MissingInput some seconds after all ranks are in end().
+    // setTile() waits for room and nothing of this rank is taken for this long. The error says what is missing and from
+    // whom. If the verdict does not come within twice the time either, end() throws TransportError. 0: no limit. An
+    // input that is never sent needs no time-out: the frame fails with ErrorKind::MissingInput some seconds after all
+    // ranks are in end().
     std::chrono::milliseconds timeout{0};
     // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
     // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same
-    // as without it. An input of a source that is not in the order makes the frame fail. MixedParallelLoop, and
-    // DataParallelLoop with a SharedWorld, set it where the bricks (1024 at most) have such an order and the camera
+    // as without it. An input with pixels of a source that is not in the order makes the frame fail. MixedParallelLoop,
+    // and DataParallelLoop with a SharedWorld, set it where the bricks (1024 at most) have such an order and the camera
     // says where its rays begin: see render/visibility.hpp.
     std::shared_ptr<const SourceOrder> order{};
     // Not null: which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does not depend
@@ -166,9 +169,26 @@ struct Figure {
     double value = 0;
 };
 
+// Those figures of a finished frame that are sums over all ranks.
+struct FrameSums {
+    // Bytes of messages to other ranks, without the transport's own headers; and bytes that owners wrote into the
+    // display rank's image directly.
+    std::int64_t bytesSent = 0;
+    std::int64_t messagesSent = 0;
+    std::int64_t tilesTouched = 0;         // tiles that had an input
+    std::int64_t nonFinitePixels = 0;      // input pixels with an infinite or NaN colour, or a NaN depth
+    std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
+    std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
+    std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
+    // Messages with pixels that were dropped since the last verdict: of frames that failed, or hidden by an opaque
+    // input that came sooner.
+    std::int64_t lateMessages = 0;
+    std::int64_t repeatedMessages = 0; // came twice, dropped since the last verdict
+};
+
 // Figures of a finished frame. Those marked "all" are sums or maxima over the ranks, and the same on all of them; they
 // include what each rank counted until it entered the verdict. The others are this rank's own.
-struct FrameReport {
+struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
     // All: tiles that were not finished; the display rank also counts finished tiles that have not come. They show the
@@ -181,29 +201,16 @@ struct FrameReport {
     // This rank: who moved messages: calls of the program (Caller), or a thread of the library (Thread). With
     // InprocTransport the sending thread delivers them, which counts as Thread.
     Progress progress = Progress::Thread;
-    int threads = 1; // this rank: workers of its executor
-    // All: bytes of messages to other ranks, without the transport's own headers; and bytes that owners wrote into the
-    // display rank's image directly.
-    std::int64_t bytesSent = 0;
-    std::int64_t messagesSent = 0;              // all
+    int threads = 1;                            // this rank: workers of its executor
     std::int64_t tilesTotal = 0;                // in the image
-    std::int64_t tilesTouched = 0;              // all: tiles that had an input
-    std::int64_t nonFinitePixels = 0;           // all: input pixels with an infinite or NaN colour, or a NaN depth
-    std::int64_t alphaOutsidePixels = 0;        // all: finite input pixels whose alpha is not within [0, 1]
-    std::int64_t orderUndefinedPixels = 0;      // all: of finished tiles, see TileReport
     WireFormat wireColor = WireFormat::Float32; // how this rank's inputs travelled, but for those out of range
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
-    std::int64_t compressedLinks = 0;           // all: pairs of sender and receiver for which it paid
     // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance. Depth, positions
     // and ids are exact.
     double wireErrorBound = 0;
     double mergeErrorBound = 0;        // all: how far a pixel may be off because segments were merged, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: the sums of Frame::addFigure(), by key
-    // All: messages with pixels that were dropped since the last verdict: of frames that failed, or hidden by an opaque
-    // input that came sooner.
-    std::int64_t lateMessages = 0;
-    std::int64_t repeatedMessages = 0; // all: came twice, dropped since the last verdict
     std::int64_t peakInboxBytes = 0;   // all: the most that a rank's inbox held of what messages.poolBytes limits
     std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's framebuffer ever held
 };

@@ -144,7 +144,8 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
 }
 
 // A whole image, row-major, without padding. Row 0 is the top row, or the lowest one after
-// ImageCompositor::setBottomUp(true). Empty on ranks other than the display rank and with OutputFormat::None.
+// ImageCompositor::setBottomUp(true). image() is empty on ranks other than the display rank, and with
+// OutputFormat::None.
 class Image {
 public:
     Image() = default;

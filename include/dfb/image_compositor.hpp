@@ -58,7 +58,8 @@ struct InputImage {
     bool bottomUp = false;         // the first row is the lowest, as in OpenGL
     bool isBgra = false;           // bytes are blue, green, red, alpha
     bool hasStraightAlpha = false; // colours are not multiplied by alpha yet; 8-bit ones then travel as floats
-    float farDepth = std::numeric_limits<float>::infinity(); // a pixel at this depth or beyond is empty; 1 in OpenGL
+    // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
+    float farDepth = std::numeric_limits<float>::infinity();
     // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
     // left, y from the first row in memory. {0, 0, 0, 0}: all of it. Another one without pixels: nothing to show.
     Region region{0, 0, 0, 0};
@@ -70,7 +71,8 @@ struct InputImage {
     bool staysUntilEnd = false;
 };
 
-// One object per rank. Construction, destruction and resize() are collective. One thread at a time may call members;
+// One object per rank. Construction, destruction, resize(), composite(), end(), imageOnAllRanks() and allGather() are
+// collective. One thread at a time may call members;
 // they work on all threads of config.executor.
 class ImageCompositor {
 public:
@@ -87,7 +89,8 @@ public:
 
     ImageCompositor(const ImageCompositor&) = delete;
     ImageCompositor& operator=(const ImageCompositor&) = delete;
-    // Collective. Waits for all ranks. Must come before MPI_Finalize(). An open picture fails on all ranks.
+    // Collective. The last object of a connection waits for all ranks. Must come before MPI_Finalize(). An open picture
+    // fails on all ranks.
     ~ImageCompositor()
     {
         if (isOpen_)
@@ -97,6 +100,7 @@ public:
     int rank() const noexcept { return engine_->rank(); }
     int size() const noexcept { return engine_->size(); }
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
+    ImageBlend blend() const noexcept { return blend_; }
     const FrameBufferConfig& config() const noexcept { return engine_->config(); }
 
     // True: row 0 of image() is the lowest row, as OpenGL takes it. False, the default: the top row. Call it with the
@@ -217,10 +221,7 @@ std::unique_ptr<Operations> imageOperations(const ImageConfig& image, int ranks,
         const std::int64_t rows = std::clamp<std::int64_t>(share, 4096, 32768) / traits.tileWidth;
         traits.tileHeight = static_cast<int>(std::clamp<std::int64_t>(rows, 1, 256));
     }
-    static const NoFrameData none;
-    auto operations = std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
-    operations->offer(none, none);
-    return operations;
+    return std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
 }
 
 // A region of a picture in a number that a double holds: 13 bits for each side.
@@ -261,8 +262,8 @@ public:
     InputTile(const InputImage& image, const Region& region, const TileLayout& layout, bool isFlipped, bool usesDepth)
         : image_(image), held_(region), height_(layout.height()), isFlipped_(isFlipped)
     {
-        const bool hasFarDepth = image.depth && image.farDepth < std::numeric_limits<float>::infinity();
-        isConverted_ = image.hasStraightAlpha || image.isBgra || (hasFarDepth && !usesDepth);
+        hasFarDepth_ = image.depth && image.farDepth < std::numeric_limits<float>::infinity();
+        isConverted_ = image.hasStraightAlpha || image.isBgra || (hasFarDepth_ && !usesDepth);
         valid_ = intersection(intersection(held_, image.valid), {0, 0, layout.width(), layout.height()});
         if (isFlipped)
             valid_ = {valid_.x0, height_ - valid_.y1, valid_.x1, height_ - valid_.y0};
@@ -307,7 +308,7 @@ private:
         for (int y = some.y0 - view.region.y0; y < some.y1 - view.region.y0; ++y)
             for (int x = some.x0 - view.region.x0; x < some.x1 - view.region.x0; ++x) {
                 const std::ptrdiff_t from = y * view.stride + x, at = y * width + x;
-                const bool isEmpty = view.depth && view.depth[from] >= image_.farDepth;
+                const bool isEmpty = hasFarDepth_ && view.depth[from] >= image_.farDepth;
                 if (view.depth)
                     to.depth.data()[at] = isEmpty ? std::numeric_limits<float>::infinity() : view.depth[from];
                 if (staysBytes) {
@@ -336,7 +337,7 @@ private:
     const InputImage& image_;
     Region held_, valid_;
     int height_;
-    bool isFlipped_, isConverted_;
+    bool isFlipped_, isConverted_, hasFarDepth_;
 };
 
 } // namespace detail
@@ -423,14 +424,14 @@ DFB_COMPILED_ONCE void ImageCompositor::begin(const FrameConfig& frame)
         declared.owners = findOwners();
     if (declared.maxLayers == 0)
         declared.maxLayers = size();
-    engine_->begin(declared);
+    engine_->begin(declared, [] {});
     isOpen_ = true;
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::startFailed(const std::exception_ptr& why, const FrameConfig& frame)
 {
     begin(frame);
-    engine_->abort(why, -1);
+    engine_->abort(engine_->frame(), why, -1);
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place, const FrameConfig& frame)
@@ -441,7 +442,7 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
             detail::failArgument("a picture of images has one sample a pixel");
         send(image, place, blend_ != ImageBlend::InOrder || config().image.depth);
     } catch (...) {
-        engine_->abort(std::current_exception(), -1);
+        engine_->abort(engine_->frame(), std::current_exception(), -1);
     }
 }
 
@@ -493,7 +494,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
                              static_cast<long long>(image.rowPixels));
     if (image.rgba8 && image.rgba32f)
         detail::failArgument("an image of 8 bits and of floats");
-    if (blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
+    if (isThere && blend_ == ImageBlend::InOrder && (place < 0 || place >= size()))
         detail::failArgument("place %d in an order of %d ranks: each rank gives its own, from 0, in front, to %d",
                              place, size(), size() - 1);
     const detail::InputTile part(image, region, layout, image.bottomUp != bottomUp_, usesDepth);

@@ -280,7 +280,6 @@ struct InputPixels : TileHeader {
     {
     }
 
-    const ConstPlanes& planes() const noexcept { return at; }
     // Bytes of a pixel in a channel.
     std::size_t pixelBytes(std::size_t channel) const noexcept
     {

@@ -202,9 +202,9 @@ private:
     static const char* messageOf(const TraceEvent& e)
     {
         static constexpr std::array<const char*, 18> names{
-            "reduction up", "reduction down", "input",         "manifest", "manifest taken", "finished tiles",
-            "tiles done",   "abort",          "ask",           "credit",   "ask for jobs",   "jobs",
-            "image place",  "failure",        "are you there", "present",  "hidden",         "leaving"};
+            "reduction up", "reduction down", "input", "manifest", "manifest taken", "finished tiles",
+            "tiles done",   "abort",          "ask",   "credit",   "ask for jobs",   "jobs",
+            "image place",  "failure",        "ping",  "pong",     "hidden",         "leaving"};
         static_assert(static_cast<std::size_t>(MessageKind::Leaving) + 1 == names.size());
         return names[std::min<std::size_t>(e.message, names.size() - 1)];
     }
@@ -214,7 +214,7 @@ private:
                                                            "input", "finish", "send", "receive", "wait"};
         static_assert(static_cast<std::size_t>(TraceEvent::Kind::Wait) + 1 == names.size());
         const bool isMessage = e.kind == TraceEvent::Kind::Send || e.kind == TraceEvent::Kind::Receive;
-        return names[static_cast<std::size_t>(e.kind)] + std::string(isMessage ? " " : "")
+        return names[std::min(static_cast<std::size_t>(e.kind), names.size() - 1)] + std::string(isMessage ? " " : "")
                + (isMessage ? messageOf(e) : "");
     }
 
@@ -230,6 +230,7 @@ private:
 class TraceFile final : public TraceSink {
 public:
     // Keeps up to `capacity` events, 64 bytes each, in memory that it allocates now. Later events are only counted.
+    // Throws std::bad_alloc.
     explicit TraceFile(std::size_t capacity = 200'000) : capacity_(capacity) { records_.reserve(capacity); }
 
     void add(const TraceEvent& event) noexcept override
@@ -290,8 +291,10 @@ private:
         std::int64_t dropped = 0;
         std::vector<std::vector<detail::TraceRecord>> ranks;
         for (const std::vector<std::byte>& part : parts) {
-            dropped += detail::loadAs<std::int64_t>(part.data());
             const std::size_t bytes = part.size() - sizeof dropped;
+            if (part.size() < sizeof dropped || bytes % sizeof(detail::TraceRecord) != 0)
+                detail::failMalformed("a trace is not made of whole events");
+            dropped += detail::loadAs<std::int64_t>(part.data());
             std::vector<detail::TraceRecord>& records = ranks.emplace_back(bytes / sizeof(detail::TraceRecord));
             if (bytes > 0)
                 std::memcpy(records.data(), part.data() + sizeof dropped, bytes);

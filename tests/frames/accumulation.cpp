@@ -187,7 +187,7 @@ struct NextSamples {
             frame(1, 1);
             frame(1, 2);
             params.passes = std::numeric_limits<int>::max();
-            const std::string outcome = scene::outcomeOf([&] { fb.begin(params); });
+            const std::string outcome = scene::outcomeOf([&] { (void)fb.begin(params); });
             result.expect(scene::has(outcome, "InvalidArgument") && scene::has(outcome, "take another accumulationId"),
                           "more samples than can be counted: " + outcome);
         }
@@ -276,6 +276,41 @@ struct MovingSamples {
     }
 };
 
+// The mean is off by no more than its worst sample, however many frames ago that was.
+struct RoundedSamples {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        auto config = configOf(s, 1);
+        config.precision = dfb::WireFormat::Unorm8;
+        dfb::DistributedFrameBuffer<dfb::Progressive<dfb::BasicAlphaBlend<16>>, dfb::NoPixelOp, Transport> fb(
+            communicator, config);
+        const auto boundOf = [&](std::uint64_t id, dfb::TileSamples samples, const std::vector<dfb::Brick>& bricks) {
+            const auto count = static_cast<std::size_t>(fb.layout().tileCount());
+            auto params = paramsOf(s);
+            params.accumulationId = id;
+            params.samples = std::make_shared<const std::vector<dfb::TileSamples>>(count, samples);
+            return dfb::DataParallelLoop(fb, dfb::World(bricks))
+                .render(
+                    scene::FlatCamera(),
+                    [](const dfb::Brick&, auto& tile) {
+                        tile.fill({0.1f, 0.1f, 0.1f, 0.3f}, 1.0f);
+                    },
+                    params)
+                .wireErrorBound;
+        };
+        const std::vector<dfb::Brick> own = bricksOf(s, fb.rank(), fb.size());
+        const double first = boundOf(1, {0, 1}, own);
+        result.expect(first > 0, "nothing was rounded");
+        result.expect(boundOf(1, {1, 1}, {}) == first, "another bound after an empty sample");
+        result.expect(boundOf(1, {2, 0}, own) == first, "another bound after a frame without samples");
+        result.expect(boundOf(2, {0, 1}, {}) == 0, "a bound of what is in the image no more");
+        return result;
+    }
+};
+
 } // namespace frame_cases
 
 TEST_CASE("Without a plan each frame renders the next samples, in each loop", "[accumulation]")
@@ -286,4 +321,9 @@ TEST_CASE("Without a plan each frame renders the next samples, in each loop", "[
 TEST_CASE("The image is the mean of all samples also if bricks have moved", "[accumulation]")
 {
     everywhere<frame_cases::MovingSamples>();
+}
+
+TEST_CASE("How far samples may be off counts as long as they are in the image", "[accumulation]")
+{
+    everywhere<frame_cases::RoundedSamples>();
 }

@@ -216,10 +216,40 @@ struct BlamedConfig {
             std::vector<std::int64_t> values(rank == odd ? 3 : 2);
             expectText(result, "allReduce() of rank " + std::to_string(odd),
                        scene::outcomeOf([&] { fb.allReduce(values, BlameFrameBuffer<Transport>::Reduce::Sum); }),
-                       {"InvalidArgument: dfb: invalid argument: the number of values in allReduce() is ",
-                        valuesText(odd, "2", "3"), "2 on rank "});
+                       {"InvalidArgument: dfb: invalid argument: rank ", " calls allReduce() of ",
+                        "rank " + std::to_string(odd), "allReduce() of 3 values to their sum",
+                        ": all ranks must make the same calls"});
         }
         expectGoodFrame(result, fb, s, "all of them");
+        return result;
+    }
+};
+
+// Ranks that make different collective calls.
+struct BlamedCalls {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        using Fb = BlameFrameBuffer<Transport>;
+        using Call = std::pair<std::string, std::function<void(Fb&)>>; // and its name in errors
+        const auto reduce = [](typename Fb::Reduce how) { return [how](Fb& fb) { fb.allReduce({1}, how); }; };
+        const Call sum{"allReduce() of 1 values to their sum", reduce(Fb::Reduce::Sum)},
+            largest{"allReduce() of 1 values to their maximum", reduce(Fb::Reduce::Max)},
+            share{"allGather() or SharedWorld()", [](Fb&fb) { dfb::SharedWorld(fb, dfb::World()); }},
+            image{"imageOnAllRanks()", [](Fb&fb) { fb.imageOnAllRanks(); }},
+            resize{"resize()", [](Fb&fb) { fb.resize(40, 30); }};
+        Result result;
+        Fb fb(communicator, configOf(scene::makeScene(3)));
+        for (const int odd : oddRanks(fb.size()))
+            for (const auto& [its, usual] : {std::pair{sum, largest}, {share, image}, {resize, sum}}) {
+                const Call& mine = fb.rank() == odd ? its : usual;
+                const std::string text = scene::outcomeOf([&] { mine.second(fb); });
+                expectText(result, "rank " + std::to_string(odd) + " in " + its.first, text,
+                           {"InvalidArgument: dfb: invalid argument: rank ",
+                            rankText(odd) + (odd == 0 ? " calls " : " ") + its.first, usual.first,
+                            ": all ranks must make the same calls"});
+                result.expect(fb.allReduce({1}, Fb::Reduce::Sum).front() == fb.size(), "a wrong sum after it");
+            }
         return result;
     }
 };
@@ -401,7 +431,7 @@ struct BlamedOutside {
             int leastRanks;
         };
         for (const Case& c : {Case{"end()", "FrameError: dfb: missing input", endWithMissingInput, 1},
-                              Case{"allReduce()", "the number of values in allReduce()", reduceUnequal, 2},
+                              Case{"allReduce()", "all ranks must make the same calls", reduceUnequal, 2},
                               Case{"resize()", "width is ", resizeUnequal, 2}})
             for (int round = 0; round < 10; ++round) {
                 int size = 0;
@@ -470,6 +500,10 @@ TEST_CASE("Parameters of frames that differ are named, with ranks and values", "
 TEST_CASE("A configuration that is wrong or differs is named, with ranks and values", "[blame]")
 {
     everywhere<frame_cases::BlamedConfig>();
+}
+TEST_CASE("Different collective calls are named, with their ranks", "[blame]")
+{
+    everywhere<frame_cases::BlamedCalls>();
 }
 TEST_CASE("Inputs that are missing or come twice are named, with their ranks", "[blame]")
 {

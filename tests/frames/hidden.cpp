@@ -9,6 +9,7 @@
 #include <memory>
 #include <string>
 #include <thread>
+#include <utility>
 
 namespace frame_cases {
 
@@ -106,6 +107,10 @@ struct Hidden {
         for (int round = 0; round < 3; ++round) {
             auto frame = fb.begin();
             const auto tile = std::make_unique<typename Fb<Transport>::Tile>();
+            for (const auto& [t, generation] : {std::pair{0, 0}, {-1, 1}, {fb.layout().tileCount(), 1}}) {
+                const std::string text = scene::outcomeOf([&, t = t, g = generation] { frame.hide(t, g, fb.rank()); });
+                result.expect(scene::has(text, "InvalidArgument"), "what is no input is hidden: " + text);
+            }
             for (int t = 0; t < fb.layout().tileCount() && fb.rank() == 0; ++t) {
                 result.expect(fb.size() == 1 || !frame.isHidden(t, 1), "a tile is hidden from the last frame");
                 frame.start(*tile, t);

@@ -116,7 +116,7 @@ struct OwnImage {
         image.valid = valid;
     }
 
-    // Brings the image to memory that other ranks see, as long as the result lives.
+    // Brings the image to memory that other ranks see, as long as the result lives; bytes to an odd address.
     dfb::Buffer moveTo(const dfb::ImageCompositor& compositor)
     {
         dfb::Buffer memory = compositor.sharedMemory(bytes.size() + 4 * floats.size() + 4 * depths.size() + 1);
@@ -129,9 +129,10 @@ struct OwnImage {
             end += values.size() * sizeof values[0];
             values.assign(values.size(), 77); // nobody reads it there
         };
-        move(bytes, image.rgba8);
         move(floats, image.rgba32f);
         move(depths, image.depth);
+        ++end;
+        move(bytes, image.rgba8);
         return memory;
     }
 };
@@ -291,6 +292,54 @@ struct BytesAndFloats {
     }
 };
 
+// A pixel at infinite depth counts by its colour, in each form.
+struct AtInfinity {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto connection = dfb::connect<Transport>(communicator);
+        const std::uint8_t pixel[] = {100, 100, 100, 255};
+        const float depth[] = {std::numeric_limits<float>::infinity()};
+        for (const auto blend : {dfb::ImageBlend::ByDepth, dfb::ImageBlend::InOrder}) {
+            dfb::ImageCompositor compositor(connection, blend, dfb::FrameBufferConfig(1, 1));
+            for (const char* form : {"RGBA", "BGRA", "straight"}) {
+                dfb::InputImage image(pixel, depth);
+                image.isBgra = form[0] == 'B';
+                image.hasStraightAlpha = form[0] == 's';
+                compositor.composite(image, compositor.rank());
+                result.expect(!compositor.isDisplayRank() || compositor.image().rgba8()[0] == 100,
+                              std::string("nothing in ") + form);
+            }
+        }
+        return result;
+    }
+};
+
+// Who shows nothing needs no place in the order, who shows something does.
+struct Places {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        dfb::ImageCompositor compositor(dfb::connect<Transport>(communicator), dfb::ImageBlend::InOrder,
+                                        dfb::FrameBufferConfig(1, 1));
+        const std::uint8_t pixel[] = {100, 100, 100, 255};
+        const bool isLast = compositor.rank() == compositor.size() - 1;
+        const std::string fine = scene::outcomeOf([&] {
+            if (isLast)
+                compositor.composite({});
+            else
+                compositor.composite(dfb::InputImage(pixel), compositor.rank());
+        });
+        result.expect(fine == "fine", fine);
+        const std::string wrong =
+            scene::outcomeOf([&] { compositor.composite(dfb::InputImage(pixel), isLast ? -1 : compositor.rank()); });
+        result.expect(wrong.find("place -1 in an order") != std::string::npos, "without a place: " + wrong);
+        return result;
+    }
+};
+
 // Wrong images and other sizes: the error is the same on all ranks, and the next picture is right.
 struct Failures {
     template <class Transport>
@@ -355,16 +404,20 @@ struct Failures {
                       "two passes on a rank: " + passes);
         expectGood(imageWidth, imageHeight, "two passes on a rank");
 
-        const std::string failed = scene::outcomeOf([&] {
-            if (compositor.rank() < compositor.size() - 1)
-                compositor.start(good);
-            else
-                compositor.startFailed(std::make_exception_ptr(std::runtime_error("no mesh")));
-            compositor.end();
-        });
-        result.expect(failed.find("FrameError") != std::string::npos && failed.find("no mesh") != std::string::npos,
-                      "startFailed(): " + failed);
-        expectGood(imageWidth, imageHeight, "startFailed()");
+        for (const auto& [why, part] :
+             {std::make_pair(std::make_exception_ptr(std::runtime_error("no mesh")), "no mesh"),
+              std::make_pair(std::exception_ptr(), "no exception")}) {
+            const std::string failed = scene::outcomeOf([&, why = why] {
+                if (compositor.rank() < compositor.size() - 1)
+                    compositor.start(good);
+                else
+                    compositor.startFailed(why);
+                compositor.end();
+            });
+            result.expect(failed.find("FrameError") != std::string::npos && failed.find(part) != std::string::npos,
+                          "startFailed(): " + failed);
+            expectGood(imageWidth, imageHeight, "startFailed()");
+        }
 
         // The second and the third are wider and higher than a strip may be.
         for (const auto& [width, height] :
@@ -399,6 +452,13 @@ TEST_CASE("Images of 8 bits travel as bytes and give what floats give", "[image_
 {
     everywhere<BytesAndFloats>();
 }
+
+TEST_CASE("A pixel at infinite depth is in the picture whatever form its image has", "[image_compositor]")
+{
+    everywhere<AtInfinity>();
+}
+
+TEST_CASE("Only a rank that shows something needs a place in the order", "[image_compositor]") { everywhere<Places>(); }
 
 TEST_CASE("An image that cannot be fails the picture on all ranks, and resize() changes its size", "[image_compositor]")
 {

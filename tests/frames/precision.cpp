@@ -101,6 +101,31 @@ struct Precision {
     }
 };
 
+// An input with such an alpha is exact, but how much of rounded ones it lets through is not known.
+struct AlphaOutside {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const scene::Scene s = scene::makeScene(5, 11);
+        auto config = configOf(s, 1);
+        config.precision = dfb::WireFormat::Unorm8;
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<16>, dfb::NoPixelOp, Transport> fb(communicator, config);
+        const auto report = dfb::DataParallelLoop(fb, dfb::World(bricksOf(s, fb.rank(), fb.size())))
+                                .render(
+                                    scene::FlatCamera(),
+                                    [&](const dfb::Brick& b, auto& tile) {
+                                        renderInRange(s, b, tile);
+                                        if (b.id == s.bricks[0].id)
+                                            tile.forEachPixel([](int, int, float* rgba, float&) { rgba[3] *= 3; });
+                                    },
+                                    paramsOf(s));
+        result.expect(report.alphaOutsidePixels > 0, "no alpha is outside");
+        result.expect(std::isinf(report.wireErrorBound), "a bound of " + std::to_string(report.wireErrorBound));
+        return result;
+    }
+};
+
 // HalfLevel: images of floats, and what stays within a node, are exact; no 8-bit level is off by more than one.
 struct WithinHalfALevel {
     template <class Transport>
@@ -273,6 +298,11 @@ TEST_CASE("Within half a level: exact on a node and for floats, else no level is
 TEST_CASE("Lossy formats keep their bounds and budgets, the same on any ranks", "[precision]")
 {
     everywhere<frame_cases::Precision>();
+}
+
+TEST_CASE("With an alpha outside 0 and 1 the bound of what is rounded beside it is infinite", "[precision]")
+{
+    everywhere<frame_cases::AlphaOutside>();
 }
 
 TEST_CASE("Depth, positions and ids are the same in any format, normals stay means", "[precision]")

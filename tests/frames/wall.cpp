@@ -3,6 +3,7 @@
 #include "everywhere.hpp"
 
 #include <algorithm>
+#include <chrono>
 #include <cstring>
 #include <memory>
 #include <utility>
@@ -106,6 +107,10 @@ struct Wall {
         const std::string outcome =
             scene::outcomeOf([&] { dfb::DisplayWall(connection, wrong, dfb::OutputFormat::RGBA8); });
         result.expect(scene::has(outcome, "is driven by rank"), outcome);
+        const std::string huge = scene::outcomeOf([&] {
+            dfb::DisplayWall(connection, {65536, 65536, 64, 64, 0, 0, {}}, dfb::OutputFormat::RGBA8);
+        });
+        result.expect(scene::has(huge, "InvalidArgument") && scene::has(huge, "cannot be"), "a huge wall: " + huge);
         return result;
     }
 };
@@ -173,9 +178,58 @@ struct WallProgressive {
     }
 };
 
+// Frames that are not finished do not end the wall; those that are come once each, in order.
+struct WallSkips {
+    template <class Transport>
+    static Result run(const typename Transport::Communicator& communicator)
+    {
+        Result result;
+        const auto connection = dfb::connect<Transport>(communicator);
+        dfb::DisplayWall wall(connection, {1, 1, 40, 50, 0, 0, {0}}, dfb::OutputFormat::RGBA32F,
+                              std::make_shared<dfb::ThreadExecutor>(1));
+        auto config = wall.frameBufferConfig();
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks - 1; };
+        FrameBufferOf<dfb::BasicImageParallel<16>, dfb::ToWall, Transport> fb(connection, config, {&wall});
+        const auto show = [&](float shade) {
+            dfb::FrameConfig params;
+            params.background = {shade, shade, shade, 1};
+            return dfb::ImageParallelLoop(fb).render([](auto&) {}, params).frame;
+        };
+        for (const bool isCancelled : {true, false}) {
+            for (int i = 0; i < 20; ++i) {
+                if (!isCancelled) {
+                    show(0.125f);
+                    continue;
+                }
+                auto frame = fb.begin();
+                frame.cancel();
+                scene::outcomeOf([&] { frame.end(); });
+            }
+            const float shade = isCancelled ? 0.5f : 0.25f;
+            const std::int64_t number = show(shade);
+            const std::string outcome = scene::outcomeOf([&] { wall.finish(number); });
+            result.expect(outcome == "fine", "after 20 frames: " + outcome);
+            for (const std::int64_t old : {number, number - 1}) {
+                const std::string again = scene::outcomeOf([&] { wall.finish(old, std::chrono::seconds(5)); });
+                result.expect(scene::has(again, "InvalidArgument"), "finished again: " + again);
+            }
+            result.expect(wall.imageFrame() == number, "another frame");
+            for (std::size_t i = 0; fb.rank() == 0 && i < wall.image(0).pixelCount(); ++i)
+                result.expect(wall.image(0).rgba32f()[4 * i] == shade, "a wrong pixel");
+        }
+        return result;
+    }
+};
+
 } // namespace frame_cases
 
 TEST_CASE("Each display of a wall shows what the single image has there", "[wall]") { everywhere<frame_cases::Wall>(); }
+
+TEST_CASE("A wall shows the frame after many that it did not, and none twice", "[wall]")
+{
+    everywhere<frame_cases::WallSkips>();
+}
 
 TEST_CASE("A wall shows converged tiles and survives a frame that fails", "[wall]")
 {

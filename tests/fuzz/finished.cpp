@@ -119,11 +119,10 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
             const std::string& done)
 {
     const auto pool = dfb::MemoryPool::create(false);
-    d::GatherConfig gatherConfig;
-    gatherConfig.format = format;
-    gatherConfig.channels = channels;
-    gatherConfig.codec = flags & HasCodec ? codec() : nullptr;
-    d::FinalGather display(pool, layout(), gatherConfig, 0, 0, 2, ownerOf, [](dfb::Buffer&&, std::size_t) {});
+    dfb::FrameBufferConfig config;
+    config.image.format = format;
+    config.messages.codec = flags & HasCodec ? codec() : nullptr;
+    d::FinalGather display(pool, layout(), config, channels, 0, 0, 2, ownerOf, [](dfb::Buffer&&, std::size_t) {});
     if (flags & Shared) // other ranks put tiles into it
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});
@@ -135,11 +134,11 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     if (flags & MakeHeader) {
         BatchHeader h;
         h.rawBytes = batch.size();
-        if (gatherConfig.codec) {
-            body.resize(gatherConfig.codec->bound(batch.size()));
-            body.resize(gatherConfig.codec->compress(fuzz::bytesOf(batch), batch.size(),
-                                                     reinterpret_cast<std::byte*>(body.data())));
-            h.codec = gatherConfig.codec->id();
+        if (config.messages.codec) {
+            body.resize(config.messages.codec->bound(batch.size()));
+            body.resize(config.messages.codec->compress(fuzz::bytesOf(batch), batch.size(),
+                                                        reinterpret_cast<std::byte*>(body.data())));
+            h.codec = config.messages.codec->id();
         }
         body = fuzz::Output().put(h).text(body).bytes();
     }

@@ -248,7 +248,7 @@ enum : std::uint32_t { OwnScope, AllDeclared, FrameVerdict };
 std::string vote(Way way, int inputsOnTheWay = 0)
 {
     d::Verdict verdict;
-    verdict.sums[9] = inputsOnTheWay;
+    verdict.sums.inputsLeft = inputsOnTheWay;
     verdict.terms = d::FrameTerms::of(paramsFor(way), 1);
     return reductionOf(FrameVerdict, verdict.bytes());
 }
@@ -291,7 +291,8 @@ public:
         try {
             make();
         } catch (const dfb::InvalidArgument&) {
-            fuzz::require(way_.has(NoConfiguration), "a framebuffer is made if the other rank agrees");
+            fuzz::require(way_.has(NoConfiguration) || way_.has(Gathers),
+                          "a framebuffer is made if the other rank agrees");
             return 0;
         } catch (const dfb::Error&) {
             fuzz::require(way_.has(NoConfiguration) || way_.has(Gathers), "as is one that nobody disturbs");
@@ -516,12 +517,9 @@ std::pair<std::string, std::string> finished(Way way)
     const auto config = configFor(way);
     const auto pool = dfb::MemoryPool::create(false);
     std::vector<std::string> bodies;
-    d::GatherConfig gatherConfig;
-    gatherConfig.format = config.image.format;
-    gatherConfig.channels = config.image.depth ? dfb::depthChannel : 0;
-    gatherConfig.codec = config.messages.codec;
     const dfb::TileLayout layout(width, height, side);
-    d::FinalGather gather(pool, layout, gatherConfig, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message, std::size_t) {
+    const dfb::ChannelMask channels = config.image.depth ? dfb::depthChannel : 0;
+    d::FinalGather gather(pool, layout, config, channels, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message, std::size_t) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
     });
@@ -666,11 +664,23 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "width=4\n", 1}.bytes())) + end);
     add("configuration_broken", {NoConfiguration}, of(MessageKind::ReduceUp, std::string("\0\0\0\0no", 6)) + end);
     const auto gathered = [](std::int32_t rank, std::uint64_t count, const std::string& bytes) {
-        return of(MessageKind::ReduceUp, Output().put(+OwnScope).put(rank).put(count).text(bytes).bytes());
+        const std::string call = "allGather() or SharedWorld()";
+        return of(MessageKind::ReduceUp, Output()
+                                             .put(+OwnScope)
+                                             .put(std::int32_t{1})
+                                             .put(static_cast<std::uint32_t>(call.size()))
+                                             .text(call)
+                                             .put(rank)
+                                             .put(count)
+                                             .text(bytes)
+                                             .bytes());
     };
     add("gathered", {Gathers}, gathered(1, 2, "ab"));
     add("gathered_too_much", {Gathers}, gathered(1, ~std::uint64_t{0}, "ab"));
     add("gathered_of_another", {Gathers}, gathered(0, 2, "ab"));
+    add("gathered_by_another_call", {Gathers},
+        of(MessageKind::ReduceUp,
+           Output().put(+OwnScope).put(std::int32_t{1}).put(std::uint32_t{2}).text("no").bytes()));
     add("gathered_of_no_rank", {Gathers}, gathered(7, 2, "ab"));
     return all;
 }

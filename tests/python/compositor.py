@@ -129,6 +129,8 @@ class Compositor(unittest.TestCase):
         image, _ = composite([None, rgba, np.zeros((HEIGHT, WIDTH, 4), np.uint8)],
                              [None, depth, np.full((HEIGHT, WIDTH), np.inf, np.float32)])
         assert_exact(image, nearest([rgba], [depth])[0])
+        image, _ = composite([None, rgba], None, places=(None, 0), blend="order")
+        assert_exact(image, in_order([rgba], (0,)))
 
     def test_display_rank_and_all_ranks(self):
         images, depths = zip(*(pixels(rank) for rank in range(RANKS)))
@@ -163,6 +165,7 @@ class Compositor(unittest.TestCase):
             self.assertIsNone(compositor.image)
             report = compositor.composite(rgba, depth)
             self.assertEqual(report.threads, 1)
+            self.assertEqual(report.order_undefined_pixels, 0)
             self.assertGreater(report.total_ms, 0)
             self.assertIn("frame 1", repr(report))
             assert_exact(compositor.image, nearest([rgba], [depth])[0])

@@ -154,6 +154,9 @@ class Errors(unittest.TestCase):
         errors = errors_of(lambda comm: compositor(comm, blend="order"),
                            lambda thing, rank: thing.composite(rgba, order=3 if rank == 1 else rank))
         self.assertRegex(str(errors[0]), "place 3 in an order of 3 ranks")
+        errors = errors_of(lambda comm: compositor(comm, blend="order"),
+                           lambda thing, rank: thing.composite(rgba, order=None if rank == 1 else rank))
+        self.assertEqual({"order is None" in str(e) and e.rank for e in errors}, {1})
 
     def test_wrong_scenes_on_one_rank(self):
         class Bare:

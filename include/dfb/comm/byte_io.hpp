@@ -11,13 +11,13 @@
 #include <cstring>
 #include <string>
 #include <type_traits>
+#include <utility>
 #include <vector>
-
-// SmallBytes: the bytes of a control message, of which the usual ones need no memory of their own.
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
+// The bytes of a control message, of which the usual ones need no memory of their own.
 class SmallBytes {
 public:
     SmallBytes() = default;
@@ -77,8 +77,10 @@ public:
         const auto* first = reinterpret_cast<const std::byte*>(text.data());
         bytes_.append(first, first + text.size());
     }
+    void putBytes(const std::byte* first, const std::byte* last) { bytes_.append(first, last); }
     void clear() noexcept { bytes_.clear(); }
-    const SmallBytes& bytes() const noexcept { return bytes_; }
+    const SmallBytes& bytes() const& noexcept { return bytes_; }
+    SmallBytes bytes() && noexcept { return std::move(bytes_); }
 
 private:
     SmallBytes bytes_;
@@ -109,6 +111,8 @@ public:
         const std::byte* from = take(count);
         std::copy(from, from + count, to);
     }
+    // All that is left.
+    void copyTo(ByteWriter& out) const { out.putBytes(next_, next_ + left_); }
     // Throws Error (MalformedMessage) when bytes are left.
     void end() const
     {

@@ -114,7 +114,7 @@ public:
             progress_.start();
             if (heartbeat_.isOn())
                 for (const int other : detail::treeNeighbours(rank_, size_))
-                    sendSign(other, detail::MessageKind::Present);
+                    sendSign(other, detail::MessageKind::Pong);
         } catch (const std::exception& e) { // no thread, no memory: the others have made theirs
             leave(e.what());
             end();
@@ -146,7 +146,7 @@ public:
     }
 
     // More than two ranks share a processor.
-    bool isCrowded() const noexcept { return isCrowded_; }
+    bool isOversubscribed() const noexcept { return isOversubscribed_; }
 
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
     // may not call MPI. Never blocks.
@@ -162,9 +162,9 @@ public:
         address = addresses_++;
         receivers_.push_back({address, &receiver});
         std::vector<detail::Arrival> all, its;
-        all.swap(early_);
+        all.swap(unexpected_);
         for (detail::Arrival& e : all)
-            (e.header.receiver == address ? its : early_).push_back(std::move(e));
+            (e.header.receiver == address ? its : unexpected_).push_back(std::move(e));
         for (detail::Arrival& e : its)
             receiver.receive(e.source, e.header, std::move(e.message));
         if (stray_)
@@ -260,12 +260,7 @@ public:
     }
 
     // Says that messages may come from now on (true), or no more (false). Each true is followed by one false.
-    void expectMessages(bool expect)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        expecting_ += expect ? 1 : -1;
-        progress_.expectMessages(expecting_ > 0);
-    }
+    void expectMessages(bool expect) { progress_.expectMessages(expect); }
 
     // Returns what the exception that all ranks throw now must keep: while it does, the connection ends in order.
     std::shared_ptr<const void> throwByAll()
@@ -373,8 +368,8 @@ private:
     static bool isOfSetUp(detail::MessageKind kind)
     {
         using Kind = detail::MessageKind;
-        return kind == Kind::ReduceUp || kind == Kind::ReduceDown || kind == Kind::Failure || kind == Kind::AreYouThere
-               || kind == Kind::Present;
+        return kind == Kind::ReduceUp || kind == Kind::ReduceDown || kind == Kind::Failure || kind == Kind::Ping
+               || kind == Kind::Pong;
     }
 
     void checkChecksum(detail::MessageHeader header, Buffer& message) const
@@ -406,7 +401,7 @@ private:
                 fail(error);
                 return;
             }
-            if (header.kind == detail::MessageKind::AreYouThere || header.kind == detail::MessageKind::Present)
+            if (header.kind == detail::MessageKind::Ping || header.kind == detail::MessageKind::Pong)
                 return;
         } catch (const Error& e) {
             const std::lock_guard<std::mutex> lock(mutex_);
@@ -420,7 +415,7 @@ private:
         if (const auto receiver = findReceiver(header.receiver); receiver != receivers_.end())
             receiver->second->receive(source, header, std::move(message));
         else if (header.receiver >= addresses_)
-            early_.push_back({source, header, std::move(message)});
+            unexpected_.push_back({source, header, std::move(message)});
     }
 
     using Receiver = std::pair<std::uint32_t, detail::MessageReceiver*>;
@@ -444,8 +439,8 @@ private:
     bool isNew(int source, const detail::MessageHeader& header)
     {
         const std::lock_guard<std::mutex> lock(peersMutex_);
-        heartbeat_.heard(source, header.kind == detail::MessageKind::Present);
-        if (header.kind == detail::MessageKind::AreYouThere) {
+        heartbeat_.heard(source, header.kind == detail::MessageKind::Pong);
+        if (header.kind == detail::MessageKind::Ping) {
             if (std::find(askers_.begin(), askers_.end(), source) == askers_.end())
                 askers_.push_back(source);
             isAsked_ = true;
@@ -505,7 +500,7 @@ private:
                 askers.swap(askers_);
             }
             for (const int other : askers)
-                sendSign(other, detail::MessageKind::Present);
+                sendSign(other, detail::MessageKind::Pong);
         }
         if (!heartbeat_.isOn() || failed_ || now < nextBeat_)
             return;
@@ -516,7 +511,7 @@ private:
             due = heartbeat_.due(now, expecting);
         }
         for (const int other : due.ask)
-            sendSign(other, detail::MessageKind::AreYouThere);
+            sendSign(other, detail::MessageKind::Ping);
         if (due.lost >= 0)
             lose(due.lost);
     }
@@ -548,7 +543,7 @@ private:
     std::shared_ptr<MemoryPool> pool_;
     std::unique_ptr<Link> link_;
     const int rank_ = link_->rank(), size_ = link_->size();
-    const bool isCrowded_ = link_->sharingRanks() > 2 * Processors::ofThisThread().count();
+    const bool isOversubscribed_ = link_->sharingRanks() > 2 * Processors::ofThisThread().count();
     std::atomic<std::int64_t> duplicates_{0};
     std::atomic<bool> isAlike_{false};
 
@@ -563,10 +558,9 @@ private:
 
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::vector<Receiver> receivers_;
-    std::vector<detail::Arrival> early_;             // for receivers to come
+    std::vector<detail::Arrival> unexpected_;        // for receivers to come
     std::optional<std::pair<int, ErrorInfo>> stray_; // the malformed message that came before its receiver
     std::uint32_t addresses_ = 0;
-    int expecting_ = 0;
 
     mutable std::mutex failureMutex_;
     std::optional<ErrorInfo> failure_;

@@ -66,16 +66,18 @@ public:
     }
 
     // From now on only messages of this epoch count for which `matters(message)` is true. Forgets the others that wait,
-    // and drops those that still come.
+    // and drops those that still come. What credit was asked for still goes: the receiver would set aside for nothing.
     void drop(std::function<bool(const Buffer&)> matters)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         matters_ = std::move(matters);
         for (auto& [rank, peer] : peers_) {
             Outgoing& out = peer.out;
+            std::uint64_t total = out.sent;
             for (std::size_t left = out.queue.size(); left > 0; --left) {
                 Buffer message = out.queue.pop();
-                if (matters_(message))
+                total += message.size();
+                if (total <= out.askedForAll || matters_(message))
                     out.queue.push(std::move(message));
                 else
                     underWay_ -= message.size();
@@ -233,7 +235,7 @@ public:
 private:
     struct Outgoing {
         std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
-        std::uint64_t askedFor = 0;                        // Request::first
+        std::uint64_t askedFor = 0, askedForAll = 0;       // Request::first, all
         Fifo<Buffer> queue;
 
         bool asked() const { return askedFor > granted; } // and has no answer yet
@@ -254,7 +256,7 @@ private:
         void reset(std::uint64_t allowance)
         {
             out.queue.clear();
-            out.sent = out.consumed = out.askedFor = 0;
+            out.sent = out.consumed = out.askedFor = out.askedForAll = 0;
             in = Incoming();
             out.granted = in.granted = allowance;
         }
@@ -282,6 +284,7 @@ private:
             request.all = total;
         }
         out.askedFor = request.first;
+        out.askedForAll = request.all;
         return request;
     }
 

@@ -164,7 +164,7 @@ public:
         const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
         const Connection::Hurry hurry(*connection_);
         for (auto lastChange = Clock::now(); !done();) {
-            if (const std::size_t now = flow_.underWay(); now < before) {
+            if (const std::size_t now = flow_.underWay(); now != before) { // also more: another thread has found room
                 before = now;
                 lastChange = Clock::now();
             } else if (limit.count() > 0 && Clock::now() - lastChange > limit) {
@@ -315,7 +315,7 @@ public:
         } else {
             // A nap takes about 0.1 ms, and a frame waits for some five messages one after the other. But a rank that
             // is awake takes time from those that it shares a processor with.
-            Alertness alertness(std::chrono::microseconds(connection_->isCrowded() ? 30 : 1000));
+            SpinWait spin(std::chrono::microseconds(connection_->isOversubscribed() ? 30 : 1000));
             // Messages that were just queued must leave also when this is over, such as results for ranks below in the
             // tree.
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
@@ -323,8 +323,8 @@ public:
                 // Before a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
                 if (executor_->help() || moved)
-                    alertness.renew();
-                else if (!over() && !alertness.yield())
+                    spin.renew();
+                else if (!over() && !spin.yield())
                     connection_->nap(std::chrono::microseconds(50));
                 handler_.polled();
                 lock.lock();
@@ -366,46 +366,40 @@ public:
         return result->bytes;
     }
 
-    // Combines `values` element by element over all ranks. Collective. Throws InvalidArgument on all ranks if the
-    // numbers of values differ.
+    // Combines `values` element by element over all ranks. `how`: the operation's name. Collective. Waits and throws as
+    // reduce(), and InvalidArgument on all ranks if they make different calls.
     template <class Operation>
-    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Operation operation)
+    std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, const char* how, Operation operation)
     {
-        ByteWriter mine;
-        mine.put(static_cast<std::int32_t>(rank()));
+        ByteWriter mine = partOf(printed("allReduce() of %zu values to their %s", values.size(), how));
         for (const std::int64_t value : values)
             mine.put(value);
-        const Bytes result = reduce(mine.bytes(), [operation](const Bytes& a, const Bytes& b) {
-            return ReductionTable::combineElements(a, b, operation);
+        const Bytes result = reduceParts(std::move(mine), [operation](ByteReader& a, ByteReader& b, ByteWriter& out) {
+            while (a.left() > 0) {
+                const auto x = a.get<std::int64_t>(), y = b.get<std::int64_t>();
+                out.put(operation(x, y));
+            }
         });
-        ByteReader in(result);
-        if (in.get<std::int32_t>() < 0)
-            throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, "the number of values in allReduce() is "
-                                                                            + in.getText()
-                                                                            + ": it must be the same on all ranks"),
-                                  connection_->throwByAll());
-        in.require(in.left() == values.size() * sizeof(std::int64_t));
+        ByteReader in = partIn(result);
         std::vector<std::int64_t> reduced(values.size());
         for (std::int64_t& value : reduced)
             value = in.get<std::int64_t>();
         return reduced;
     }
 
-    // Returns the bytes of each rank, by rank; their numbers may differ. Collective.
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own)
+    // Returns the bytes of each rank, by rank; their numbers may differ. Collective. Waits and throws as allReduce().
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
     {
-        ByteWriter out; // of each rank: which it is, the size, the bytes
-        out.put(static_cast<std::int32_t>(rank()));
-        out.put(static_cast<std::uint64_t>(own.size()));
-        Bytes mine = out.bytes();
-        mine.append(own.data(), own.data() + own.size());
-        const Bytes all = reduce(std::move(mine), [](const Bytes& a, const Bytes& b) {
-            Bytes both = a;
-            both.append(b.begin(), b.end());
-            return both;
+        ByteWriter mine = partOf(call); // then of each rank: which it is, the size, the bytes
+        mine.put(static_cast<std::int32_t>(rank()));
+        mine.put(static_cast<std::uint64_t>(own.size()));
+        mine.putBytes(own.data(), own.data() + own.size());
+        const Bytes all = reduceParts(std::move(mine), [](ByteReader& a, ByteReader& b, ByteWriter& out) {
+            a.copyTo(out);
+            b.copyTo(out);
         });
         std::vector<std::vector<std::byte>> result;
-        ByteReader in(all);
+        ByteReader in = partIn(all);
         for (int from = 0; from < size(); ++from) { // in order, as they were combined
             const auto whose = in.get<std::int32_t>();
             const auto byteCount = in.get<std::uint64_t>();
@@ -418,6 +412,34 @@ public:
     }
 
 private:
+    // What this rank brings to a call of this name: see ReductionTable::combineParts().
+    ByteWriter partOf(const std::string& call) const
+    {
+        ByteWriter out;
+        out.put(static_cast<std::int32_t>(rank()));
+        out.putText(call);
+        return out;
+    }
+
+    template <class Combine>
+    Bytes reduceParts(ByteWriter&& mine, Combine combine)
+    {
+        return reduce(std::move(mine).bytes(), [combine](const Bytes& a, const Bytes& b) {
+            return ReductionTable::combineParts(a, b, combine);
+        });
+    }
+
+    // What all have brought together. Throws InvalidArgument if they have made different calls.
+    ByteReader partIn(const Bytes& result) const
+    {
+        ByteReader in(result);
+        const auto first = in.get<std::int32_t>();
+        std::string call = in.getText();
+        if (first < 0)
+            throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, std::move(call)), connection_->throwByAll());
+        return in;
+    }
+
     // A message that could not be read may have been a part of this reduction, if others are not here yet, or of the
     // next, if they are through. The first reduction is that of its owner's constructor. `damage`: from before.
     void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
@@ -426,7 +448,7 @@ private:
         const std::chrono::milliseconds late = connection_->config().peerTimeout;
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
-        if (damage)
+        if (damage && (isFirst || late.count() > 0)) // a peerTimeout of 0 is no limit
             deadline = Clock::now() + (isFirst ? soon : late);
         do { // also if the parts of all were here: with Progress::Caller wait() sends the result on
             if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {
@@ -445,10 +467,10 @@ private:
         return damage_.has_value();
     }
 
-    // How long a thread that waits stays awake: until nothing has come for `patience`, or others need the core.
-    class Alertness {
+    // How long a thread that waits stays awake: until nothing has come for `limit`, or others need the processor.
+    class SpinWait {
     public:
-        explicit Alertness(std::chrono::microseconds patience) : patience_(patience) {}
+        explicit SpinWait(std::chrono::microseconds limit) : limit_(limit) {}
 
         void renew() { last_ = Clock::now(); } // something has come
 
@@ -457,14 +479,14 @@ private:
         {
             constexpr std::chrono::microseconds taken{50};
             const auto now = Clock::now();
-            if (now - last_ > patience_)
+            if (now - last_ > limit_)
                 return false;
             std::this_thread::yield();
             return Clock::now() - now <= taken;
         }
 
     private:
-        const std::chrono::microseconds patience_;
+        const std::chrono::microseconds limit_;
         Clock::time_point last_ = Clock::now();
     };
 
@@ -474,10 +496,10 @@ private:
     {
         if (!connection_->hasProgressThread() || connection_->needsCaller())
             return;
-        for (Alertness alertness(std::chrono::microseconds(200)); !over();) {
+        for (SpinWait spin(std::chrono::microseconds(200)); !over();) {
             if (executor_->help() || connection_->helpProgress())
-                alertness.renew();
-            else if (!alertness.yield())
+                spin.renew();
+            else if (!spin.yield())
                 return;
         }
     }

@@ -115,8 +115,8 @@ enum class MessageKind : std::uint8_t {
     Jobs,          // a range of them
     ImagePlace,    // where in shared memory the image of the display rank lies
     Failure,       // the sender's connection cannot go on, nor can ranks that wait for it
-    AreYouThere,   // to be answered at once with the next
-    Present,       // the sender is there, and answers whenever it is asked
+    Ping,          // to be answered at once with the next
+    Pong,          // the sender is there, and answers whenever it is asked
     Hidden,        // from which generation on inputs of a tile cannot be seen
     Leaving        // the sender destroys its object, and takes part in nothing that begins from now on
 };

@@ -60,7 +60,7 @@ inline int mpiLevel()
 }
 
 // For waiting without spinning and without a blocking call.
-class Patience {
+class Backoff {
 public:
     void nap()
     {
@@ -78,8 +78,8 @@ private:
 inline void waitMpi(MPI_Request& request, int rank, MPI_Status* status = MPI_STATUS_IGNORE)
 {
     int done = 0;
-    for (Patience patience; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
-        patience.nap();
+    for (Backoff backoff; checkMpi(MPI_Test(&request, &done, status), "MPI_Test", rank), !done;)
+        backoff.nap();
 }
 
 } // namespace detail

@@ -25,7 +25,8 @@ class MpiSession {
 public:
     // Initialises MPI at this thread level or a higher one; without `level` at the highest that it has. With
     // MPI_THREAD_MULTIPLE messages move by themselves (see Progress). Throws TransportError if MPI has been initialised
-    // or finalised before, or does not have the level.
+    // or finalised before, or does not have the level. Collective over MPI_COMM_WORLD; waits as
+    // MPI_Init_thread() does.
     MpiSession(int& argc, char**& argv, std::optional<int> level = std::nullopt);
 
     MpiSession(const MpiSession&) = delete;
@@ -94,11 +95,11 @@ DFB_COMPILED_ONCE void MpiSession::abortJob()
     int done = 0;
     MPI_Request request = MPI_REQUEST_NULL;
     MPI_Ibarrier(MPI_COMM_WORLD, &request);
-    detail::Patience patience;
+    detail::Backoff backoff;
     for (const auto limit = std::chrono::steady_clock::now() + std::chrono::milliseconds(500);
          MPI_Test(&request, &done, MPI_STATUS_IGNORE) == MPI_SUCCESS && !done
          && std::chrono::steady_clock::now() < limit;)
-        patience.nap();
+        backoff.nap();
     std::this_thread::sleep_for(std::chrono::milliseconds(50));
     MPI_Abort(MPI_COMM_WORLD, 1);
 }
@@ -114,9 +115,11 @@ DFB_COMPILED_ONCE void MpiSession::finalize()
 
 // MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
 // the rest in its connections, but a rank that has got further answers no more. With no connection in use, and
-// nothing new on them for a while, it does not.
+// nothing new on them for a while, it does not. Beyond `most` ranks, opening all connections would cost more than that.
 DFB_COMPILED_ONCE void MpiSession::partFromAll()
 {
+#if defined(MPICH_VERSION)
+    constexpr int most = 256;
     if (size_ == 1)
         return;
     MPI_Comm comm = MPI_COMM_NULL;
@@ -127,7 +130,7 @@ DFB_COMPILED_ONCE void MpiSession::partFromAll()
 
     std::vector<char> bytes(static_cast<std::size_t>(size_) + 1);
     std::vector<MPI_Request> requests;
-    for (int other = 0; other < size_; ++other)
+    for (int other = 0; other < size_ && size_ <= most; ++other)
         if (other != rank_) {
             requests.push_back(MPI_REQUEST_NULL);
             check(MPI_Irecv(&bytes[static_cast<std::size_t>(other)], 1, MPI_CHAR, other, 0, comm, &requests.back()),
@@ -141,6 +144,7 @@ DFB_COMPILED_ONCE void MpiSession::partFromAll()
     detail::waitMpi(request, rank_);
     MPI_Comm_free(&comm);
     std::this_thread::sleep_for(std::chrono::milliseconds(20));
+#endif
 }
 #endif
 

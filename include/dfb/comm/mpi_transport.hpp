@@ -112,7 +112,7 @@ public:
     }
     bool wakesOnArrival() const noexcept { return false; }
     // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are. Where
-    // all that a rank waits for comes from this node, its bell ends the nap.
+    // all that a rank waits for comes from this node, its doorbell ends the nap.
     void nap(std::chrono::nanoseconds limit)
     {
         napLimit_ = limit;
@@ -120,13 +120,13 @@ public:
         if (Clock::now() - lastWake_.load() < 2 * wakePause) // then send() may not end it
             limit = std::min(limit, wakePause);
         if (limit < std::chrono::milliseconds(10))
-            limit = limit * crowding_ / 4;
+            limit = limit * oversubscription_ / 4;
         if (listener_)
             listener_->nap(isAwaiting && isRungForAll_ ? std::max(limit, rungNap) : limit, isAwaiting);
         else
             signal_.nap(limit);
     }
-    void interrupt() { listener_ ? ranks_.memory()->bell().interrupt() : signal_.interrupt(); }
+    void interrupt() { listener_ ? ranks_.memory()->doorbell().interrupt() : signal_.interrupt(); }
 
     void start(TransportHandler& handler) { handler_ = &handler; }
 
@@ -207,19 +207,17 @@ private:
         int found = 0;
         check(MPI_Comm_get_attr(comm(), MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
         lastTag_ = found ? std::min(*tagBound, 1 << 20) : 32767;
-        crowding_ = crowding();
+        oversubscription_ = oversubscription();
         if (ranks_.memory())
-            listener_.emplace(ranks_.memory()->bell());
+            listener_.emplace(ranks_.memory()->doorbell());
         peers_.resize(static_cast<std::size_t>(size()));
-        packetRequests_.assign(postedPackets, MPI_REQUEST_NULL);
-        packets_ = pool_->acquire(detail::packetBytes * postedPackets);
-        for (int slot = 0; slot < postedPackets; ++slot)
-            postPacket(slot);
+        for (int i = 0; i < postedPackets; ++i)
+            receive(packets_, {pool_->acquire(detail::packetBytes), 0, MPI_ANY_SOURCE, 0});
     }
 
     // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
     // each wakes up so often, and takes the core from all others that often.
-    int crowding() const
+    int oversubscription() const
     {
         const std::int64_t ranksPerCore = std::int64_t{4} * ranks_.sharingRanks() / ranks_.processors(); // in quarters
         return static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
@@ -348,7 +346,7 @@ private:
             listener_->look();
         const bool started = !leaving_ && startSends();
         // A second time, as Open MPI's MPI_Testsome returns what had come before the call, and only then looks for
-        // more: the bell would not ring again.
+        // more: the doorbell would not ring again.
         const bool arrived = receivePackets() || receivePackets();
         const bool delivered = receiveBodies();
         const bool completed = finishSends();
@@ -361,7 +359,7 @@ private:
     void ring(int other)
     {
         if (const auto& memory = ranks_[other].itsMemory)
-            memory->bell().ring();
+            memory->doorbell().ring();
     }
 
     // --- sending
@@ -479,32 +477,20 @@ private:
 
     // --- receiving
 
-    std::byte* packetAt(int slot) { return packets_.data() + static_cast<std::size_t>(slot) * detail::packetBytes; }
-
-    void postPacket(int slot)
-    {
-        check(MPI_Irecv(packetAt(slot), static_cast<int>(detail::packetBytes), MPI_BYTE, MPI_ANY_SOURCE, 0, comm(),
-                        &packetRequests_[static_cast<std::size_t>(slot)]),
-              "MPI_Irecv");
-    }
-
     bool receivePackets()
     {
-        const int count = testSome(packetRequests_);
-        for (int i = 0; i < count; ++i) {
-            const int slot = indices_[static_cast<std::size_t>(i)];
-            const MPI_Status& status = statuses_[static_cast<std::size_t>(i)];
-            unpack(status.MPI_SOURCE, packetAt(slot), byteCountOf(status));
-            postPacket(slot);
-        }
-        return count > 0;
+        return testSome(packets_, [this](Transfer& packet, const MPI_Status& status) {
+            unpack(packet, status);
+            return startReceive(packet);
+        });
     }
 
     // An empty packet says goodbye, see finish().
-    void unpack(int source, const std::byte* packet, std::size_t byteCount)
+    void unpack(const Transfer& packet, const MPI_Status& status)
     {
-        const bool isPacket =
-            detail::readPacket(packet, byteCount, [&](const Record& record, const std::byte* payload) {
+        const int source = status.MPI_SOURCE;
+        const bool isPacket = detail::readPacket(
+            packet.data.data(), byteCountOf(status), [&](const Record& record, const std::byte* payload) {
                 const auto payloadBytes = static_cast<std::size_t>(record.byteCount);
                 if (record.kind == Record::Announcement) {
                     announced_.push({source, record.tag, record.byteCount});
@@ -533,10 +519,7 @@ private:
     {
         while (!announced_.empty() && receives_.requests.size() < bodiesAtOnce) {
             const Announced next = announced_.pop();
-            Transfer body{pool_->acquire(static_cast<std::size_t>(next.byteCount)), 0, next.source, next.tag};
-            const MPI_Request request = startReceive(body);
-            receives_.requests.push_back(request);
-            receives_.items.push_back(std::move(body));
+            receive(receives_, {pool_->acquire(static_cast<std::size_t>(next.byteCount)), 0, next.source, next.tag});
         }
         return testSome(receives_, [this](Transfer& body, const MPI_Status& status) {
             if (byteCountOf(status) != static_cast<std::size_t>(body.count()))
@@ -548,6 +531,12 @@ private:
             deliver(body.peer, std::move(body.data));
             return MPI_REQUEST_NULL;
         });
+    }
+
+    void receive(Transfers& transfers, Transfer&& body)
+    {
+        transfers.requests.push_back(startReceive(body));
+        transfers.items.push_back(std::move(body));
     }
 
     MPI_Request startReceive(Transfer& body)
@@ -573,11 +562,14 @@ private:
 
     // --- completion
 
-    // How many have completed; indices_ and statuses_ say which and how. `items`: what they move, if they are of one
-    // rank each. MPI_Testsome reports errors to the handler of MPI_COMM_SELF or MPI_COMM_WORLD, which by default ends
-    // the job.
-    int testSome(std::vector<MPI_Request>& requests, const std::vector<Transfer>* items = nullptr)
+    // Calls `next(item, status)` for each that has completed, which returns the request of its next chunk or that it
+    // was the last; removes those. True if there were any. MPI_Testsome reports errors to the handler of MPI_COMM_SELF
+    // or MPI_COMM_WORLD, which by default ends the job.
+    bool testSome(Transfers& transfers, detail::FunctionRef<MPI_Request(Transfer&, const MPI_Status&)> next)
     {
+        auto& [requests, items] = transfers;
+        if (requests.empty())
+            return false;
         if (indices_.size() < requests.size()) {
             indices_.resize(requests.size());
             statuses_.resize(requests.size());
@@ -585,28 +577,15 @@ private:
         int count = 0, kind = MPI_SUCCESS;
         const int code =
             MPI_Testsome(static_cast<int>(requests.size()), requests.data(), &count, indices_.data(), statuses_.data());
+        const auto which = [this](int i) { return static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)]); };
         if (code != MPI_SUCCESS && MPI_Error_class(code, &kind) == MPI_SUCCESS && kind == MPI_ERR_IN_STATUS)
             for (int i = 0; i < count; ++i)
-                check(statuses_[static_cast<std::size_t>(i)].MPI_ERROR, "MPI_Testsome",
-                      items ? (*items)[static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)])].peer : -1);
+                check(statuses_[static_cast<std::size_t>(i)].MPI_ERROR, "MPI_Testsome", items[which(i)].peer);
         check(code, "MPI_Testsome");
-        return count == MPI_UNDEFINED ? 0 : count;
-    }
-
-    // Calls `next(item, status)` for each that has completed, which returns the request of its next chunk or that it
-    // was the last; removes those. True if there were any.
-    bool testSome(Transfers& transfers, detail::FunctionRef<MPI_Request(Transfer&, const MPI_Status&)> next)
-    {
-        auto& [requests, items] = transfers;
-        if (requests.empty())
+        if (count == 0 || count == MPI_UNDEFINED)
             return false;
-        const int count = testSome(requests, &items);
-        if (count == 0)
-            return false;
-        for (int i = 0; i < count; ++i) {
-            const auto which = static_cast<std::size_t>(indices_[static_cast<std::size_t>(i)]);
-            requests[which] = next(items[which], statuses_[static_cast<std::size_t>(i)]);
-        }
+        for (int i = 0; i < count; ++i)
+            requests[which(i)] = next(items[which(i)], statuses_[static_cast<std::size_t>(i)]);
         std::size_t kept = 0;
         for (std::size_t i = 0; i < requests.size(); ++i) {
             if (requests[i] == MPI_REQUEST_NULL)
@@ -627,15 +606,15 @@ private:
     // False if the handler has failed: then the event that it waits for may never come.
     bool moveUntil(detail::FunctionRef<bool()> done)
     {
-        for (detail::Patience patience; !done();) {
+        for (detail::Backoff backoff; !done();) {
             if (handler_)
                 handler_->waiting();
             if (handler_ && handler_->failed())
                 return false;
             if (move())
-                patience.reset();
+                backoff.reset();
             else
-                patience.nap();
+                backoff.nap();
         }
         return true;
     }
@@ -668,29 +647,25 @@ private:
         if (!moveUntil(haveLeft) || !barrier())
             return false;
         // A receive that cannot be cancelled any more has a packet.
-        cancelPackets([this](int slot, std::size_t byteCount) {
-            unpack(statuses_[static_cast<std::size_t>(slot)].MPI_SOURCE, packetAt(slot), byteCount);
-        });
+        cancelPackets([this](const Transfer& packet, const MPI_Status& status) { unpack(packet, status); });
         return moveUntil([this] { return announced_.empty() && receives_.requests.empty(); });
     }
 
-    // Calls `came(slot, byteCount)` for the receives that have got something.
-    void cancelPackets(detail::FunctionRef<void(int, std::size_t)> came)
+    // Calls `came(packet, status)` for the receives that have got something.
+    void cancelPackets(detail::FunctionRef<void(const Transfer&, const MPI_Status&)> came)
     {
-        for (MPI_Request& request : packetRequests_)
+        for (MPI_Request& request : packets_.requests)
             if (request != MPI_REQUEST_NULL)
                 check(MPI_Cancel(&request), "MPI_Cancel");
-        statuses_.resize(std::max(statuses_.size(), packetRequests_.size()));
-        for (std::size_t slot = 0; slot < packetRequests_.size(); ++slot) {
-            MPI_Request& request = packetRequests_[slot];
-            if (request == MPI_REQUEST_NULL)
+        for (std::size_t i = 0; i < packets_.requests.size(); ++i) {
+            if (packets_.requests[i] == MPI_REQUEST_NULL)
                 continue;
-            MPI_Status& status = statuses_[slot];
+            MPI_Status status;
             int cancelled = 0;
-            detail::waitMpi(request, rank(), &status);
+            detail::waitMpi(packets_.requests[i], rank(), &status);
             check(MPI_Test_cancelled(&status, &cancelled), "MPI_Test_cancelled");
             if (!cancelled)
-                came(static_cast<int>(slot), byteCountOf(status));
+                came(packets_.items[i], status);
         }
     }
 
@@ -698,7 +673,7 @@ private:
     void release()
     {
         try {
-            cancelPackets([](int, std::size_t) {}); // if stop() was never called
+            cancelPackets([](const Transfer&, const MPI_Status&) {}); // if stop() was never called
         } catch (const std::exception&) {
         }
         ranks_.free();
@@ -720,13 +695,12 @@ private:
     {
         int done = 0;
         if (!detail::mpiSays(MPI_Finalized))
-            for (auto* requests : {&packetRequests_, &receives_.requests})
+            for (auto* requests : {&packets_.requests, &receives_.requests})
                 for (MPI_Request& request : *requests)
                     if (request != MPI_REQUEST_NULL && MPI_Cancel(&request) == MPI_SUCCESS)
                         MPI_Test(&request, &done, MPI_STATUS_IGNORE);
         struct Abandoned {
-            Transfers sends, receives, notices;
-            Buffer packets;
+            Transfers sends, receives, notices, packets;
         };
         new Abandoned{std::move(sends_), std::move(receives_), std::move(notices_), std::move(packets_)};
         ranks_.abandon();
@@ -737,10 +711,10 @@ private:
     detail::MpiRanks ranks_;
     TransportHandler* handler_ = nullptr;
     int lastTag_ = 1;
-    int crowding_ = 4;
+    int oversubscription_ = 4;
 
-    std::optional<detail::Bell::Listener> listener_; // of this rank's memory; none: signal_ in its place
-    std::atomic<bool> isRungForAll_{false};          // nothing can come that is not announced by the bell
+    std::optional<detail::Doorbell::Listener> listener_; // of this rank's memory; none: signal_ in its place
+    std::atomic<bool> isRungForAll_{false};              // nothing can come that is not announced by the doorbell
     NapSignal signal_;
     mutable std::mutex mutex_;
     std::vector<std::pair<int, Buffer>> outbox_;                                  // under mutex_
@@ -752,13 +726,11 @@ private:
     bool failed_ = false, leaving_ = false;
     std::vector<std::pair<int, Buffer>> starting_;
     std::vector<Peer> peers_;
-    std::vector<int> waitingPeers_; // those with messages that wait
-    detail::PacketWriter packet_;   // that is being filled
-    std::vector<Transfer> bodies_;  // to follow it
-    Transfers sends_, receives_, notices_;
+    std::vector<int> waitingPeers_;                  // those with messages that wait
+    detail::PacketWriter packet_;                    // that is being filled
+    std::vector<Transfer> bodies_;                   // to follow it
+    Transfers sends_, receives_, notices_, packets_; // packets_: the posted receives
     detail::Fifo<Announced> announced_;
-    Buffer packets_; // the posted ones
-    std::vector<MPI_Request> packetRequests_;
     std::vector<int> indices_;
     std::vector<MPI_Status> statuses_;
 };

@@ -1,5 +1,5 @@
 // NodeMemory: memory that the processes of one node all see, so that messages between them are not copied: the sender
-// tells where a block lies, and the receiver reads it there and gives it back. It also has a bell for each process.
+// tells where a block lies, and the receiver reads it there and gives it back. It also has a doorbell for each process.
 //
 // It has no name in the file system that could be left behind: others reach it through the process that made it, and it
 // is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at another, there
@@ -32,36 +32,39 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Bell: a word in memory that the processes of a node share, with which they wake a rank that naps.
-class Bell {
+// Doorbell: a word in memory that the processes of a node share, with which they wake a rank that naps.
+class Doorbell {
 public:
     // One that naps. From several threads at once.
     class Listener {
     public:
-        explicit Listener(Bell& bell) : bell_(bell), heard_(bell.word_.load()), seen_(bell.word_.load()) {}
+        explicit Listener(Doorbell& doorbell)
+            : doorbell_(doorbell), heard_(doorbell.word_.load()), seen_(doorbell.word_.load())
+        {
+        }
 
         // Before it looks for messages: rings up to now need not end a nap.
-        void look() noexcept { heard_ = bell_.word_.load(); }
+        void look() noexcept { heard_ = doorbell_.word_.load(); }
 
         // Naps for `limit`, or until it is interrupted, or with `isAwaiting` until a rank rings. Ends at once if either
         // has happened since the last nap, or look().
         void nap(std::chrono::nanoseconds limit, bool isAwaiting) noexcept
         {
-            const std::uint32_t word = bell_.word_.load();
+            const std::uint32_t word = doorbell_.word_.load();
             if (ringsOf(word) == ringsOf(heard_) && interruptsOf(word) == interruptsOf(seen_)) {
-                auto& nappers = isAwaiting ? bell_.awaiting_ : bell_.napping_;
+                auto& nappers = isAwaiting ? doorbell_.awaiting_ : doorbell_.napping_;
                 nappers.fetch_add(1);
-                bell_.wait(word, limit); // returns at once if the word is another one by now
+                doorbell_.wait(word, limit); // returns at once if the word is another one by now
                 nappers.fetch_sub(1);
             }
-            heard_ = seen_ = bell_.word_.load();
+            heard_ = seen_ = doorbell_.word_.load();
         }
 
     private:
         static std::uint32_t ringsOf(std::uint32_t word) { return word & 0xffff; }
         static std::uint32_t interruptsOf(std::uint32_t word) { return word >> 16; }
 
-        Bell& bell_;
+        Doorbell& doorbell_;
         std::atomic<std::uint32_t> heard_, seen_;
     };
 
@@ -100,7 +103,7 @@ private:
     std::atomic<std::uint32_t> word_{0}; // rings in the lower half, interrupts in the upper one
     std::atomic<std::uint32_t> awaiting_{0}, napping_{0};
 };
-static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(Bell) == 3 * sizeof(std::uint32_t));
+static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(Doorbell) == 3 * sizeof(std::uint32_t));
 
 class NodeMemory final : public SharedMemory, public BlockOwner, public std::enable_shared_from_this<NodeMemory> {
 public:
@@ -135,7 +138,7 @@ public:
         memory->address_.process = getpid();
         memory->address_.file = file;
         std::memcpy(base, memory->address_.secret, sizeof memory->address_.secret);
-        new (&memory->bell()) Bell;
+        new (&memory->doorbell()) Doorbell;
         return memory;
 #else
         return nullptr;
@@ -179,8 +182,8 @@ public:
     }
 
     const Address& address() const noexcept { return address_; }
-    // The bell of the process whose memory it is.
-    Bell& bell() const noexcept { return *reinterpret_cast<Bell*>(base_ + alignment); }
+    // The doorbell of the process whose memory it is.
+    Doorbell& doorbell() const noexcept { return *reinterpret_cast<Doorbell*>(base_ + alignment); }
 
     std::byte* take(std::size_t byteCount) noexcept override
     {
@@ -297,7 +300,7 @@ private:
     const int file_; // -1: of another process
     Address address_;
     std::mutex mutex_;
-    std::size_t used_ = 2 * alignment, allocated_; // the first bytes are the secret and the bell; under mutex_
+    std::size_t used_ = 2 * alignment, allocated_; // the first bytes are the secret and the doorbell; under mutex_
 };
 
 } // namespace detail

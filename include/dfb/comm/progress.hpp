@@ -65,11 +65,11 @@ public:
     // Whether messages may come in: if not, and nothing waits to be sent, the thread sleeps. From any thread.
     void expectMessages(bool expect)
     {
-        expecting_ = expect;
+        expecting_ += expect ? 1 : -1;
         if (expect)
             link_.interrupt();
     }
-    bool expectsMessages() const noexcept { return expecting_; }
+    bool expectsMessages() const noexcept { return expecting_ > 0; }
 
     // Begins (true) or ends (false) that a thread which calls tryPoll() all the time stands in for this one, which
     // polls every 2 ms meanwhile. Calls nest and must balance. From any thread.
@@ -111,7 +111,7 @@ private:
             return std::clamp<Clock::duration>(idle / 8, microseconds(shortest), microseconds(longest));
         };
         // The network library may need more calls to finish messages that it has taken.
-        if (!expecting_ && quiet && idle > std::chrono::milliseconds(10))
+        if (!expectsMessages() && quiet && idle > std::chrono::milliseconds(10))
             return longestNap_;
         if (link_.wakesOnArrival())
             return between(waiting_ > 0 ? 50 : 200, 2000);
@@ -152,8 +152,8 @@ private:
     const std::function<void(Clock::time_point)> between_;
     std::mutex pollMutex_;
     std::atomic<std::uint64_t> polls_{0};
-    std::atomic<bool> stop_{false}, expecting_{false};
-    std::atomic<int> waiting_{0}, standIns_{0};
+    std::atomic<bool> stop_{false};
+    std::atomic<int> expecting_{0}, waiting_{0}, standIns_{0};
     std::mutex standInMutex_;
     std::condition_variable standInLeft_;
     std::thread thread_;

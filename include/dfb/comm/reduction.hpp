@@ -5,6 +5,7 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
+#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/message.hpp>
 
@@ -60,30 +61,28 @@ public:
             states_.emplace_back(children_.size() + 1);
     }
 
-    // Combines arrays of int64 element by element. In front of each stands (int32) the lowest rank that it is of; -1: a
-    // text follows, on arrays that are not equally long. Throws Error (MalformedMessage).
-    template <class Operation>
-    static Bytes combineElements(const Bytes& a, const Bytes& b, Operation operation)
+    // Combines what ranks bring to a call. In front stand (int32) the lowest rank that it is of, and the call's name; or
+    // -1 and a text, if ranks make different calls. `combine(a, b, out)` does so with the rest. Throws Error
+    // (MalformedMessage).
+    static Bytes combineParts(const Bytes& a, const Bytes& b,
+                              detail::FunctionRef<void(detail::ByteReader&, detail::ByteReader&, detail::ByteWriter&)> combine)
     {
         detail::ByteReader as(a), bs(b);
         const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
         if (rankA < 0 || rankB < 0)
             return rankA < 0 ? a : b;
+        const std::string callA = as.getText(), callB = bs.getText();
         detail::ByteWriter out;
-        if (as.left() != bs.left()) {
-            const auto text = [](const detail::ByteReader& in, std::int32_t rank) {
-                return detail::printed("%zu on rank %d", in.left() / sizeof(std::int64_t), rank);
-            };
+        if (callA == callB) {
+            out.put(rankA);
+            out.putText(callA);
+            combine(as, bs, out);
+        } else {
             out.put(std::int32_t{-1});
-            out.putText(text(as, rankA) + " and " + text(bs, rankB));
-            return out.bytes();
+            out.putText(detail::printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
+                                callA.c_str(), rankB, callB.c_str()));
         }
-        out.put(rankA);
-        while (as.left() > 0) {
-            const auto x = as.get<std::int64_t>(), y = bs.get<std::int64_t>();
-            out.put(operation(x, y));
-        }
-        return out.bytes();
+        return std::move(out).bytes();
     }
 
     // Takes part with `own`; every rank does so once per key, or again when it has got the result. `done` gets the

@@ -125,23 +125,13 @@ private:
 
 namespace detail {
 
-template <class T, class = void>
-inline constexpr bool has_communicator_v = false;
-template <class T>
-inline constexpr bool has_communicator_v<T, std::void_t<typename T::Communicator>> =
-    std::is_constructible_v<T, const typename T::Communicator&, std::shared_ptr<MemoryPool>, Progress>;
-
+DFB_DETECTS(has_communicator_v, T(std::declval<const typename T::Communicator&>(), std::shared_ptr<MemoryPool>(),
+                                  Progress()));
 DFB_DETECTS(has_rank_and_size_v, std::declval<const T&>().rank(), std::declval<const T&>().size());
 DFB_DETECTS(has_send_v, std::declval<T&>().send(0, std::declval<Buffer&&>()));
 
-template <class T, class = void>
-inline constexpr bool has_poll_v = false;
-template <class T>
-inline constexpr bool has_poll_v<
-    T, std::void_t<decltype(std::declval<T&>().poll()), decltype(std::declval<const T&>().needsPolling()),
-                   decltype(std::declval<const T&>().mayPoll()), decltype(std::declval<const T&>().quiet())>> =
-    std::is_same_v<bool, decltype(std::declval<T&>().poll())>;
-
+DFB_DETECTS(has_poll_v, bool{std::declval<T&>().poll()}, std::declval<const T&>().needsPolling(),
+            std::declval<const T&>().mayPoll(), std::declval<const T&>().quiet());
 DFB_DETECTS(has_nap_v, std::declval<T&>().nap(std::chrono::nanoseconds()), std::declval<T&>().interrupt(),
             std::declval<const T&>().wakesOnArrival());
 DFB_DETECTS(has_start_and_stop_v, std::declval<T&>().start(std::declval<TransportHandler&>()),

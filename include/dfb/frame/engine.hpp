@@ -41,10 +41,11 @@ public:
     virtual bool isComplete(int tile) const = 0;
     virtual bool poll() = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;
-    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own,
+                                                          const char* call = "allGather() or SharedWorld()") = 0;
 
     virtual bool isOpen() const noexcept = 0;
-    virtual void begin(const FrameConfig& params) = 0;
+    virtual void begin(const FrameConfig& params, FunctionRef<void()> copyData) = 0; // for the operations
     virtual std::int64_t frame() const noexcept = 0; // the number of the one that has begun last
     virtual TileHeader headerOf(int tile, int pass) const = 0;
     virtual ChannelMask sent() const noexcept = 0; // the channels of inputs that travel in this frame
@@ -61,9 +62,12 @@ public:
     virtual void addFigure(std::uint64_t key, double value) = 0;
     virtual void noteMergeError(int tile, double bound) = 0;
     virtual bool failed() const noexcept = 0;
-    virtual void abort(const std::exception_ptr& reason, int tile) = 0;
+    virtual void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) = 0;
     virtual void cancel(std::int64_t frame) = 0;
     virtual void requireProgress() const = 0;
+    virtual void tryVote() = 0; // again, as messages have moved
+    // Those of one framebuffer: when one has moved messages, all try to vote. At first it is alone.
+    virtual void setTogether(std::vector<Engine*> engines) = 0;
     virtual bool isDone() = 0;
     virtual FrameReport end() = 0;
     virtual void leave() noexcept = 0; // in place of end(), when an exception passes

@@ -42,10 +42,10 @@ public:
     {
         config_.messages.poolBytes =
             std::max(config_.messages.poolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
+        compression_.emplace(config_.messages.codec, config_.messages.compression, connection->size());
         MailboxOwner& self = *this;
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self,
                                              config_.trace.get());
-        compression_.emplace(config_.messages.codec, config_.messages.compression, size());
         mailbox_->start();
         const auto all = agree(*mailbox_, [this] {
             checkConfig(config_, traits(), size(), mailbox_->connection().config().peerTimeout);
@@ -70,10 +70,6 @@ public:
         tellImagePlace();
     }
 
-    FrameEngine(const FrameEngine&) = delete;
-    FrameEngine& operator=(const FrameEngine&) = delete;
-    ~FrameEngine() override { mailbox_->stop(); }
-
     int rank() const noexcept override { return mailbox_->rank(); }
     int size() const noexcept override { return mailbox_->size(); }
     const FrameBufferConfig& config() const noexcept override { return config_; }
@@ -93,10 +89,11 @@ public:
     std::int64_t frame() const noexcept override { return open_.number(); }
     bool failed() const noexcept override { return outcome_->failed(); }
 
-    void begin(const FrameConfig& params) override
+    void begin(const FrameConfig& params, FunctionRef<void()> copyData) override
     {
         if (isOpen())
-            failArgument("begin() while a frame is open: end() it first");
+            failArgument("begin() while frame %lld is open: end() it first (framesInFlight is %d)",
+                         static_cast<long long>(frame()), config_.framesInFlight);
         FrameTerms::check(params, traits());
         const bool lastFailed = outcome_->lastFailed();
         accumulation_.check(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
@@ -119,6 +116,7 @@ public:
         try {
             pipeline_->newFrame(info, params.samples, params.owners, haveMoved, params.maxLayers,
                                 codecFor(config_.image.displayRank) != nullptr);
+            copyData();
         } catch (...) {
             userError = std::current_exception();
         }
@@ -158,10 +156,10 @@ public:
         const bool isInPlace = pipeline_->mayReadInPlace(tile);
         if (isInPlace && mailbox_->connection().config().checksums)
             pipeline_->notePromise(tile);
-        ++inputsSent_;
         if (owner != rank()) {
             Buffer message = isInPlace ? encodePlace(tile, owner) : Buffer();
             mailbox_->send(owner, message.empty() ? encode(tile, owner) : std::move(message));
+            ++inputsSent_;
             waitForRoom();
         } else if (open_.enter(tile.frame)) {
             const OpenFrame::Inside inside(open_);
@@ -169,6 +167,7 @@ public:
                 arrive([&] { return pipeline_->inputOf(tile); }, rank(), true);
             else
                 arrive(encode(tile, owner), rank());
+            ++inputsSent_;
         }
         pollNowAndThen();
     }
@@ -179,6 +178,8 @@ public:
     bool isUndecided(int tile, int generation) const override { return hidden_.isUndecided(tile, generation); }
     void tell(int other, const HiddenTiles::Message& word) override
     {
+        if (word.tile < 0 || word.tile >= layout().tileCount() || word.generation < 1)
+            failArgument("hide() of generation %d of tile %d", word.generation, word.tile);
         if (!pipeline_->opaqueHides(word.tile))
             failArgument("hide() with a tile operation or a frame to which everything counts");
         if (other == rank())
@@ -227,8 +228,11 @@ public:
             enterAllDeclared();
     }
 
-    void abort(const std::exception_ptr& reason, int tile) override
+    void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) override
     {
+        if (!open_.enter(frame))
+            return; // it is over
+        const OpenFrame::Inside inside(open_);
         ErrorInfo where;
         where.tile = tile;
         outcome_->fail(reason, where);
@@ -242,6 +246,7 @@ public:
             did = true;
             mailbox_->connection().poll(); // other ranks may wait for messages that this one has queued
         }
+        polled();
         return did;
     }
 
@@ -274,6 +279,13 @@ public:
             outcome_->guarded([this] { pipeline_->finishBackground(); });
         renderNs_ = std::chrono::nanoseconds(Clock::now() - beginTime_).count();
     }
+
+    void tryVote() override
+    {
+        if (isOpen())
+            outcome_->tryVote();
+    }
+    void setTogether(std::vector<Engine*> engines) override { together_ = std::move(engines); }
 
     bool isDone() override
     {
@@ -346,7 +358,8 @@ public:
 
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) override
     {
-        return mailbox_->allReduce(values, [how](std::int64_t x, std::int64_t y) {
+        static const char* const names[] = {"sum", "minimum", "maximum"};
+        return mailbox_->allReduce(values, names[static_cast<std::size_t>(how)], [how](std::int64_t x, std::int64_t y) {
             if (how == Reduce::Sum)
                 return static_cast<std::int64_t>(static_cast<std::uint64_t>(x) + static_cast<std::uint64_t>(y));
             return how == Reduce::Min ? std::min(x, y) : std::max(x, y);
@@ -358,7 +371,7 @@ public:
         std::vector<std::byte> mine;
         image().forEachPlane(
             [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
-        const auto all = mailbox_->allGather(mine);
+        const auto all = mailbox_->allGather(mine, "imageOnAllRanks()");
         const std::vector<std::byte>& displayed = all[static_cast<std::size_t>(config_.image.displayRank)];
         if (displayed.empty())
             return {};
@@ -370,9 +383,9 @@ public:
         return copy;
     }
 
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own) override
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call) override
     {
-        return mailbox_->allGather(own);
+        return mailbox_->allGather(own, call);
     }
 
 private:
@@ -460,7 +473,9 @@ private:
         if (hasCredit)
             mailbox_->flow().consumed(source, byteCount);
         mailbox_->countTaken(source, header, message);
-        outcome_->guarded([&] { handle(source, header, std::move(message)); }, {}, source);
+        ErrorInfo where;
+        where.from = source;
+        outcome_->guarded([&] { handle(source, header, std::move(message)); }, where);
     }
 
     void sendToDisplay(Buffer&& message, std::size_t raw)
@@ -608,8 +623,8 @@ private:
     {
         if (!open_.beginReading(isInPlace))
             return;
-        const int sender = source == rank() ? -1 : source; // of the message
         ErrorInfo where;
+        where.from = source == rank() ? -1 : source; // whose message it is
         TileTable::Arrival arrival;
         {
             TraceSpan span(config_.trace.get(), TraceEvent::Kind::Input, open_.number());
@@ -618,10 +633,10 @@ private:
                 TilePipeline::setPlace(where, input.header());
                 pipeline_->arrive(std::move(input), source, arrival);
             };
-            outcome_->guarded(take, where, sender);
+            outcome_->guarded(take, where);
             if (TraceEvent* event = span.event()) {
                 event->tile = static_cast<std::int32_t>(where.tile);
-                event->peer = sender;
+                event->peer = where.from;
             }
         }
         if (arrival.spoilt) {
@@ -728,17 +743,17 @@ private:
         }
         const std::int64_t repeated = mailbox_->connection().duplicates();
         const auto reports = pipeline_->reports();
-        v.sums[Verdict::BytesSent] = mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes();
-        v.sums[Verdict::MessagesSent] = mailbox_->messagesSent() - messagesBefore_;
-        v.sums[Verdict::TilesTouched] = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
-        v.sums[Verdict::NonFinitePixels] = pipeline_->faults().nonFinite;
-        v.sums[Verdict::LateMessages] = open_.takeLateCount();
-        v.sums[Verdict::RepeatedMessages] = repeated - repeatedBefore_;
-        v.sums[Verdict::OrderUndefinedPixels] = reports.orderUndefinedPixels;
-        v.sums[Verdict::AlphaOutsidePixels] = pipeline_->faults().alphaOutside;
-        v.sums[Verdict::CompressedLinks] = compression_->links();
-        v.sums[Verdict::InputsLeft] = inputsSent_ - pipeline_->table().arrivedCount();
-        v.sums[Verdict::TilesEndedEarly] = pipeline_->table().endedEarlyCount();
+        v.sums.bytesSent = mailbox_->bytesSent() - bytesBefore_ + pipeline_->gather().placedBytes();
+        v.sums.messagesSent = mailbox_->messagesSent() - messagesBefore_;
+        v.sums.tilesTouched = open_.areTilesFinished() ? pipeline_->table().touchedCount() : 0;
+        v.sums.nonFinitePixels = pipeline_->faults().nonFinite;
+        v.sums.lateMessages = open_.takeLateCount();
+        v.sums.repeatedMessages = repeated - repeatedBefore_;
+        v.sums.orderUndefinedPixels = reports.orderUndefinedPixels;
+        v.sums.alphaOutsidePixels = pipeline_->faults().alphaOutside;
+        v.sums.compressedLinks = compression_->links();
+        v.sums.inputsLeft = inputsSent_ - pipeline_->table().arrivedCount();
+        v.sums.tilesEndedEarly = pipeline_->table().endedEarlyCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
         v.maxima[Verdict::RenderNs] = std::max<std::int64_t>(renderNs_, 0);
         v.maxima[Verdict::PeakInboxBytes] = static_cast<std::int64_t>(mailbox_->flow().peakInboxBytes());
@@ -751,8 +766,8 @@ private:
 
     void polled() override
     {
-        if (isOpen())
-            outcome_->tryVote();
+        for (Engine* engine : together_)
+            engine->tryVote();
     }
 
     void makeParts()
@@ -775,6 +790,7 @@ private:
     std::unique_ptr<TilePipeline> pipeline_;
     const Image noImage_;
     std::vector<int> nodeOf_;
+    std::vector<Engine*> together_{this};
     Declarations declarations_;
     HiddenTiles hidden_;
 

@@ -54,7 +54,8 @@ public:
             while (message.generation < before && !from.compare_exchange_weak(before, message.generation)) {
             }
         }
-        anyOpen_ = anyOpen_ || message.word == Word::MayHide;
+        if (message.word == Word::MayHide)
+            anyOpen_ = true;
         const std::lock_guard<std::mutex> lock(mutex_);
         auto& open = open_[static_cast<std::size_t>(message.tile)];
         auto at =

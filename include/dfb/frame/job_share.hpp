@@ -137,23 +137,20 @@ public:
         return range.value_or(JobRange{});
     }
 
-    // False if the message is of another kind. Throws Error (MalformedMessage).
-    bool receive(int source, const MessageHeader& header, const Buffer& message)
+    // Throws Error (MalformedMessage).
+    void receive(int source, const MessageHeader& header, const Buffer& message)
     {
         if (header.kind == MessageKind::JobRequest) {
             if (mailbox_.rank() != server_)
                 failMalformed("a request for jobs to a rank that hands out none", server_, mailbox_.rank());
             mailbox_.sendBody(source, MessageKind::Jobs, frame_.number(),
                               share_.give(bodyOf<JobRequest>(message), mailbox_.size()));
-            return true;
+            return;
         }
-        if (header.kind != MessageKind::Jobs)
-            return false;
-        if (source != server_)
+        if (header.kind != MessageKind::Jobs || source != server_)
             failMalformed("jobs from a rank that hands out none", server_, source);
         share_.receive(bodyOf<JobRange>(message));
         mailbox_.notify();
-        return true;
     }
 
 private:

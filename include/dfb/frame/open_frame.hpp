@@ -1,9 +1,5 @@
-// OpenFrame: the frame that is open on this rank, as a state machine: its states, who causes a transition, what belongs
-// to it, and what it still waits for.
-//
-//   Closed --open()--> Rendering --finish()--> Finishing --vote()--> Voted --decide()--> Decided --close()--> Closed
-//                          |                       |
-//                          +--------fail()---------+----> Failed --vote()--> Voted
+// OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md): its states, who
+// causes a transition, what belongs to it, and what it still waits for.
 //
 // open(), finish() and close() are called by the thread that is in begin() and end(); fail() by any, for a failure of
 // this rank or one that another has told; vote() by any that may have brought about the last thing to wait for;

@@ -63,9 +63,6 @@ public:
 
     const OperationTraits& traits() const noexcept { return traits_; }
 
-    // With copies of the data given to begin(). Throws the exceptions of the copies and of the pixel operation. No
-    // other member may be running.
-    virtual void newFrame() = 0;
     // Must not live longer than this object.
     virtual std::unique_ptr<TileStage> makeTile() const = 0;
     virtual bool opaqueHides(const TileInfo& info) const = 0;
@@ -90,18 +87,13 @@ public:
     {
     }
 
-    // Offers the frame data that the next newFrame() copies. Both objects must live until then.
-    void offer(const TileFrameData& tileData, const PixelFrameData& pixelData)
+    // Copies the data of a frame. Throws the exceptions of the copies and of the pixel operation. No other member may
+    // be running.
+    void newFrame(const TileFrameData& tileData, [[maybe_unused]] const PixelFrameData& pixelData)
     {
-        offeredTileData_ = &tileData;
-        offeredPixelData_ = &pixelData;
-    }
-
-    void newFrame() override
-    {
-        tileData_ = *offeredTileData_;
+        tileData_ = tileData;
         if constexpr (has_pixel_new_frame_v<PixelOp>)
-            pixelOp_.newFrame(*offeredPixelData_);
+            pixelOp_.newFrame(pixelData);
     }
 
     std::unique_ptr<TileStage> makeTile() const override { return std::make_unique<Stage>(tileData_); }
@@ -152,8 +144,6 @@ private:
 
     PixelOp pixelOp_;
     TileFrameData tileData_{};
-    const TileFrameData* offeredTileData_ = nullptr;
-    const PixelFrameData* offeredPixelData_ = nullptr;
 };
 
 } // namespace detail

@@ -52,17 +52,14 @@ public:
 
     // ---- failure
 
-    // Runs `body`; an exception makes the frame fail. `where` says which place is known by then, `source` whose message
-    // it was about, or -1. False if it did throw.
-    bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {}, int source = -1)
+    // Runs `body`; an exception makes the frame fail. `where` says which place is known by then. False if it did throw.
+    bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {})
     {
         try {
             body();
             return true;
         } catch (...) {
-            ErrorInfo place = where;
-            place.from = source;
-            fail(std::current_exception(), place);
+            fail(std::current_exception(), where);
             return false;
         }
     }
@@ -133,7 +130,7 @@ public:
         addFigures_(mine);
         verdictSpan_.emplace(mailbox_.trace(), TraceEvent::Kind::Verdict, frame_.number());
         if (TraceEvent* event = verdictSpan_->event())
-            event->byteCount = mine.sums[Verdict::BytesSent];
+            event->byteCount = mine.sums.bytesSent;
         if (terms_.allowPartial)
             mine.incomplete = tiles_.table().unfinished(terms_.declared);
         mailbox_.reductions().enter(verdictKey(), mine.bytes(), Verdict::combine, [this](const Bytes& result) {

@@ -37,11 +37,8 @@ public:
           table_(TileLayout(config.image.width, config.image.height, traits().tileWidth, traits().tileHeight),
                  config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
-              pool_, table_.layout(),
-              {config.image.format, imageChannels(config), address, config.messages.codec, config.image.dither,
-               config.onTile},
-              config.image.displayRank, rank, rankCount, [this](int tile) { return table_.owner(tile); },
-              std::move(sendToDisplay)),
+              pool_, table_.layout(), config, imageChannels(config), address, rank, rankCount,
+              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
           coder_(config.precision, traits().activeByDepth, traits().readsInPlace && !isLossy())
     {
     }
@@ -76,13 +73,15 @@ public:
     FinalGather& gather() noexcept { return gather_; }
 
     // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `compresses`: whether
-    // finished tiles are compressed. Throws the exceptions of user code: then all is ready but its data.
+    // finished tiles are compressed.
     void newFrame(TileInfo info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved, int maxLayers,
                   bool compresses)
     {
         faults_.reset();
         promises_.clear();
-        reports_ = {};
+        const bool goesOn = traits().keepsState && info.accumulationId == accumulationId_;
+        accumulationId_ = info.accumulationId;
+        reports_ = {{}, 0, goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
         const bool hasPasses =
             plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
         if (!traits().takesOrder)
@@ -91,14 +90,13 @@ public:
         info.minTransmittance = config_.minTransmittance;
         background_ = info.background;
         backgroundIsFine_ = true;
-        table_.newFrame(info, plan, owners);
+        table_.newFrame(info, plan, owners, haveMoved);
         if (haveMoved)
             gather_.findSenders();
         gather_.newFrame(info.frame, compresses, info.background);
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);
         setLayers(maxLayers);
-        operations_.newFrame();
     }
 
     ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame
@@ -129,7 +127,7 @@ public:
             setPlace(info, tile);
             throw InvalidArgument(std::move(info));
         }
-        const ConstPlanes& planes = tile.planes();
+        const ConstPlanes& planes = tile.at;
         if (!planes.at[Color])
             return;
         if (std::abs(tile.stride) < tile.valid.width())
@@ -190,7 +188,7 @@ public:
     bool mayReadInPlace(const InputPixels& tile) const
     {
         return tile.staysUntilEnd && traits().readsInPlace && !traits().keepsState && !isLossy()
-               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.planes().at[Color] && !tile.valid.empty();
+               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.at.at[Color] && !tile.valid.empty();
     }
 
     // The message for such a tile of another owner. `offsetOf(address)`: from the start of the memory that the owner
@@ -250,6 +248,9 @@ public:
             failMalformed("a colour in another format than this rank's",
                           static_cast<std::int64_t>(config_.precision.color),
                           static_cast<std::int64_t>(fragment.colorFormat()));
+        if (fragment.encoding() == FragmentEncoding::InPlace
+            && (!traits().readsInPlace || traits().keepsState || isLossy()))
+            failMalformed("an input in place, which this rank does not read");
         if (isLossy())
             losses_.add(fragment, coder_);
         table_.arrive(std::move(fragment), from, arrival);
@@ -448,6 +449,7 @@ private:
     const WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;
+    std::uint64_t accumulationId_ = 0;
     FaultCounts faults_;
     struct Promise {
         InputPixels tile;

@@ -78,9 +78,10 @@ public:
 
     // `info` is common to all tiles; `owners`: see prepare(), which was called with them. No other member may be
     // running.
-    void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners)
+    void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved)
     {
-        setOwners(owners ? owners : byMap_);
+        if (haveMoved)
+            setOwners(owners ? owners : byMap_);
         expected_ = nullptr;
         info_ = info;
         plan_ = plan;
@@ -255,7 +256,6 @@ public:
                     continue;
                 if (!first) {
                     first.emplace();
-                    first->kind = ErrorKind::TimedOut;
                     first->tile = tile;
                     first->pass = pass;
                     first->generation = m->generation;
@@ -325,8 +325,6 @@ private:
     // After prepare(). Slots of tiles that this rank has no more are kept for others.
     void setOwners(const TileOwners& owners)
     {
-        if (owners_ && *owners_ == *owners)
-            return;
         owners_ = owners;
         for (const int tile : owned_)
             if (auto& slot = slotOf(tile); slot && !isMine(tile)) {
@@ -405,22 +403,19 @@ private:
     // In words: which inputs are missing, and from which ranks; or which ranks announced them, and which have come.
     static std::string namesOf(const DependencyTracker::Missing& missing)
     {
-        std::string text;
-        for (const DependencyTracker::Declared& input : missing.inputs) {
-            text += printed(text.empty() ? "; missing source %u" : ", %u", input.source);
-            if (input.part > 0)
-                text += printed(" part %d", input.part);
-            text += printed(" of rank %d", input.rank);
-        }
-        return text + listOf("; announced by source ", missing.announcers)
-               + listOf("; here are source ", missing.arrived);
+        return listOf("; missing source ", missing.inputs, missing.inputs.size())
+               + listOf("; announced by source ", missing.announcers) + listOf("; here are source ", missing.arrived);
     }
-    static std::string listOf(const char* what, const std::vector<DependencyTracker::Missing::Known>& inputs)
+    static std::string listOf(const char* what, const std::vector<DependencyTracker::Declared>& inputs,
+                              std::size_t most = 8)
     {
-        constexpr std::size_t most = 8;
         std::string text;
-        for (std::size_t i = 0; i < std::min(most, inputs.size()); ++i)
-            text += printed("%s%u of rank %d", i == 0 ? what : ", ", inputs[i].source, inputs[i].rank);
+        for (std::size_t i = 0; i < std::min(most, inputs.size()); ++i) {
+            text += printed("%s%u", i == 0 ? what : ", ", inputs[i].source);
+            if (inputs[i].part > 0)
+                text += printed(" part %d", inputs[i].part);
+            text += printed(" of rank %d", inputs[i].rank);
+        }
         if (inputs.size() > most)
             text += printed(" and %zu more", inputs.size() - most);
         return text;

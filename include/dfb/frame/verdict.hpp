@@ -32,6 +32,8 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
 {
     ErrorInfo info;
     try {
+        if (!reason)
+            failArgument("no exception: std::current_exception() has one in a handler only");
         std::rethrow_exception(reason);
     } catch (const Error& e) {
         info = e.info();
@@ -152,22 +154,12 @@ struct Verdict {
     std::optional<ErrorInfo> error;
     FrameTerms terms;      // the parameters of begin(), which should be the same on all ranks
     std::string differing; // which of them differ, in words
-    enum Sum {
-        BytesSent,
-        MessagesSent,
-        TilesTouched,
-        NonFinitePixels,
-        LateMessages,
-        RepeatedMessages,
-        OrderUndefinedPixels,
-        AlphaOutsidePixels, // outside [0, 1]
-        CompressedLinks,
-        InputsLeft,      // sent, less those that have come
-        TilesEndedEarly, // finished before all their inputs had come
-        sumCount
+    struct Sums : FrameSums {
+        std::int64_t inputsLeft = 0;      // sent, less those that have come
+        std::int64_t tilesEndedEarly = 0; // finished before all their inputs had come
     };
     enum Maximum { PeakMemoryBytes, RenderNs, PeakInboxBytes, TotalNs, maximumCount };
-    std::array<std::int64_t, sumCount> sums{};
+    Sums sums;
     std::array<std::int64_t, maximumCount> maxima{};
     double wireErrorBound = 0;            // a maximum
     std::vector<Figure> tileErrors;       // by tile; each tile is of one rank
@@ -207,7 +199,7 @@ struct Verdict {
             v.error = getErrorInfo(in);
         v.terms = in.get<FrameTerms>();
         v.differing = in.getText();
-        v.sums = in.get<decltype(v.sums)>();
+        v.sums = in.get<Sums>();
         v.maxima = in.get<decltype(v.maxima)>();
         v.wireErrorBound = in.get<double>();
         for (auto* list : {&v.tileErrors, &v.figures, &v.mergeErrors})
@@ -236,18 +228,10 @@ struct Verdict {
     // Sets the figures of `report` that are the same on all ranks.
     void addTo(FrameReport& report) const
     {
-        report.bytesSent = sums[BytesSent];
-        report.messagesSent = sums[MessagesSent];
-        report.tilesTouched = sums[TilesTouched];
-        report.nonFinitePixels = sums[NonFinitePixels];
-        report.lateMessages = sums[LateMessages];
-        report.repeatedMessages = sums[RepeatedMessages];
+        static_cast<FrameSums&>(report) = sums;
         report.peakMemoryBytes = maxima[PeakMemoryBytes];
         report.renderMsMax = static_cast<double>(maxima[RenderNs]) / 1e6;
         report.peakInboxBytes = maxima[PeakInboxBytes];
-        report.orderUndefinedPixels = sums[OrderUndefinedPixels];
-        report.alphaOutsidePixels = sums[AlphaOutsidePixels];
-        report.compressedLinks = sums[CompressedLinks];
         report.wireErrorBound = wireErrorBound;
         report.mergeErrorBound = 0;
         for (const Figure& f : mergeErrors)
@@ -294,7 +278,7 @@ struct Verdict {
     // Nothing can be said if a tile was finished early, since its inputs may be late, too.
     std::optional<ErrorInfo> strayInputs() const
     {
-        const std::int64_t count = sums[TilesEndedEarly] == 0 ? sums[InputsLeft] : 0;
+        const std::int64_t count = sums.tilesEndedEarly == 0 ? sums.inputsLeft : 0;
         if (count == 0)
             return std::nullopt;
         ErrorInfo info = errorInfo(ErrorKind::Disagreement, "more inputs were sent than had been announced: so many "
@@ -341,9 +325,12 @@ struct Verdict {
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
         if (!a.differing.empty())
             a.error = disagreement(a.differing); // other errors follow from it
-        for (std::size_t i = 0; i < a.sums.size(); ++i)
-            a.sums[i] = static_cast<std::int64_t>(static_cast<std::uint64_t>(a.sums[i])
-                                                  + static_cast<std::uint64_t>(b.sums[i]));
+        using Words = std::array<std::uint64_t, sizeof(Sums) / 8>;
+        auto sums = loadAs<Words>(reinterpret_cast<const std::byte*>(&a.sums));
+        const auto more = loadAs<Words>(reinterpret_cast<const std::byte*>(&b.sums));
+        for (std::size_t i = 0; i < sums.size(); ++i)
+            sums[i] += more[i];
+        a.sums = loadAs<Sums>(reinterpret_cast<const std::byte*>(sums.data()));
         for (std::size_t i = 0; i < a.maxima.size(); ++i)
             a.maxima[i] = std::max(a.maxima[i], b.maxima[i]);
         a.wireErrorBound = std::max(a.wireErrorBound, b.wireErrorBound);

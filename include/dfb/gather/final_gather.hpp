@@ -2,7 +2,7 @@
 // into a message of several tiles; background tiles do not travel.
 #pragma once
 
-#include <dfb/comm/compression.hpp>
+#include <dfb/frame.hpp>
 #include <dfb/gather/image_gate.hpp>
 #include <dfb/image.hpp>
 #include <dfb/tile_layout.hpp>
@@ -28,16 +28,6 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Configuration of a gather: the image, and its messages to the display rank.
-struct GatherConfig {
-    OutputFormat format = OutputFormat::None;
-    ChannelMask channels = 0;   // beside the colour
-    std::uint32_t receiver = 0; // address of the framebuffer
-    std::shared_ptr<const Codec> codec;
-    bool dither = false;
-    TileCallback onTile{}; // see FrameBufferConfig::onTile
-};
-
 // One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
 class FinalGather {
 public:
@@ -53,17 +43,18 @@ public:
         std::int64_t imageEpoch = 0;
     };
 
+    // `config` must live as long as this. `channels`: of the image, beside the colour; `address`: of the framebuffer.
     // `ownerOf(tile)`: the rank that has it when it is finished. `send`: to the display rank, batches and the count of
     // tiles.
-    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, GatherConfig config, int displayRank,
-                int rank, int rankCount, OwnerOf ownerOf, Send send)
-        : pool_(std::move(pool)), layout_(layout), config_(std::move(config)), displayRank_(displayRank), rank_(rank),
-          ownerOf_(std::move(ownerOf)), send_(std::move(send)), record_(config_.format, config_.channels),
+    FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, const FrameBufferConfig& config,
+                ChannelMask channels, std::uint32_t address, int rank, int rankCount, OwnerOf ownerOf, Send send)
+        : pool_(std::move(pool)), layout_(layout), config_(config), channels_(channels), address_(address), rank_(rank),
+          ownerOf_(std::move(ownerOf)), send_(std::move(send)), record_(config.image.format, channels),
           tilesOf_(static_cast<std::size_t>(rankCount))
     {
         findSenders();
         if (displays()) {
-            image_ = Image(*pool_, layout_.width(), layout_.height(), config_.format, config_.channels);
+            image_ = Image(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
             for (auto& s : state_)
                 s = TileState::Undefined;
@@ -76,7 +67,7 @@ public:
     // Valid only while imageFrame() >= 0, which is the frame that it shows.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
-    bool enabled() const noexcept { return config_.format != OutputFormat::None; }
+    bool enabled() const noexcept { return config_.image.format != OutputFormat::None; }
     bool displays() const noexcept { return isDisplay() && enabled(); }
 
     // Call it before newFrame() if tiles have other owners than in the last frame.
@@ -98,7 +89,7 @@ public:
         imageFrame_ = -1;
         imageEpoch_ += std::memcmp(&background, &lastBackground_, sizeof background) != 0;
         lastBackground_ = background;
-        compresses_ = compresses && config_.codec;
+        compresses_ = compresses && config_.messages.codec;
         batch_.reset();
         flushed_ = false;
         sent_ = {};
@@ -147,8 +138,8 @@ public:
     template <class BlockAt>
     void receivePlaces(int source, const ImagePlaces& places, const BlockAt& blockAt)
     {
-        if (source != displayRank_)
-            failMalformed("a rank that displays nothing has an image", displayRank_, source);
+        if (source != config_.image.displayRank)
+            failMalformed("a rank that displays nothing has an image", config_.image.displayRank, source);
         if (isDisplay() || !enabled())
             return;
         SharedImage image;
@@ -180,7 +171,7 @@ public:
         if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
             return;
         // Somebody is still at it, or has died there: the memory is left to it, and the other tiles are in a copy.
-        Image copy(*pool_, layout_.width(), layout_.height(), config_.format, config_.channels);
+        Image copy(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
         const Planes from = image_.planesAt(0), to = copy.planesAt(0);
         for (std::size_t c = 0; c < channelCount; ++c)
             if (to.at[c])
@@ -248,7 +239,11 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             if (flushed_)
                 return false;
-            if (batch_ && batch_->used + plan.bytes() > batch_->message.size()) {
+            const bool isFull = batch_ && batch_->used + plan.bytes() > batch_->message.size();
+            Buffer memory; // first, as it may throw
+            if (!batch_ || isFull)
+                memory = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
+            if (isFull) {
                 batch_->closed = true;
                 if (batch_->writers == 0)
                     full = batch_;
@@ -256,7 +251,7 @@ public:
             }
             if (!batch_) {
                 batch_ = takeSpare();
-                batch_->message = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
+                batch_->message = std::move(memory);
                 batch_->used = prefix;
                 ++sent_.batches;
             }
@@ -291,6 +286,12 @@ public:
             const std::lock_guard<std::mutex> lock(mutex_);
             if (flushed_)
                 return;
+            const auto header = MessageHeader::of(MessageKind::TilesDone, address_, frame_);
+            done = pool_->acquire(sizeof header + sizeof sent_ + sizeof(std::int32_t) * placed_.size()); // may throw
+            std::memcpy(done.data(), &header, sizeof header);
+            std::memcpy(done.data() + sizeof header, &sent_, sizeof sent_);
+            std::copy(placed_.begin(), placed_.end(),
+                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof sent_));
             flushed_ = true;
             if (batch_) {
                 batch_->closed = true;
@@ -298,12 +299,6 @@ public:
                     last = batch_;
                 batch_.reset();
             }
-            const auto header = MessageHeader::of(MessageKind::TilesDone, config_.receiver, frame_);
-            done = pool_->acquire(sizeof header + sizeof sent_ + sizeof(std::int32_t) * placed_.size());
-            std::memcpy(done.data(), &header, sizeof header);
-            std::memcpy(done.data() + sizeof header, &sent_, sizeof sent_);
-            std::copy(placed_.begin(), placed_.end(),
-                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof sent_));
         }
         if (last)
             sendBatch(std::move(last));
@@ -370,7 +365,7 @@ public:
             }
             const Region region = layout_.region(tile);
             const Place place = inImage(image_.planesAt(0), region);
-            FinishedTile out(region, config_.format, place.planes, place.stride, config_.dither);
+            FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
             row.resize(4 * static_cast<std::size_t>(region.width()));
             for (std::size_t i = 0; i < row.size(); ++i)
                 row[i] = static_cast<double>(rgba[i % 4]);
@@ -429,7 +424,10 @@ private:
     };
 
     // Whether a rank has finished tiles for the display rank.
-    bool isSender(std::size_t r) const { return static_cast<int>(r) != displayRank_ && tilesOf_[r].owned > 0; }
+    bool isSender(std::size_t r) const
+    {
+        return static_cast<int>(r) != config_.image.displayRank && tilesOf_[r].owned > 0;
+    }
     // Under mutex_.
     bool isMissing(std::size_t r) const { return isSender(r) && !tilesOf_[r].isComplete(); }
 
@@ -464,8 +462,8 @@ private:
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(BatchHeader);
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
-    bool isDisplay() const noexcept { return rank_ == displayRank_; }
-    bool travels(std::size_t channel) const { return hasChannel(config_.channels | colorChannel, channel); }
+    bool isDisplay() const noexcept { return rank_ == config_.image.displayRank; }
+    bool travels(std::size_t channel) const { return hasChannel(channels_ | colorChannel, channel); }
     // `planes`: of the whole image.
     Place inImage(const Planes& planes, const Region& region) const
     {
@@ -498,14 +496,14 @@ private:
                           static_cast<std::int64_t>(left));
         Buffer raw;
         if (h.codec != 0) {
-            if (!config_.codec || config_.codec->id() != h.codec)
+            if (!config_.messages.codec || config_.messages.codec->id() != h.codec)
                 failMalformed("compressed by a codec that this rank does not have");
             const std::size_t pixels =
                 static_cast<std::size_t>(layout_.tileWidth()) * static_cast<std::size_t>(layout_.tileHeight());
-            if (h.rawBytes > largestMessage(pixels, config_.format, config_.channels))
+            if (h.rawBytes > largestMessage(pixels, config_.image.format, channels_))
                 failMalformed("a batch of tiles is too large");
             raw = pool_->acquire(h.rawBytes);
-            if (!config_.codec->decompress(in, left, raw.data(), h.rawBytes))
+            if (!config_.messages.codec->decompress(in, left, raw.data(), h.rawBytes))
                 failMalformed("a batch of tiles does not decompress to its size");
             in = raw.data();
             left = h.rawBytes;
@@ -592,16 +590,16 @@ private:
             spareBatches_.push_back(std::move(batch));
         }
         if (compresses_) {
-            Buffer packed = pool_->acquire(prefix + config_.codec->bound(h.rawBytes));
+            Buffer packed = pool_->acquire(prefix + config_.messages.codec->bound(h.rawBytes));
             const std::size_t bytes =
-                config_.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
+                config_.messages.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
             if (bytes < h.rawBytes) {
                 packed.shrink(prefix + bytes);
                 message = std::move(packed);
-                h.codec = config_.codec->id();
+                h.codec = config_.messages.codec->id();
             }
         }
-        const auto m = MessageHeader::of(MessageKind::FinishedTiles, config_.receiver, frame_);
+        const auto m = MessageHeader::of(MessageKind::FinishedTiles, address_, frame_);
         std::memcpy(message.data(), &m, sizeof m);
         std::memcpy(message.data() + sizeof m, &h, sizeof h);
         send_(std::move(message), compresses_ ? prefix + h.rawBytes : 0);
@@ -609,8 +607,10 @@ private:
 
     std::shared_ptr<MemoryPool> pool_;
     TileLayout layout_;
-    GatherConfig config_;
-    int displayRank_, rank_;
+    const FrameBufferConfig& config_;
+    ChannelMask channels_;
+    std::uint32_t address_;
+    int rank_;
     OwnerOf ownerOf_;
     Send send_;
     const FinishedRecord record_;

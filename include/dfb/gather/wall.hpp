@@ -48,13 +48,16 @@ public:
         });
     }
 
-    Wall(const Wall&) = delete;
-    Wall& operator=(const Wall&) = delete;
-    ~Wall() { mailbox_->stop(); }
-
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
         mailbox_->requireProgress();
+        {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            if (frame <= last_)
+                failArgument("frame %lld, after the wall has finished frame %lld: frames are finished in order, once, "
+                             "and all those of a wall are of one framebuffer",
+                             static_cast<long long>(frame), static_cast<long long>(last_));
+        }
         const Connection::Expecting expecting(mailbox_->connection());
         std::optional<std::chrono::steady_clock::time_point> deadline;
         if (timeout.count() > 0)
@@ -97,6 +100,12 @@ public:
 
     std::int64_t imageFrame() const noexcept { return shownFrame_; }
 
+    void begin()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ++newest_;
+    }
+
     void put(const PixelTile& tile)
     {
         noteFrame(tile.frame);
@@ -135,6 +144,7 @@ private:
     // The others may be so many frames ahead of this rank: those in flight, and some that have failed. A message of a
     // later frame is not believed, as each frame takes the memory of its pictures.
     static constexpr std::int64_t framesAhead = 16;
+    static constexpr std::size_t framesKept = 16;
 
     // In front of an Agreement's text that is not about time.
     static constexpr std::string_view malformed = "malformed: ";
@@ -170,8 +180,14 @@ private:
     // Throws InvalidArgument.
     void checkLayout() const
     {
-        if (layout_.columns < 1 || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1
-            || layout_.bezelX < 0 || layout_.bezelY < 0 || format_ == OutputFormat::None)
+        const auto isTooLarge = [](int count, int size, int bezel) {
+            constexpr std::int64_t most = TileLayout::maxImageSize;
+            return std::max({count, size, bezel}) > most || std::int64_t{count} * (size + bezel) - bezel > most;
+        };
+        if (isTooLarge(layout_.columns, layout_.displayWidth, layout_.bezelX)
+            || isTooLarge(layout_.rows, layout_.displayHeight, layout_.bezelY) || layout_.columns < 1
+            || layout_.rows < 1 || layout_.displayWidth < 1 || layout_.displayHeight < 1 || layout_.bezelX < 0
+            || layout_.bezelY < 0 || format_ == OutputFormat::None)
             failArgument("a wall of %dx%d displays of %dx%d, bezels of %dx%d, format %s: cannot be", layout_.columns,
                          layout_.rows, layout_.displayWidth, layout_.displayHeight, layout_.bezelX, layout_.bezelY,
                          nameOf(format_));
@@ -259,12 +275,14 @@ private:
         std::shared_ptr<Pictures> pictures; // finish() may drop those of a frame that failed
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            if (frame <= last_)
+            if (frame <= std::max(last_, dropped_))
                 return;
             if (frame > lastPossible())
                 failMalformed("a part of a display's frame that no rank can have begun", lastPossible(), frame);
             pictures = picturesOf(frame);
             cover(pictures->at(where.display), part);
+            for (; coming_.size() > framesKept; coming_.erase(coming_.begin()))
+                dropped_ = coming_.begin()->first;
         }
         Picture& picture = pictures->at(where.display);
         std::byte* pixels = picture.image.bytes();
@@ -397,9 +415,9 @@ private:
     bool isOver(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
-            return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
-        });
+        return frame <= dropped_ || std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
+                   return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
+               });
     }
     bool hasError()
     {
@@ -433,6 +451,7 @@ private:
     std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, but for the pixels
     std::map<std::int64_t, std::vector<std::int64_t>> sent_, allSent_; // pixels by frame and display; under mutex_
     std::int64_t last_ = 0;                                            // finished; under mutex_
+    std::int64_t dropped_ = 0;    // the newest of which parts were dropped, for want of room; under mutex_
     std::int64_t newest_ = 0;     // of which this rank has put() a tile; under mutex_
     std::string error_;           // under mutex_
     std::int64_t errorFrame_ = 0; // the last that error_ may be about; under mutex_

@@ -18,9 +18,6 @@
 #include <utility>
 #include <vector>
 
-// DeepTile: a tile whose pixels may have several segments. A segment is what one brick contributes along one piece of a
-// ray. In the gaps between its segments other bricks may have theirs.
-
 DFB_NAMESPACE_BEGIN
 
 // The composited colour between two depths of a ray.
@@ -29,12 +26,14 @@ struct Segment {
     float depth = 0, farDepth = 0;
 };
 
-// The segments of one brick in one tile. A pixel keeps at most `maxSegments`, which bounds memory and messages. If one
-// more is added, two neighbours are merged: those that change the pixel least. A merge is exact unless another brick
-// has something between the two. Then that layer (c', a') is blended behind both. This puts the pixel off by
-// T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the part of the light that passes the brick's
-// segments in front of it. This is at most T max(a2, |c2|) for colours with c' <= a' <= 1. The sum over all merges
-// bounds the error of a pixel: errorBound(). Where c' is more than a', multiply it by the largest c' / a'.
+// A tile whose pixels may have several segments, all of one brick. A segment is what the brick contributes along one
+// piece of a ray. In the gaps between its segments other bricks may have theirs. A pixel keeps at most `maxSegments`,
+// which bounds memory and messages. If one more is added, two neighbours are merged: those that change the pixel least.
+// A merge is exact unless another brick has something between the two. Then that layer (c', a') is blended behind both.
+// This puts the pixel off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the part of the
+// light that passes the brick's segments in front of it. This is at most T max(a2, |c2|) for colours with c' <= a' <=
+// 1. The sum over all merges bounds the error of a pixel: errorBound(). Where c' is more than a', multiply it by the
+// largest c' / a'.
 class DeepTile {
 public:
     explicit DeepTile(int maxSegments) : maxSegments_(std::max(1, maxSegments)) {}
@@ -57,7 +56,8 @@ public:
     const TileHeader& header() const noexcept { return header_; }
 
     // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any
-    // order and should not overlap. One that has no colour and no alpha is left out.
+    // order and should not overlap. One that has no colour and no alpha is left out. One thread at a time; nobody
+    // checks x and y.
     void add(int x, int y, const Segment& segment)
     {
         if (segment.rgba == std::array<float, 4>{})

@@ -32,7 +32,9 @@ struct InPlace {
 };
 
 // Makes a renderer for any loop out of pixels that are there already, such as an image that a rank has made by itself.
-// find(view) gets a TileView and points its planes to the pixels of view.region. Nothing is copied into a tile.
+// find(view) gets a TileView and points its planes to the pixels of view.region; a view left without colour is empty.
+// Several threads call it at once. Unless it sets staysUntilEnd, the pixels may change when it is called for the next
+// tile on the same thread.
 template <class Find>
 InPlace<Find> inPlace(Find find)
 {
@@ -86,9 +88,6 @@ private:
 
 } // namespace detail
 
-// ImageParallelLoop (Listing 2 of the paper): all ranks have the scene, each tile and pass is rendered by one of
-// them.
-//
 // Which rank renders which tile (section 4.1.1 of the paper). Passes are dealt out like tiles, so a tile that needs
 // many samples is rendered by many ranks; the image does not depend on which rank renders a tile.
 enum class WorkDistribution : std::uint8_t {
@@ -112,8 +111,9 @@ inline std::int64_t scatteringStride(std::int64_t count)
 
 } // namespace detail
 
-// One object per rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may use it.
-// The framebuffer must outlive it.
+// Image-parallel rendering (Listing 2 of the paper): all ranks have the scene, and one of them renders each tile and
+// pass. One object per rank, for any number of frames; it keeps memory from frame to frame. One thread at a time may
+// use it. The framebuffer must outlive it.
 template <class FrameBuffer>
 class ImageParallelLoop {
 public:
@@ -280,6 +280,7 @@ private:
 template <class FrameBuffer>
 class DataParallelLoop {
 public:
+    // Not collective. Waits for nothing.
     DataParallelLoop(FrameBuffer& fb, const World& world) : fb_(fb), world_(world) {}
 
     // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an

@@ -46,6 +46,7 @@ struct RoundRobinBricks {
 // The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
+    // Call it on all ranks, between frames.
     void update(const FrameReport& report)
     {
         costs_.clear();
@@ -108,6 +109,7 @@ public:
             table_[keyOf(world, pairs[job.pair])][static_cast<std::size_t>(job.pass)] = job.rank;
     }
 
+    // After plan(). Throws std::out_of_range for a pair that plan() did not get.
     int operator()(const SharedBrick& brick, int tile, int pass) const
     {
         return table_.at(keyOf(brick.id, tile))[static_cast<std::size_t>(pass)];
@@ -312,6 +314,7 @@ void renderMeasured(const Frame& frame, const Brick& brick, const RenderBrick& r
 template <class FrameBuffer, class TileBrickOwner>
 class MixedParallelLoop {
 public:
+    // Not collective. Waits for nothing.
     MixedParallelLoop(FrameBuffer& fb, const SharedWorld& world, TileBrickOwner& owner)
         : fb_(fb), world_(world), owner_(owner)
     {
@@ -376,17 +379,18 @@ private:
 // nothing and wait for no manifest. An input behind an opaque one is not sent, nor rendered if its rank hears of that
 // in time. An input that was hidden in the last frame waits until the tile that hid it has been rendered again, at most
 // FrameBufferConfig::quiet. Use it only if one order of the bricks is right for all rays of a frame: not with an
-// extended lens or several eyes.
+// extended lens or several eyes. Framebuffer, world and owner must outlive it. One thread at a time may use it.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
 public:
+    // Not collective. Waits for nothing.
     OrderedLoop(FrameBuffer& fb, const SharedWorld& world, TileBrickOwner& owner)
         : fb_(fb), world_(world), owner_(owner)
     {
     }
 
     // As MixedParallelLoop::start(). `order`: the bricks front to back, by their place in world.bricks(), as
-    // visibilityOrder() returns them.
+    // visibilityOrder() returns them. If it has not each brick once, the frame fails (InvalidArgument).
     template <class Camera, class RenderBrick>
     [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                                     const RenderBrick& renderBrick, FrameConfig params = {},

@@ -35,8 +35,8 @@ struct SamplingConfig {
     int frameSamples = 64; // the most that a tile gets in one frame; memory grows with it
 };
 
-// Use it alike on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere. The
-// verdict of the frame finds a rank that decides otherwise. The operation is a Progressive one:
+// Use it alike on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere. If a rank
+// decides otherwise, the frame fails (Disagreement). The operation is a Progressive one:
 //
 //   dfb::ImageParallelLoop loop(fb);
 //   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
@@ -79,7 +79,8 @@ public:
         return params;
     }
 
-    // Plans the next frame by the report of the last one, which was begun with next(). Call it after each frame.
+    // Plans the next frame by the report of the last one, which was begun with next(). Call it after each frame, on
+    // all ranks. Nobody checks that the report is of this layout.
     void update(const FrameReport& report)
     {
         for (std::size_t t = 0; t < plan_.size(); ++t)

@@ -52,7 +52,7 @@ public:
             tile = tiles_[static_cast<std::size_t>(index)];
         }
         const double behind = std::max(maxColor_, background_) + tile.beyond;
-        double bound = minTransmittance_ * std::max(behind, 1.0);
+        double bound = minTransmittance_ > 0 ? minTransmittance_ * std::max(behind, 1.0) : 0; // `behind` may be infinite
         for (const WireFormat format : {WireFormat::Unorm8, WireFormat::Unorm16, WireFormat::Float16})
             if (const std::int64_t layers = tile.layers[static_cast<std::size_t>(format)]; layers > 0) {
                 const double its = wireErrorBound(format, layers, maxColor_, behind);

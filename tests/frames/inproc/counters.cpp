@@ -596,6 +596,68 @@ TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and t
     });
 }
 
+TEST_CASE("A tile that there was no memory for can be set again", "[counters]")
+{
+    dfb::runRanks(1, [](dfb::InprocCommunicator communicator) {
+        using Fb = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
+        dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        Fb fb(communicator, config);
+        const auto tile = std::make_unique<Fb::Tile>();
+        auto frame = fb.begin();
+        frame.start(*tile, 0, 0);
+        std::fill_n(tile->color, 4 * 64 * 64, 0.5f);
+        largestAllocation = 20000;
+        CHECK_THROWS_AS(frame.setTile(*tile), dfb::OutOfMemory);
+        largestAllocation = std::numeric_limits<std::size_t>::max();
+        frame.setTile(*tile);
+        CHECK(frame.end().tilesTouched == 1);
+    });
+}
+
+namespace {
+
+// From its third tile on there is no memory for another batch of finished tiles, which has 256 KiB.
+struct TakesMemory {
+    std::shared_ptr<std::atomic<int>> tiles = std::make_shared<std::atomic<int>>(0);
+    void process(dfb::PixelTile&) const
+    {
+        if (++*tiles == 3)
+            largestAllocation = 200000;
+    }
+};
+
+} // namespace
+
+TEST_CASE("A lack of memory for finished tiles costs a partial frame no other tile", "[counters]")
+{
+    std::vector<std::int64_t> incomplete(2);
+    int shown = 0;
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        using Fb = dfb::DistributedFrameBuffer<dfb::ImageParallel, TakesMemory, dfb::InprocTransport>;
+        dfb::FrameBufferConfig config(64 * 8, 64, dfb::OutputFormat::RGBA32F); // a batch has room for 3 tiles
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        dfb::NetworkConfig network;
+        network.sharedMemory = false;
+        Fb fb(communicator, config, network);
+        dfb::FrameConfig params;
+        params.allowPartial = true;
+        auto frame = fb.begin(params);
+        frame.forEachTile(fb.ownedTiles(), [&](auto& tile) {
+            for (int i = 0; i < 4 * 64 * 64; ++i)
+                tile.color[i] = static_cast<float>(i % 1009) / 1009;
+            frame.setTile(tile);
+        });
+        incomplete[static_cast<std::size_t>(fb.rank())] = frame.end().tilesIncomplete;
+        for (int tile = 0; tile < 8 && fb.isDisplayRank(); ++tile)
+            shown += fb.isComplete(tile);
+    });
+    largestAllocation = std::numeric_limits<std::size_t>::max();
+    CHECK(incomplete == std::vector<std::int64_t>(2, 5));
+    CHECK(shown == 3);
+}
+
 TEST_CASE("What is too large for memory is named with its bytes and its rank, on every rank", "[counters]")
 {
     using dfb::OutputFormat;

@@ -283,7 +283,7 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
             texts.push_back(outcomeOf([&] { frame.start(*tile, -1); }));
             texts.push_back(outcomeOf([&] { frame.start(*tile, 0, 1); }));
             texts.push_back(outcomeOf([&] { frame.declare({}); }));
-            texts.push_back(outcomeOf([&] { fb.begin(); }));
+            texts.push_back(outcomeOf([&] { (void)fb.begin(); }));
             const std::vector<float> pixels(16 * 16 * 4, 0.5f);
             Fb::TileView view;
             frame.start(view, 3);
@@ -339,10 +339,10 @@ TEST_CASE("Frame parameters that cannot be are refused", "[errors]")
         FrameBuffer<Blend> fb(communicator, configOf(s));
         dfb::FrameConfig params;
         params.passes = 0;
-        texts.push_back(outcomeOf([&] { fb.begin(params); }));
+        texts.push_back(outcomeOf([&] { (void)fb.begin(params); }));
         params.passes = 1;
         params.maxLayers = -1;
-        texts.push_back(outcomeOf([&] { fb.begin(params); }));
+        texts.push_back(outcomeOf([&] { (void)fb.begin(params); }));
     });
     for (const std::string& text : texts) {
         INFO(text);
@@ -686,6 +686,22 @@ TEST_CASE("An exception in a renderer fails the frame on every rank", "[errors]"
         }
 }
 
+TEST_CASE("A frame that is given up without an exception fails on every rank", "[errors]")
+{
+    const Scene s = scene::makeScene(3);
+    const BadFrame bad = badFrame<FrameBuffer<Blend>>(3, s, configOf(s), [](auto& fb) {
+        auto frame = fb.begin();
+        if (fb.rank() == 1)
+            frame.abort(nullptr);
+        frame.end();
+    });
+    INFO(joined(bad.texts));
+    CHECK(allSame(bad.texts));
+    CHECK(has(bad.texts[0], "FrameError: dfb: invalid argument: rank 1"));
+    CHECK(has(bad.texts[0], "no exception"));
+    CHECK(bad.wrongAfter == 0);
+}
+
 TEST_CASE("An exception in a tile operation fails the frame on every rank", "[errors]")
 {
     const Scene s = scene::makeScene(6);
@@ -984,7 +1000,7 @@ TEST_CASE("An input that takes the place of an announced one is an error, whatev
         }
 }
 
-TEST_CASE("Cancelling a frame that is over changes nothing", "[errors]")
+TEST_CASE("Cancelling or aborting a frame that is over changes nothing", "[errors]")
 {
     const Scene s = scene::makeScene(3);
     std::vector<std::string> texts(2);
@@ -996,15 +1012,37 @@ TEST_CASE("Cancelling a frame that is over changes nothing", "[errors]")
             auto first = fb.begin(params);
             first.declare({});
             first.end();
-            first.cancel();
+            const auto stop = [&] {
+                first.cancel();
+                first.abort(std::make_exception_ptr(std::runtime_error("too late")));
+            };
+            stop();
             auto second = fb.begin(params);
             second.declare({});
-            first.cancel();
+            stop();
             second.end();
         });
     });
     INFO(joined(texts));
     CHECK(texts == std::vector<std::string>(2, "fine"));
+}
+
+TEST_CASE("A frame that has ended or was moved from cannot be ended", "[errors]")
+{
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<Blend> fb(communicator, configOf(scene::makeScene(3)));
+        dfb::FrameConfig params;
+        params.declared = true;
+        params.timeout = std::chrono::seconds(5);
+        auto from = fb.begin(params);
+        auto frame = std::move(from);
+        frame.declare({});
+        CHECK_THROWS_AS(from.end(), dfb::InvalidArgument);
+        CHECK(frame.end().frame == 1);
+        CHECK_THROWS_AS(frame.isDone(), dfb::InvalidArgument);
+        CHECK_THROWS_AS(frame.tryEnd(), dfb::InvalidArgument);
+        CHECK_THROWS_AS(frame.end(), dfb::InvalidArgument);
+    });
 }
 
 TEST_CASE("What was not declared, or not sent as declared, is named", "[errors]")
@@ -1211,7 +1249,7 @@ TEST_CASE("A rank that leaves by an exception outside frames: the others get a T
                             else
                                 scene::renderLoop(*fb, s, loop);
                         });
-                        const std::string again = outcomeOf([&] { fb->begin(); });
+                        const std::string again = outcomeOf([&] { (void)fb->begin(); });
                         if (again.compare(0, 14, "TransportError") != 0)
                             texts[rank] = "begin() afterwards: " + again;
                     });

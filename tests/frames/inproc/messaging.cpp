@@ -649,6 +649,29 @@ TEST_CASE("A damaged part of a reduction that its receiver is not at yet ends in
     }
 }
 
+TEST_CASE("Without a peerTimeout a damaged message of before does not end a reduction", "[messaging]")
+{
+    const auto board = std::make_shared<Board>();
+    std::vector<std::string> texts(2);
+    std::vector<std::int64_t> sums(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(sceneFor(Loop::Declared));
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in poll()
+        dfb::NetworkConfig options;
+        options.peerTimeout = std::chrono::milliseconds(0);
+        FrameBuffer<Blend> fb(communicator, config, options);
+        const int rank = fb.rank();
+        board->handlers.at(rank)->receive(1 - rank, board->pool->acquire(sizeof(MessageHeader) - 1));
+        while (fb.poll()) {
+        }
+        texts[static_cast<std::size_t>(rank)] = outcomeOf(
+            [&] { sums[static_cast<std::size_t>(rank)] = fb.allReduce({7}, FrameBuffer<Blend>::Reduce::Sum).at(0); });
+    });
+    INFO(joined(texts));
+    CHECK(texts == std::vector<std::string>(2, "fine"));
+    CHECK(sums == std::vector<std::int64_t>(2, 14));
+}
+
 TEST_CASE("What is damaged when a rank has given its part of a reduction counts for what comes after it", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared);
@@ -1004,46 +1027,109 @@ TEST_CASE("With progress by the caller messages move in poll(), and not without 
     }
 }
 
+TEST_CASE("A thread that waits for room gives up only if nothing moves", "[messaging]")
+{
+    // Each credit of the receiver comes late, and some of 16 threads are always quicker than another.
+    const auto board = std::make_shared<Board>();
+    std::atomic<bool> slow{true};
+    std::atomic<int> credits{0};
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
+        if (slow && header.kind == MessageKind::Credit) {
+            std::this_thread::sleep_for(std::chrono::milliseconds(20)); // as a receiver that is busy
+            slow = ++credits < 60;
+        }
+        return Board::What::Pass;
+    };
+    std::vector<std::string> texts(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(scene::makeScene(0, 1, 2048, 1024));
+        config.messages.poolBytes = 0;
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+        config.executor = std::make_shared<dfb::ThreadExecutor>(communicator.inner.rank() == 0 ? 1 : 16);
+        dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport> fb(communicator, config);
+        dfb::FrameConfig params;
+        params.timeout = std::chrono::milliseconds(1000);
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            auto frame = fb.begin(params);
+            frame.forEachTile(fb.rank() == 1 ? fb.layout().tileCount() : 0, [&](std::int64_t i, auto& tile) {
+                frame.start(tile, static_cast<int>(i));
+                tile.forEachPixel([](int x, int y, float* rgba, float& depth) { // not what a few bytes could say
+                    rgba[0] = static_cast<float>((x + 64 * y) % 777) / 1000;
+                    rgba[3] = 1;
+                    depth = 1;
+                });
+                frame.setTile(tile);
+            });
+            while (fb.rank() == 0 && slow && !frame.failed())
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+            frame.end();
+        });
+    });
+    INFO(joined(texts) << ", " << credits << " credits");
+    CHECK(texts == std::vector<std::string>(2, "fine"));
+    CHECK_FALSE(slow);
+}
+
 TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[messaging]")
 {
-    // 64 tiles of 64 KiB, and a pool of four; the frame is cancelled when they are finished.
+    // 64 tiles of 64 KiB, and a pool of four; the frame is cancelled when they are finished. `senders`: ranks whose
+    // inputs have asked for room before, and are forgotten then.
     constexpr int tiles = 64;
+    const int senders = GENERATE(0, 22), inputs = 4;
     static std::atomic<int> finished{0};
-    static std::promise<void> areFinished;
+    finished = 0;
     struct Count {
-        void process(dfb::PixelTile&) const
-        {
-            if (++finished == tiles)
-                areFinished.set_value();
-        }
+        void process(dfb::PixelTile&) const { ++finished; }
     };
     using Fb = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, Count, BoardTransport>;
     dfb::FrameConfig params;
     params.allowPartial = true;
     params.timeout = std::chrono::milliseconds(20000);
-    std::vector<dfb::FrameReport> reports(2);
-    runOn(std::make_shared<Board>(), 2, [&](const auto& communicator) {
-        auto config = configOf(scene::makeScene(0, 1, 64 * (tiles + 1), 64));
+    std::vector<dfb::FrameReport> reports(static_cast<std::size_t>(2 + senders));
+    std::atomic<int> set{0}, haveHeard{0};
+    runOn(std::make_shared<Board>(), 2 + senders, [&](const auto& communicator) {
+        const auto waitFor = [](const auto& condition) {
+            const auto limit = std::chrono::steady_clock::now() + std::chrono::seconds(20);
+            while (!condition() && std::chrono::steady_clock::now() < limit)
+                std::this_thread::sleep_for(std::chrono::milliseconds(1));
+        };
+        auto config = configOf(scene::makeScene(0, 1, 64 * (tiles + 1 + senders * inputs), 64));
         config.image.format = dfb::OutputFormat::RGBA32F;
         config.messages.poolBytes = 0;
-        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        config.image.ownerMap = [=](int tile, const dfb::TileLayout&, int) {
+            return tile < tiles || senders == 0 ? 1 : 0;
+        };
+        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         Fb fb(communicator, config);
+        const int rank = fb.rank();
+        std::promise<void> mayReceive;
+        if (rank == 0 && senders > 0) // its worker, which hands out credit
+            fb.executor().submit([&] { mayReceive.get_future().wait(); });
         auto frame = fb.begin(params);
         auto tile = std::make_unique<Fb::Tile>();
-        for (int index = 0; index < tiles && fb.rank() == 1; ++index) {
-            frame.start(*tile, index);
-            for (std::size_t i = 0; i < 64 * 64; ++i) { // not what a few bytes could say
-                tile->color[4 * i] = static_cast<float>(i % 777) / 1000;
-                tile->color[4 * i + 1] = tile->color[4 * i + 3] = 0.5f;
-                tile->depth[i] = static_cast<float>(i);
+        const int first = rank == 1 ? 0 : tiles + 1 + (rank - 2) * inputs;
+        waitFor([&] { return rank != 1 || set == senders; });
+        for (int i = 0; i < (rank == 0 ? 0 : rank == 1 ? tiles : inputs); ++i) {
+            frame.start(*tile, first + i);
+            for (std::size_t k = 0; k < 64 * 64; ++k) { // not what a few bytes could say
+                tile->color[4 * k] = static_cast<float>(k % 777) / 1000;
+                tile->color[4 * k + 1] = tile->color[4 * k + 3] = 0.5f;
+                tile->depth[k] = static_cast<float>(k);
             }
             frame.setTile(*tile);
         }
-        if (fb.rank() == 0) {
-            areFinished.get_future().wait_for(std::chrono::seconds(20));
-            frame.cancel();
+        if (rank > 1) {
+            ++set;
+            waitFor([&] { return frame.failed(); });
+            ++haveHeard;
         }
-        reports[static_cast<std::size_t>(fb.rank())] = frame.end();
+        if (rank == 0) {
+            waitFor([&] { return finished == tiles; });
+            frame.cancel();
+            waitFor([&] { return haveHeard == senders; });
+            mayReceive.set_value();
+        }
+        reports[static_cast<std::size_t>(rank)] = frame.end();
         if (fb.isDisplayRank())
             for (int index = 0; index < tiles; ++index)
                 if (fb.isComplete(index)
@@ -1054,9 +1140,11 @@ TEST_CASE("Finished tiles of a partial frame that wait for room still come", "[m
     CHECK(finished == tiles);
     REQUIRE(reports[0].failure);
     CHECK(reports[0].failure->kind == dfb::ErrorKind::Cancelled);
-    // One was never sent; another may not have been handed on when the frame was cancelled.
-    CHECK(reports[0].tilesIncomplete >= 1);
-    CHECK(reports[0].tilesIncomplete <= 2);
+    // One, and those of the senders, were never sent; another may not have been handed on when the frame was cancelled.
+    const int never = 1 + senders * inputs;
+    CHECK(reports[0].tilesIncomplete >= never);
+    CHECK(reports[0].tilesIncomplete <= never + 1);
+    CHECK(reports[1].tilesIncomplete == reports[0].tilesIncomplete);
     CHECK(reports[0].compositingOverheadMs < 20000.0 / 2);
 }
 

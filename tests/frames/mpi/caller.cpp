@@ -1,6 +1,7 @@
 // Progress by the caller: a rank that has left end() may go into calls of MPI that do not move messages of dfb, and
 // nobody may need it there.
 #include "catch.hpp"
+#include "random_scene.hpp"
 #include "ranks.hpp"
 
 #include <dfb/comm/mpi_transport.hpp>
@@ -8,7 +9,9 @@
 
 #include <chrono>
 #include <cstddef>
+#include <cstdint>
 #include <memory>
+#include <stdexcept>
 #include <string>
 #include <thread>
 #include <vector>
@@ -114,6 +117,46 @@ TEST_CASE("Who comes last to a reduction has sent its result on when it leaves",
         }
     }
     MPI_Comm_free(&pair);
+}
+
+TEST_CASE("Frames that an exception leaves, the newest first, do not keep others in end() of the oldest", "[mpi]")
+{
+    const int rank = rankIn(MPI_COMM_WORLD);
+    dfb::FrameBufferConfig config(64 * 20, 64 * 20, dfb::OutputFormat::None);
+    config.executor = std::make_shared<dfb::CallerExecutor>();
+    config.framesInFlight = 2;
+    config.messages.poolBytes = std::size_t{1} << 30;
+    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+    dfb::NetworkConfig options;
+    options.progress = dfb::Progress::Caller;
+    options.sharedMemory = false;
+    Fb fb(MPI_COMM_WORLD, config, options);
+    std::vector<float> pixels(4 * 64 * 64);
+    for (std::size_t i = 0; i < pixels.size(); ++i)
+        pixels[i] = static_cast<float>(i % 1009) / 1009;
+    dfb::FrameConfig params;
+    params.timeout = std::chrono::seconds(10); // an error in place of a hang
+    const std::string left = scene::outcomeOf([&] {
+        auto first = fb.begin(params), second = fb.begin(params);
+        for (int index = 0; index < 200 && rank > 0; ++index) { // some are still under way when rank 0 leaves
+            Fb::TileView view;
+            second.start(view, index);
+            view.generation = 1;
+            view.source = static_cast<std::uint32_t>(rank);
+            view.stride = 64;
+            view.color = pixels.data();
+            second.setTile(view);
+        }
+        MPI_Barrier(MPI_COMM_WORLD);
+        if (rank == 0)
+            throw std::runtime_error("on purpose");
+        for (auto* frame : {&first, &second}) {
+            const std::string text = scene::outcomeOf([&] { frame->end(); });
+            INFO(text);
+            CHECK(scene::has(text, "frame cancelled: rank 0"));
+        }
+    });
+    CHECK(left == (rank == 0 ? "exception: on purpose" : "fine"));
 }
 
 } // namespace caller_cases

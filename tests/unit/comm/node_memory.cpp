@@ -45,7 +45,7 @@ TEST_CASE("The memory has large pages, if the system makes them", "[memory]")
         blocks.push_back(memory->take(page));
         std::memset(blocks.back(), 1, page);
     }
-    CHECK((reinterpret_cast<std::uintptr_t>(&memory->bell()) - NodeMemory::alignment) % page == 0);
+    CHECK((reinterpret_cast<std::uintptr_t>(&memory->doorbell()) - NodeMemory::alignment) % page == 0);
     const auto largePages = [] { // KB of this process
         std::ifstream map("/proc/self/smaps_rollup");
         std::string word;
@@ -61,12 +61,13 @@ TEST_CASE("The memory has large pages, if the system makes them", "[memory]")
     CHECK(largePages() >= 4 * 2048);
 }
 
-TEST_CASE("A bell ends a nap, or the next one, and wakes only who wants to be woken", "[memory]")
+TEST_CASE("A doorbell ends a nap, or the next one, and wakes only who wants to be woken", "[memory]")
 {
     using namespace std::chrono;
     SharedPool s;
-    dfb::detail::Bell &mine = s.memory->bell(), &others = s.seen->bell(); // the same, as another process has it
-    dfb::detail::Bell::Listener listener(mine);
+    dfb::detail::Doorbell &mine = s.memory->doorbell(),
+                          &others = s.seen->doorbell(); // the same, as another process has it
+    dfb::detail::Doorbell::Listener listener(mine);
     // The time is the assertion: a nap that nobody ends takes a minute.
     const auto isShort = [&](bool isAwaiting, const auto& before, const auto& meanwhile) {
         before();

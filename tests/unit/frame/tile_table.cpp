@@ -49,7 +49,6 @@ struct Stage final : dfb::detail::TileStage {
 
 struct Operations final : dfb::detail::Operations {
     explicit Operations(Fault at) : dfb::detail::Operations({}), fault(at) {}
-    void newFrame() override {}
     std::unique_ptr<dfb::detail::TileStage> makeTile() const override
     {
         ++made;
@@ -92,7 +91,7 @@ Seen frame(dfb::detail::TileTable& table, std::int64_t number, Time time)
     };
     dfb::TileInfo info;
     info.frame = number;
-    table.newFrame(info, nullptr, nullptr);
+    table.newFrame(info, nullptr, nullptr, false);
     dfb::detail::ExpectedInputs expected;
     expected.replace({0}, {{0, 0, 0, 0}, {1, 0, 0, 0}, {1, 1, 0, 0}});
     if (time == BeforeDeclare || time == Between)
@@ -156,7 +155,7 @@ TEST_CASE("The operations of tiles that move away are used for those that come",
         const bool haveMoved = table.prepare(owners);
         dfb::TileInfo info;
         info.frame = number++;
-        table.newFrame(info, nullptr, owners);
+        table.newFrame(info, nullptr, owners, haveMoved);
         CHECK(table.owned() == owned);
         CHECK(table.ownedByMap() == std::vector<int>{0, 1});
         for (int tile = 0; tile < 4; ++tile)

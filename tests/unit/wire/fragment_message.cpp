@@ -483,6 +483,34 @@ TEST_CASE("A message of another version, byte order or codec is named as such", 
           != std::string::npos);
 }
 
+TEST_CASE("Pixels of 8 bits may lie at any address, floats at a multiple of 4 only", "[wire]")
+{
+    namespace d = dfb::detail;
+    const dfb::TileLayout layout(8, 8, 8);
+    const auto tile = makeTile<8>(layout, 0);
+    const auto pool = dfb::MemoryPool::create();
+    const std::vector<std::byte> shared(1100);
+    const auto bytesAt = [&](std::int64_t offset, std::int64_t) { return shared.data() + offset; };
+    for (const bool hasBytes : {true, false})
+        for (const std::int64_t first : {4, 5}) {
+            d::InputPixels pixels(*tile);
+            pixels.hasBytes = hasBytes;
+            pixels.at.at[d::Color] = shared.data();
+            const auto inPlace = d::pixelsInPlace(pixels, dfb::colorChannel, false);
+            const auto offsetOf = [&](const std::byte* p) -> std::int64_t { return first + (p - shared.data()); };
+            const auto decode = [&] {
+                d::decodeFragment(
+                    *pool, d::encodeInPlace(*pool, pixels, inPlace, dfb::colorChannel, 0, offsetOf), layout,
+                    [](int) { return 3; }, nullptr, d::WireCoder(), bytesAt);
+            };
+            INFO((hasBytes ? "bytes at " : "floats at ") << first);
+            if (hasBytes || first == 4)
+                CHECK_NOTHROW(decode());
+            else
+                CHECK_THROWS_AS(decode(), dfb::Error);
+        }
+}
+
 #if defined(DFB_HAS_SNAPPY)
 TEST_CASE("Compressed tiles come through as they were, never larger than raw", "[wire]")
 {
