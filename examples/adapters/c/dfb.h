@@ -125,9 +125,9 @@ typedef struct dfb_input {
 void dfb_input_init_sized(dfb_input* input, size_t struct_size);
 
 // Makes one picture of the images of all ranks. `place`, with DFB_IN_ORDER: this rank's place in the order, 0 in front,
-// a different one on each rank; else it does not matter. The memory of the image is only read during the call.
-// Collective; waits until the picture is complete on the display rank. DFB_FRAME_FAILED on all ranks if the image of
-// one is wrong.
+// a different one on each rank; else, and for a rank with nothing to show, it does not matter. Null for `input`: this
+// rank could not make its image. The memory of the image is only read during the call. Collective; waits until the
+// picture is complete on the display rank. DFB_FRAME_FAILED on all ranks if the image of one is wrong or null.
 int dfb_composite(dfb_framebuffer* framebuffer, const dfb_input* input, int place);
 
 // ---- bricks of data that the ranks render

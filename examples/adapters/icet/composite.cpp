@@ -154,9 +154,10 @@ std::vector<dfb::ImageCompositor*> picturesOf(IceTContextStruct& context, const 
     return all;
 }
 
-void start(dfb::ImageCompositor& picture, const Source& source, int tile, const Plan& plan)
+void start(dfb::ImageCompositor& picture, const Source& source, int tile, const Plan& plan, std::int64_t number)
 {
     dfb::FrameConfig frame;
+    frame.accumulationId = static_cast<std::uint64_t>(number); // ranks that have made different calls are an error
     frame.background = plan.background;
     frame.timeout = timeLimit();
     dfb::InputImage input;
@@ -294,7 +295,7 @@ IceTImage makeFrame(IceTContextStruct& context, const View& view, const Source& 
     findContained(context, source.limits);
     const auto pictures = picturesOf(context, plan);
     for (std::size_t i = 0; i < pictures.size(); ++i)
-        start(*pictures[i], source, static_cast<int>(i), plan);
+        start(*pictures[i], source, static_cast<int>(i), plan, frame.count);
     end(pictures, frame);
     IceTImage result{nullptr};
     if (const int tile = context.settings.tileOf(context.rank()); tile >= 0)

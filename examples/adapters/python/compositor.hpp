@@ -49,6 +49,8 @@ public:
             arrays.read(rgba, depth, options, object().config().image);
             if (!options["order"].is_none())
                 place = argument<int>(options, "order", "an int or None");
+            else if (object().blend() == dfb::ImageBlend::InOrder && !rgba.is_none())
+                throw dfb::InvalidArgument("order is None: blend=\"order\" needs this rank's place, 0 in front");
         });
         return withoutGil(*cause, [&] {
             if (!wrong)

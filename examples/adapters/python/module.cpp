@@ -121,6 +121,8 @@ PYBIND11_MODULE(_dfb, module)
                       "Input pixels with an infinity or NaN, of all ranks.")
         .def_readonly("alpha_outside_pixels", &dfb::FrameReport::alphaOutsidePixels,
                       "Input pixels whose alpha is not within 0 and 1, of all ranks.")
+        .def_readonly("order_undefined_pixels", &dfb::FrameReport::orderUndefinedPixels,
+                      "Pixels whose inputs overlap in depth: no order is right.")
         .def_readonly("peak_inbox_bytes", &dfb::FrameReport::peakInboxBytes, "The most that a rank's inbox held.")
         .def_readonly("peak_memory_bytes", &dfb::FrameReport::peakMemoryBytes,
                       "The most message and image memory that a rank ever held.");
