@@ -1,8 +1,7 @@
 #!/bin/sh
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
-# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results, one table to
-# docs/performance.md. An hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
+# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results. An hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
 # of a program, is to start it there, 4 ranks at best, one on each.
 # The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
 set -eu
@@ -102,17 +101,4 @@ if [ -n "$launcher" ]; then
 else
     echo "run.sh: no --launcher: nothing was measured over a network"
 fi
-
-# What docs/performance.md has between its two marks is what was measured.
-awk -v tables="$results/error_time.4.md $results/error_time.8.md" '
-    $0 == "<!-- end of error_time -->" { skip = 0 }
-    !skip { print }
-    $0 == "<!-- error_time: written by bench/run.sh -->" {
-        skip = 1
-        count = split(tables, table, " ")
-        for (i = 1; i <= count; ++i)
-            while ((getline line < table[i]) > 0) print line
-        print ""
-    }' docs/performance.md >docs/performance.md.new
-mv docs/performance.md.new docs/performance.md
 exit "$status"
