@@ -270,12 +270,12 @@ namespace detail {
 struct InputPixels : TileHeader {
     template <ChannelMask Channels, int Size>
     InputPixels(const Tile<Channels, Size>& from)
-        : TileHeader(from), channels(Channels), at(from.planes()), stride(Size), valid(from.region)
+        : TileHeader(from), channels(Channels), planes(from.planes()), stride(Size), valid(from.region)
     {
     }
     template <ChannelMask Channels, int Size>
     InputPixels(const TileView<Channels, Size>& from)
-        : TileHeader(from), channels(Channels), at(from.planes()), stride(from.stride), valid(from.validRegion()),
+        : TileHeader(from), channels(Channels), planes(from.planes()), stride(from.stride), valid(from.validRegion()),
           hasBytes(!from.color && from.color8), staysUntilEnd(from.staysUntilEnd)
     {
     }
@@ -287,7 +287,7 @@ struct InputPixels : TileHeader {
     }
 
     ChannelMask channels;
-    ConstPlanes at;        // to the first pixel of the region; null: not there
+    ConstPlanes planes;    // to the first pixel of the region; null: not there
     std::ptrdiff_t stride; // from a row to the next, in pixels
     Region valid;          // of the region; pixels outside of it have nothing, and are not read
     bool hasBytes = false; // the colour has 8 bits a channel

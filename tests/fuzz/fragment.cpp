@@ -163,7 +163,7 @@ dfb::Buffer encode(dfb::MemoryPool& pool, const Tile& tile, dfb::ChannelMask cha
     for (std::size_t i = 0; i < levels.size(); ++i)
         levels[i] = static_cast<std::uint8_t>(std::lround(255 * tile.color[i]));
     d::InputPixels bytes(tile);
-    bytes.at.at[d::Color] = reinterpret_cast<const std::byte*>(levels.data());
+    bytes.planes.at[d::Color] = reinterpret_cast<const std::byte*>(levels.data());
     bytes.hasBytes = true;
     return d::encodeFragment(pool, bytes, channels, 0, with, coder, dfb::WireFormat::Float32, faults);
 }
@@ -294,8 +294,8 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     const auto addInPlace = [&](const std::string& name, std::ptrdiff_t first, std::ptrdiff_t stride, bool hasBytes) {
         d::InputPixels tile(*dense);
         const auto* begin = reinterpret_cast<const std::byte*>(sharedFloats().data());
-        tile.at.at[d::Color] = begin + (hasBytes ? 4 : 16) * first;
-        tile.at.at[d::Depth] = begin + 4 * first;
+        tile.planes.at[d::Color] = begin + (hasBytes ? 4 : 16) * first;
+        tile.planes.at[d::Depth] = begin + 4 * first;
         tile.stride = stride;
         tile.hasBytes = hasBytes;
         const dfb::Buffer message =

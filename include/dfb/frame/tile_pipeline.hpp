@@ -127,7 +127,7 @@ public:
             setPlace(info, tile);
             throw InvalidArgument(std::move(info));
         }
-        const ConstPlanes& planes = tile.at;
+        const ConstPlanes& planes = tile.planes;
         if (!planes.at[Color])
             return;
         if (std::abs(tile.stride) < tile.valid.width())
@@ -188,7 +188,7 @@ public:
     bool mayReadInPlace(const InputPixels& tile) const
     {
         return tile.staysUntilEnd && traits().readsInPlace && !traits().keepsState && !isLossy()
-               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.at.at[Color] && !tile.valid.empty();
+               && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.planes.at[Color] && !tile.valid.empty();
     }
 
     // The message for such a tile of another owner. `offsetOf(address)`: from the start of the memory that the owner

@@ -91,8 +91,8 @@ inline void countFaults(const ActivePixels& active, const InputPixels& tile, Cha
     faults.nonFinite += active.nanDepths();
     if (!active.mayBeFaulty())
         return;
-    const float* rgba = tile.hasBytes ? nullptr : floatsOf(tile.at.at[Color]);
-    const float* depth = hasChannel(channels, Depth) ? floatsOf(tile.at.at[Depth]) : nullptr;
+    const float* rgba = tile.hasBytes ? nullptr : floatsOf(tile.planes.at[Color]);
+    const float* depth = hasChannel(channels, Depth) ? floatsOf(tile.planes.at[Depth]) : nullptr;
     active.forEachSpan(tile.stride, [&](std::ptrdiff_t first, int count) {
         countFaults(rgba ? rgba + 4 * first : nullptr, depth ? depth + first : nullptr, count, faults);
     });
@@ -197,8 +197,8 @@ inline std::uint32_t checksumOf(const InputPixels& tile)
     const Region valid = tile.valid;
     for (const std::size_t c : {std::size_t{Color}, std::size_t{Depth}}) {
         const auto bytes = static_cast<std::ptrdiff_t>(tile.pixelBytes(c));
-        for (int y = valid.y0 - tile.region.y0; tile.at.at[c] && y < valid.y1 - tile.region.y0; ++y)
-            sum = crc32c(tile.at.at[c] + bytes * (y * tile.stride + valid.x0 - tile.region.x0),
+        for (int y = valid.y0 - tile.region.y0; tile.planes.at[c] && y < valid.y1 - tile.region.y0; ++y)
+            sum = crc32c(tile.planes.at[c] + bytes * (y * tile.stride + valid.x0 - tile.region.x0),
                          static_cast<std::size_t>(bytes * valid.width()), sum);
     }
     return sum;

@@ -274,8 +274,8 @@ inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& sha
 inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels, bool byDepth)
 {
     PixelsInPlace p;
-    p.color = tile.at.at[Color];
-    p.depth = hasChannel(channels, Depth) ? floatsOf(tile.at.at[Depth]) : nullptr;
+    p.color = tile.planes.at[Color];
+    p.depth = hasChannel(channels, Depth) ? floatsOf(tile.planes.at[Depth]) : nullptr;
     p.stride = tile.stride;
     const int x0 = tile.region.x0, y0 = tile.region.y0;
     p.valid = {tile.valid.x0 - x0, tile.valid.y0 - y0, tile.valid.x1 - x0, tile.valid.y1 - y0};
@@ -295,7 +295,7 @@ public:
     ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors,
                        float* depths = nullptr)
     {
-        const ConstPlanes& planes = tile.at;
+        const ConstPlanes& planes = tile.planes;
         const auto most =
             static_cast<std::size_t>(tile.region.width()) * static_cast<std::size_t>(tile.region.height());
         struct Target {

@@ -495,7 +495,7 @@ TEST_CASE("Pixels of 8 bits may lie at any address, floats at a multiple of 4 on
         for (const std::int64_t first : {4, 5}) {
             d::InputPixels pixels(*tile);
             pixels.hasBytes = hasBytes;
-            pixels.at.at[d::Color] = shared.data();
+            pixels.planes.at[d::Color] = shared.data();
             const auto inPlace = d::pixelsInPlace(pixels, dfb::colorChannel, false);
             const auto offsetOf = [&](const std::byte* p) -> std::int64_t { return first + (p - shared.data()); };
             const auto decode = [&] {
