@@ -179,10 +179,9 @@ public:
     // segments were merged. The first segments of a brick's pixels announce the others as children, so pixels with one
     // segment cost nothing extra.
     template <class Camera, class RenderBrick>
-    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameConfig params = {},
-                                                    const typename FrameBuffer::TileFrameData& tileData = {},
-                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
+                                      const typename FrameBuffer::TileFrameData& tileData = {},
+                                      const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
         auto frame = fb_.begin(params, tileData, pixelData);

@@ -129,9 +129,9 @@ public:
     // and with WorkDistribution::Dynamic for jobs. Throws what FrameBuffer::begin() throws. An exception of renderTile
     // comes out of Frame::end() on all ranks, as a FrameError.
     template <class RenderTile>
-    [[nodiscard]] typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
-                                                    const typename FrameBuffer::TileFrameData& tileData = {},
-                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    typename FrameBuffer::Frame start(const RenderTile& renderTile, FrameConfig params = {},
+                                      const typename FrameBuffer::TileFrameData& tileData = {},
+                                      const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
         params.maxLayers = 1;
@@ -298,10 +298,9 @@ public:
     // setTile(). Throws what FrameBuffer::begin() throws. An exception of renderBrick comes out of Frame::end() on all
     // ranks, as a FrameError.
     template <class Camera, class RenderBrick>
-    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameConfig params = {},
-                                                    const typename FrameBuffer::TileFrameData& tileData = {},
-                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
+                                      const typename FrameBuffer::TileFrameData& tileData = {},
+                                      const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
         if (all_)

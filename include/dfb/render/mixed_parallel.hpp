@@ -322,10 +322,9 @@ public:
 
     // As DataParallelLoop::start(). renderBrick(brick, tile) may return its cost, a number in any unit.
     template <class Camera, class RenderBrick>
-    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick,
-                                                    FrameConfig params = {},
-                                                    const typename FrameBuffer::TileFrameData& tileData = {},
-                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    typename FrameBuffer::Frame start(const Camera& camera, const RenderBrick& renderBrick, FrameConfig params = {},
+                                      const typename FrameBuffer::TileFrameData& tileData = {},
+                                      const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = true;
         fromWorld_.set(params, fb_, world_, camera);
@@ -392,10 +391,10 @@ public:
     // As MixedParallelLoop::start(). `order`: the bricks front to back, by their place in world.bricks(), as
     // visibilityOrder() returns them. If it has not each brick once, the frame fails (InvalidArgument).
     template <class Camera, class RenderBrick>
-    [[nodiscard]] typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
-                                                    const RenderBrick& renderBrick, FrameConfig params = {},
-                                                    const typename FrameBuffer::TileFrameData& tileData = {},
-                                                    const typename FrameBuffer::PixelFrameData& pixelData = {})
+    typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
+                                      const RenderBrick& renderBrick, FrameConfig params = {},
+                                      const typename FrameBuffer::TileFrameData& tileData = {},
+                                      const typename FrameBuffer::PixelFrameData& pixelData = {})
     {
         params.declared = false;
         fromWorld_.set(params, fb_, world_, camera, true);
