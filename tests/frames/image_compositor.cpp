@@ -316,7 +316,7 @@ struct AtInfinity {
     }
 };
 
-// Who shows nothing needs no place in the order, who shows something does.
+// A rank that shows nothing needs no place in the order, one that shows something does.
 struct Places {
     template <class Transport>
     static Result run(const typename Transport::Communicator& communicator)

@@ -384,6 +384,7 @@ public:
         std::vector<std::int64_t> reduced(values.size());
         for (std::int64_t& value : reduced)
             value = in.get<std::int64_t>();
+        in.end();
         return reduced;
     }
 
@@ -412,7 +413,7 @@ public:
     }
 
 private:
-    // What this rank brings to a call of this name: see ReductionTable::combineParts().
+    // The beginning of this rank's part of a call of this name: see ReductionTable::combineParts().
     ByteWriter partOf(const std::string& call) const
     {
         ByteWriter out;
@@ -429,7 +430,7 @@ private:
         });
     }
 
-    // What all have brought together. Throws InvalidArgument if they have made different calls.
+    // A reader of the parts of all, behind the call's name. Throws InvalidArgument if they have made different calls.
     ByteReader partIn(const Bytes& result) const
     {
         ByteReader in(result);

@@ -48,6 +48,12 @@ public:
         }
     }
 
+    // Whether the last frame's samples count on.
+    bool goesOn(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
+    {
+        return traits.keepsState && !lastFailed && params.accumulationId == lastId_;
+    }
+
     // Of each tile in a frame without a plan of samples.
     int firstSample(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
     {
@@ -62,12 +68,6 @@ public:
     }
 
 private:
-    // Whether what the last frame left is of use.
-    bool goesOn(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
-    {
-        return traits.keepsState && !lastFailed && params.accumulationId == lastId_;
-    }
-
     std::uint64_t lastId_ = 0;
     int next_ = 0; // sample of each tile, if the next frame has no plan and goes on
 };

@@ -114,7 +114,8 @@ public:
         info.order = params_.order.get();
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(info, params.samples, params.owners, haveMoved, params.maxLayers,
+            const bool goesOn = accumulation_.goesOn(params, traits(), lastFailed);
+            pipeline_->newFrame(info, params.samples, params.owners, haveMoved, goesOn, params.maxLayers,
                                 codecFor(config_.image.displayRank) != nullptr);
             copyData();
         } catch (...) {

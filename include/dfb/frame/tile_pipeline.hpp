@@ -72,15 +72,13 @@ public:
     TileTable& table() noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
 
-    // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `compresses`: whether
-    // finished tiles are compressed.
-    void newFrame(TileInfo info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved, int maxLayers,
-                  bool compresses)
+    // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `goesOn`: whether
+    // the last frame's samples count on. `compresses`: whether finished tiles are compressed.
+    void newFrame(TileInfo info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved, bool goesOn,
+                  int maxLayers, bool compresses)
     {
         faults_.reset();
         promises_.clear();
-        const bool goesOn = traits().keepsState && info.accumulationId == accumulationId_;
-        accumulationId_ = info.accumulationId;
         reports_ = {{}, 0, goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
         const bool hasPasses =
             plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
@@ -449,7 +447,6 @@ private:
     const WireCoder coder_;
     std::atomic<WireFormat> wireColor_{WireFormat::Float32};
     WireLosses losses_;
-    std::uint64_t accumulationId_ = 0;
     FaultCounts faults_;
     struct Promise {
         InputPixels tile;

@@ -569,20 +569,33 @@ std::vector<std::string> outcomes(std::size_t largest, const Make& make)
 
 } // namespace
 
-TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and the next is right", "[counters]")
+namespace {
+
+using OneTile = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
+
+// Calls body(framebuffer, tile) on one rank with one worker, whose image is one tile.
+template <class Body>
+void withOneTile(const Body& body)
 {
-    dfb::runRanks(1, [](dfb::InprocCommunicator communicator) {
-        using Fb = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
+    dfb::runRanks(1, [&](dfb::InprocCommunicator communicator) {
         dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        Fb fb(communicator, config);
-        const auto tile = std::make_unique<Fb::Tile>();
+        OneTile fb(communicator, config);
+        body(fb, *std::make_unique<OneTile::Tile>());
+    });
+}
+
+} // namespace
+
+TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and the next is right", "[counters]")
+{
+    withOneTile([](OneTile& fb, OneTile::Tile& tile) {
         for (const bool hasMemory : {false, true}) {
             auto frame = fb.begin();
-            frame.start(*tile, 0, 0);
-            std::fill_n(tile->color, 4 * 64 * 64, 0.5f);
+            frame.start(tile, 0, 0);
+            std::fill_n(tile.color, 4 * 64 * 64, 0.5f);
             largestAllocation = hasMemory ? std::numeric_limits<std::size_t>::max() : 20000;
-            frame.guard([&] { frame.setTile(*tile); });
+            frame.guard([&] { frame.setTile(tile); });
             largestAllocation = std::numeric_limits<std::size_t>::max();
             std::string outcome = "fine";
             try {
@@ -598,19 +611,14 @@ TEST_CASE("A lack of memory for a tile of this rank's own fails the frame, and t
 
 TEST_CASE("A tile that there was no memory for can be set again", "[counters]")
 {
-    dfb::runRanks(1, [](dfb::InprocCommunicator communicator) {
-        using Fb = dfb::DistributedFrameBuffer<dfb::ImageParallel, dfb::NoPixelOp, dfb::InprocTransport>;
-        dfb::FrameBufferConfig config(64, 64, dfb::OutputFormat::RGBA32F);
-        config.executor = std::make_shared<dfb::ThreadExecutor>(1);
-        Fb fb(communicator, config);
-        const auto tile = std::make_unique<Fb::Tile>();
+    withOneTile([](OneTile& fb, OneTile::Tile& tile) {
         auto frame = fb.begin();
-        frame.start(*tile, 0, 0);
-        std::fill_n(tile->color, 4 * 64 * 64, 0.5f);
+        frame.start(tile, 0, 0);
+        std::fill_n(tile.color, 4 * 64 * 64, 0.5f);
         largestAllocation = 20000;
-        CHECK_THROWS_AS(frame.setTile(*tile), dfb::OutOfMemory);
+        CHECK_THROWS_AS(frame.setTile(tile), dfb::OutOfMemory);
         largestAllocation = std::numeric_limits<std::size_t>::max();
-        frame.setTile(*tile);
+        frame.setTile(tile);
         CHECK(frame.end().tilesTouched == 1);
     });
 }

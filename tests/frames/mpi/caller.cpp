@@ -40,6 +40,15 @@ bool passesBarrier(Fb& fb, MPI_Comm comm = MPI_COMM_WORLD)
     return inTime;
 }
 
+// The caller moves messages, all of them through MPI.
+dfb::NetworkConfig byCaller()
+{
+    dfb::NetworkConfig network;
+    network.progress = dfb::Progress::Caller;
+    network.sharedMemory = false;
+    return network;
+}
+
 } // namespace
 
 TEST_CASE("Who has left end() is not needed to take what a frame did not need", "[mpi]")
@@ -53,10 +62,7 @@ TEST_CASE("Who has left end() is not needed to take what a frame did not need", 
     config.messages.poolBytes = std::size_t{1} << 30;
     const int owner = last > 1 ? 1 : 0;
     config.image.ownerMap = [owner](int, const dfb::TileLayout&, int) { return owner; };
-    dfb::NetworkConfig options;
-    options.progress = dfb::Progress::Caller;
-    options.sharedMemory = false;
-    Fb fb(MPI_COMM_WORLD, config, options);
+    Fb fb(MPI_COMM_WORLD, config, byCaller());
     std::vector<float> pixels(4 * 64 * 64);
     for (std::size_t i = 0; i < pixels.size(); ++i)
         pixels[i] = i % 4 == 3 ? 1.0f : static_cast<float>(i % 1009) / 1009;
@@ -127,10 +133,7 @@ TEST_CASE("Frames that an exception leaves, the newest first, do not keep others
     config.framesInFlight = 2;
     config.messages.poolBytes = std::size_t{1} << 30;
     config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-    dfb::NetworkConfig options;
-    options.progress = dfb::Progress::Caller;
-    options.sharedMemory = false;
-    Fb fb(MPI_COMM_WORLD, config, options);
+    Fb fb(MPI_COMM_WORLD, config, byCaller());
     std::vector<float> pixels(4 * 64 * 64);
     for (std::size_t i = 0; i < pixels.size(); ++i)
         pixels[i] = static_cast<float>(i % 1009) / 1009;

@@ -1,4 +1,4 @@
-// What an owner takes of the inputs that come.
+// Inputs that an owner takes, and those that it refuses.
 #include "catch.hpp"
 
 #include <dfb/frame/tile_pipeline.hpp>
@@ -14,7 +14,7 @@ namespace {
 
 using Op = dfb::BasicAlphaBlend<8>;
 
-// What comes of an input in place, in a frame of one tile.
+// How an input in place ends, in a frame of one tile.
 std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireFormat format)
 {
     namespace d = dfb::detail;
@@ -22,7 +22,7 @@ std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireForma
     dfb::FrameBufferConfig config(8, 8);
     config.precision = format;
     d::TilePipeline pipeline(dfb::MemoryPool::create(), config, operations, 0, 1, false, 0, nullptr);
-    pipeline.newFrame(dfb::TileInfo(), nullptr, nullptr, pipeline.table().prepare(nullptr), 1, false);
+    pipeline.newFrame(dfb::TileInfo(), nullptr, nullptr, pipeline.table().prepare(nullptr), false, 1, false);
     const std::vector<float> pixels(4 * 64);
     dfb::TileView<Op::channels, 8> view;
     view.tile = 0;
