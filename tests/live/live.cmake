@@ -52,7 +52,7 @@ add_test(NAME live.browser COMMAND ${CMAKE_COMMAND} -E env
   DFB_RENDER=$<TARGET_FILE:dfb_render> DFB_IN_SITU=$<TARGET_FILE:in_situ> "DFB_MPIEXEC=${_mpi}"
   "DFB_LIVE_NODE_MODULES=${DFB_LIVE_NODE_MODULES}"
   sh ${CMAKE_CURRENT_SOURCE_DIR}/live/browser.sh --only-if-installed ${CMAKE_CURRENT_BINARY_DIR}/live_browser)
-set_tests_properties(live.browser PROPERTIES LABELS example TIMEOUT 300 COST 1000 SKIP_RETURN_CODE 77)
+set_tests_properties(live.browser PROPERTIES LABELS example TIMEOUT 300 RUN_SERIAL ON SKIP_RETURN_CODE 77)
 
 # A trace in speedscope, with the same browser: see speedscope.sh.
 add_test(NAME render.speedscope COMMAND ${CMAKE_COMMAND} -E env DFB_RENDER=$<TARGET_FILE:dfb_render>
