@@ -155,8 +155,9 @@ public:
         return shared_;
     }
 
-    // Takes the block out of `buffer`, until another process, which is to be told where it is, has given it back. Null,
-    // and nothing happens, if it is not in shared memory.
+    // Lends the block of `buffer` to another process, and empties `buffer`. Tell that process where the block is. When
+    // it has given the block back, the pool uses it again. Returns null, and changes nothing, if the block is not in
+    // shared memory.
     std::byte* lend(Buffer& buffer)
     {
         std::lock_guard<std::mutex> lock(mutex_);

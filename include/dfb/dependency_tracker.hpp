@@ -42,10 +42,9 @@ public:
         int rank = -1;
     };
 
-    // The owner's own root (generation 0) has come, and generation 1 has exactly these (source, part) pairs, each once.
-    // Used where the counts come from the senders' manifests; call it once, in place of an arriving root. `Inputs`: a
-    // range of Declared, or of structs with these members. Throws as arrive() does, also if an input came before that
-    // was not declared.
+    // Declares generation 1: it will have exactly these (source, part) pairs, each once. For frames in which ranks send
+    // manifests. Call it once, in place of arrive() for the input of generation 0. `Inputs`: a range of Declared, or of
+    // structs with these members. Throws as arrive() does, also if an input came before that was not declared.
     template <class Inputs>
     void declare(const Inputs& inputs)
     {
@@ -264,7 +263,7 @@ private:
         throw Error(std::move(info));
     }
 
-    // So many more than there are an input may add, lest one with a wrong number takes the memory of all.
+    // The most generations that one input may add: one with a wrong number must not take all memory.
     static constexpr std::size_t mostAhead = 64;
 
     std::vector<Generation> generations_; // the first ones

@@ -188,9 +188,10 @@ public:
 
         // Calls job(i, tile) for each i in [0, count), on this thread and the workers of the executor. Each thread has
         // a tile of its own: a Tile, or a TileView if that is the template argument. The job calls start(tile, ...),
-        // renders, and calls setTile(tile). Waits until all jobs have returned. Throws nothing: an exception of a job
-        // makes the frame fail as in guard(), and no other job begins; with FrameConfig::allowPartial the frame goes on
-        // without that job's tile.
+        // renders, and calls setTile(tile); several threads call it at once. Any thread may call forEachTile(). Not
+        // collective. Waits until all jobs have returned, for other ranks only as setTile() does. Throws nothing: an
+        // exception of a job makes the frame fail as in guard(), and no other job begins; with
+        // FrameConfig::allowPartial the frame goes on without that job's tile.
         template <class WorkerTile = Tile, class Job>
         void forEachTile(std::int64_t count, const Job& job)
         {
@@ -198,8 +199,8 @@ public:
                 fb_->executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
                     if (failed())
                         return;
-                    // Each thread keeps one, out of which it is taken, as a renderer that waits inside a job may be
-                    // given another job on the same thread.
+                    // Each thread keeps a tile for its next job. A job takes it out of there, because the thread may be
+                    // given another job while a renderer waits inside this one.
                     static thread_local std::unique_ptr<WorkerTile> spare;
                     std::unique_ptr<WorkerTile> tile = std::move(spare);
                     if (!tile)
@@ -342,8 +343,8 @@ public:
     const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
-    // bytes travel along a tree of the ranks. Collective, outside frames. Waits for all ranks. Throws OutOfMemory and
-    // TransportError.
+    // bytes travel along a tree of the ranks. Takes memory for several more images on every rank while it runs.
+    // Collective, outside frames. Waits and throws as allGather().
     Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(); }
 
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
@@ -390,7 +391,7 @@ public:
     }
 
     // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
-    // and aligned to 64 bytes. If there is no shared memory, or no more of it (1 GiB a rank), it is memory of this rank
+    // and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of this rank
     // alone, and pixels in it are sent. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
@@ -398,15 +399,17 @@ public:
 
     // Combines `values` element by element over all ranks, and returns the result on all. A sum that is too large wraps
     // around. For figures of your own, or to agree on whether all ranks could load their data. Collective, outside
-    // frames. Waits for all ranks. Throws InvalidArgument on every rank if the numbers of values differ, and
-    // TransportError.
+    // frames. Waits for all ranks, without a time-out: if one does not call it, the others wait until that rank
+    // destroys its framebuffer or is lost. Throws InvalidArgument on every rank if the numbers of values differ or a
+    // rank makes another collective call. Throws TransportError.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
     {
         return engine().allReduce(values, how);
     }
 
-    // Returns the bytes of each rank, by rank, on all ranks. Collective, outside frames. Waits for all ranks. Throws
-    // TransportError.
+    // Returns the bytes of each rank, by rank, on all ranks. The sizes may differ and may be 0; each rank needs memory
+    // for the bytes of all, several times. Collective, outside frames. Waits and throws as allReduce(); also throws
+    // std::bad_alloc on a rank that lacks memory.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
     {
         return engine().allGather(bytes);

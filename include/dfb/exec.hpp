@@ -36,7 +36,8 @@ public:
     // Whether tasks run by themselves. False: only threads in help() or parallelFor() run them.
     virtual bool hasWorkers() const noexcept { return true; }
 
-    // From any thread. The task must not throw. May throw std::bad_alloc.
+    // Queues a task, and does not wait for it. Any thread. The task must not throw, nor wait for other tasks. Throws
+    // std::bad_alloc.
     void submit(Task task)
     {
         {
@@ -46,8 +47,8 @@ public:
         wake();
     }
 
-    // Runs the oldest waiting task on the calling thread. For threads that wait themselves. Returns false if there is
-    // none.
+    // Runs the oldest waiting task on the calling thread, and returns when it has ended. For threads that wait
+    // themselves. Any thread. Returns false, at once, if no task waits.
     bool help()
     {
         Task task;
@@ -68,9 +69,9 @@ public:
         return !tasks_.empty();
     }
 
-    // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Waits until all have
-    // returned. In a task, the loop runs on the thread of that task. Rethrows the first exception of a body; after it
-    // no other body begins.
+    // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
+    // several at once. Waits until all have returned. In a task of a ThreadExecutor, the loop runs on the thread of
+    // that task. Rethrows the first exception of a body; after it no other body begins.
     void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
     {
         if (count == 0)
@@ -89,7 +90,7 @@ public:
                     error = std::current_exception();
                 stop.store(true, std::memory_order_relaxed);
             }
-            // Not within a task: tasks with loops would run in each other, as deep as there are many.
+            // Not within a task: tasks that have loops would nest without a limit.
             while (depth() == 0 && help()) {
             }
         };
@@ -120,7 +121,8 @@ private:
 class ThreadExecutor final : public Executor {
 public:
     // `threadCount` workers; 0: one for each processor that the calling thread may run on. Where several ranks share
-    // them, that is too many: see Connection::threadShare().
+    // them, that is too many: see Connection::threadShare(). Throws std::system_error if the system gives no more
+    // threads.
     explicit ThreadExecutor(int threadCount = 0)
     {
         if (threadCount <= 0)

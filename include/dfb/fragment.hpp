@@ -164,7 +164,8 @@ public:
         result.color = bytes_ ? decodeRow(result) : color_;
         return true;
     }
-    // Does so with bytes, for a fragment that keepsBytes(). Pixels in place are not checked: some may be empty.
+    // As next(result), but sets bytes in place of colours; only for a fragment that keepsBytes(). Pixels in place are
+    // not checked: some may be empty.
     bool nextBytes(ByteRow& result)
     {
         const int row = row_++;
@@ -193,7 +194,8 @@ public:
     }
     const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
 
-    // Finds the next row, and does not go there: skip(1) does. False if it has no pixels, or must be converted.
+    // Says where the next row of pixels in place is, without a step to it; skip(1) makes the step. Returns false if the
+    // row has no pixels, is not in place, or must be converted.
     bool findInPlace(detail::RowInPlace& row) const
     {
         detail::RowPlace first, ahead;

@@ -70,17 +70,16 @@ struct FrameBufferConfig {
     // Runs rendering and compositing on this rank. Null: a ThreadExecutor with Connection::threadShare() threads. A
     // CallerExecutor makes no threads. Ranks may give different ones.
     std::shared_ptr<Executor> executor{};
-    // Called on the display rank for each tile that is composited, when its pixels are in the image of the open frame.
-    // With the operations of the library these are the tiles that have an active pixel.
-    // onTile(tile index, its pixels, image). For windows that show a frame as it comes. Called by worker threads, the
-    // progress thread or a thread in end(), for several tiles at once, while other pixels of the image are written. It
-    // must be quick. An exception makes the frame fail. Tiles of ranks on the display rank's node may all come at the
-    // end.
+    // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
+    // for each composited tile, when its pixels are in the image of the open frame; with the operations of the library,
+    // for each tile that has an active pixel. Worker threads, the progress thread or a thread in end() call it, for
+    // several tiles at once, while other pixels of the image are written. It must be quick. An exception makes the
+    // frame fail. For tiles of ranks on the display rank's node all calls may come at the end.
     TileCallback onTile{};
-    // After this time in end(), ranks check whether anything is still under way; then again, less and less often. If
-    // nothing is, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs
-    // a few messages in each slow frame. An OrderedLoop waits as long for word of a tile that may be hidden, then
-    // renders it. Ranks may give different ones.
+    // After this time in end(), ranks check whether a message is still under way; they check again at growing
+    // intervals. If none is, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs a few
+    // messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message that
+    // says so, then renders the tile. Ranks may give different times.
     std::chrono::milliseconds quiet{2000};
     // Is told what this rank does for its frames, and when: see trace.hpp. Null: nobody is, which costs nothing. Ranks
     // may give different ones.

@@ -72,8 +72,8 @@ struct InputImage {
 };
 
 // One object per rank. Construction, destruction, resize(), composite(), end(), imageOnAllRanks() and allGather() are
-// collective. One thread at a time may call members;
-// they work on all threads of config.executor.
+// collective. One thread at a time may call members; they work on all threads of config.executor. Members that are not
+// collective wait for no other rank, except start() for room.
 class ImageCompositor {
 public:
     // Makes a compositor on a connection. config.image: the picture of the display rank. config.framesInFlight becomes
@@ -131,6 +131,7 @@ public:
     void startFailed(const std::exception_ptr& why, const FrameConfig& frame = {});
 
     // Whether end() would return without waiting; see DistributedFrameBuffer::Frame::isDone(). False without start().
+    // Moves messages if no thread does. Waits for nothing. Throws InvalidArgument on a thread that may not call MPI.
     bool isDone()
     {
         if (isOpen_)
@@ -147,18 +148,20 @@ public:
     // and after one that failed. Pixels that no image has show FrameConfig::background, at a depth of +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
-    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Waits
-    // for all ranks. Throws OutOfMemory, TransportError.
+    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Takes
+    // memory for several more images on every rank while it runs. Waits for all ranks, without a time-out. Throws
+    // InvalidArgument on all ranks if one makes another collective call; TransportError; and std::bad_alloc on a rank
+    // that lacks memory.
     Image imageOnAllRanks() { return engine_->imageOnAllRanks(); }
 
     // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
-    // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (1 GiB a rank), it is memory of
+    // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of
     // this rank alone, which is as good for all but speed. After a TransportError do not write to it until the
     // compositor is gone. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
-    // Returns the bytes of each rank, by rank, on all ranks. Collective, while no picture is open. Waits for all ranks.
-    // Throws TransportError.
+    // Returns the bytes of each rank, by rank, on all ranks. The sizes may differ and may be 0. Collective, while no
+    // picture is open. Waits and throws as imageOnAllRanks().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
     {
         return engine_->allGather(bytes);

@@ -24,6 +24,7 @@ public:
         arena_.initialize();
     }
 
+    // Waits until all submitted tasks have run. No loop may be under way.
     ~TbbExecutor() override
     {
         while (enqueued_ > 0)

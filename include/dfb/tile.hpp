@@ -157,7 +157,8 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
     static constexpr bool hasDepth = (Channels & depthChannel) != 0;
     using detail::TilePlanes<Channels, Size * Size>::color;
 
-    // All pixels: nothing here (all 0, depth +infinity, no id). Channels that are not in `which` are left as they are.
+    // Makes all pixels empty: all channels 0, but depth +infinity, farDepth -infinity, and ids noId. Of the channels
+    // beside colour only those in `which` are written. Throws nothing.
     void clear(ChannelMask which = Channels)
     {
         this->forEachPlane(*this, [which](detail::Channel channel, auto& values) {

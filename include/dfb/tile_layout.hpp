@@ -122,7 +122,8 @@ struct WallLayout {
     int height() const noexcept { return rows * displayHeight + (rows - 1) * bezelY; }
     int displayCount() const noexcept { return columns * rows; }
 
-    // The part of the framebuffer that a display shows.
+    // The part of the framebuffer that a display shows, in pixels. `display`: 0 to displayCount() - 1; nobody checks
+    // it.
     Region region(int display) const noexcept
     {
         const int x0 = display % columns * (displayWidth + bezelX), y0 = display / columns * (displayHeight + bezelY);

@@ -88,7 +88,8 @@ struct AuxRow {
     const std::uint32_t* instanceId = nullptr;
 };
 
-// Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way.
+// Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way. Only within
+// TileOp::finish(), on its thread. Nobody checks that rows, columns and counts are within the region.
 class FinishedTile {
 public:
     // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
@@ -251,7 +252,8 @@ private:
 // Holds 32 bytes for each pixel and pass.
 class PassImages {
 public:
-    // Begins a frame: all pixels of all passes are empty. Call it in TileOp::newFrame().
+    // Begins a frame: all pixels of all passes are empty. Call it in TileOp::newFrame(). Throws std::bad_alloc. No
+    // member checks pixel numbers, passes or positions.
     void newFrame(const TileInfo& info)
     {
         width_ = info.region.width();

@@ -14,6 +14,7 @@
 #include <cstdint>
 #include <cstdlib>
 #include <cstring>
+#include <exception>
 #include <fstream>
 #include <map>
 #include <mutex>
@@ -155,7 +156,7 @@ private:
                 out << printed(",\n{\"ph\": \"M\", \"name\": \"thread_name\", \"pid\": %d, \"tid\": %d, \"args\": "
                                "{\"name\": \"%s %d\"}}",
                                pid, row, isThread ? "thread" : "frames", isThread ? r.thread : row);
-            // Programs add both times up: rounding must not make what ends overlap what begins then.
+            // Viewers add duration to begin: by rounding, a span must not overlap one that begins when it ends.
             const bool isPart = e.kind != TraceEvent::Kind::Frame && e.end > e.begin;
             const Duration lasts = e.end - e.begin - std::chrono::nanoseconds(isPart ? 1 : 0);
             out << ",\n{\"ph\": \"X\", \"name\": \"" << nameOf(e) << '"' << place(rank, row, e.begin)
@@ -247,9 +248,10 @@ public:
         ++dropped_;
     }
 
-    // Writes the file on rank 0, and forgets the events. Collective, outside frames; waits for all ranks. `fb`: one of
-    // the framebuffers, or an ImageCompositor. Each rank gets the events of all, and needs memory for them. Throws
-    // InvalidArgument on all ranks if the file cannot be written, and TransportError.
+    // Writes the file on rank 0, and forgets the events, also if that fails. Collective, outside frames, on the thread
+    // that begins frames; waits for all ranks, without a time-out. `fb`: one of the framebuffers, or an
+    // ImageCompositor. Each rank gets the events of all, and needs memory for them. Throws InvalidArgument on all ranks
+    // if the file cannot be written; TransportError; and std::bad_alloc on a rank that lacks memory.
     template <class FrameBuffer>
     void write(FrameBuffer& fb, const std::string& path)
     {
@@ -264,8 +266,13 @@ public:
         std::vector<std::byte> failed;
         if (fb.rank() == 0) {
             std::ofstream file(path);
-            writeAll(file, parts);
-            if (!file.flush())
+            try {
+                writeAll(file, parts);
+                file.flush();
+            } catch (const std::exception&) { // the others wait for our answer
+                file.setstate(std::ios::badbit);
+            }
+            if (!file)
                 failed.emplace_back();
         }
         if (!fb.allGather(failed).front().empty())

@@ -52,7 +52,7 @@ public:
 
     bool isWorthwhile(int rank) const { return peers_[static_cast<std::size_t>(rank)].pause == 0; }
 
-    // A message to that rank had `raw` bytes, and has `sent` after the codec had a go at it.
+    // Notes a message to that rank: it has `raw` bytes without the codec, and is sent as `sent` bytes.
     void add(int rank, std::size_t raw, std::size_t sent)
     {
         Peer& peer = peers_[static_cast<std::size_t>(rank)];

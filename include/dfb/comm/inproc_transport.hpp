@@ -98,6 +98,8 @@ private:
     int rank_;
 };
 
+// The transport between the ranks of runRanks(). Its members are those of the contract in transport.hpp. All ranks make
+// their transports in the same order. A message is delivered by send(), on the thread that calls it.
 class InprocTransport {
 public:
     using Communicator = InprocCommunicator;
@@ -170,8 +172,10 @@ private:
 static_assert(is_transport_v<InprocTransport>);
 DFB_COMPILED_TEMPLATE(std::shared_ptr<Connection> connect<InprocTransport>(const InprocCommunicator&, NetworkConfig));
 
-// Calls `body(communicator)` on `rankCount` threads, one per rank, and waits for all. If a body throws, the ranks that
-// wait for it get a TransportError, and the first exception is rethrown.
+// Calls `body(communicator)` on `rankCount` new threads, one for each rank. Any thread may call it. Waits until all
+// have returned. If a body throws, the ranks that wait for it get a TransportError, and the first exception is rethrown
+// here. Throws InvalidArgument for less than 1 rank. Throws std::system_error if the system gives no more threads; the
+// ranks that have begun then get a TransportError.
 inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)>& body)
 {
     if (rankCount < 1)

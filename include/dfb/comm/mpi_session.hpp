@@ -21,6 +21,8 @@
 
 DFB_NAMESPACE_BEGIN
 
+// One object in a process. Make it before the framebuffers, compositors and walls, so that it is destroyed after them.
+// The constructor's thread is the one that may call MPI below MPI_THREAD_SERIALIZED (see Progress).
 class MpiSession {
 public:
     // Initialises MPI at this thread level or a higher one; without `level` at the highest that it has. With
@@ -41,6 +43,7 @@ public:
     // ever. The destructor then waits for nobody, and when the process exits, it aborts the job with code 1.
     void giveUp() noexcept { isGivenUp_ = true; }
 
+    // Of MPI_COMM_WORLD. Any thread. They wait for nothing.
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     int level() const noexcept { return level_; } // that MPI was initialised at

@@ -114,7 +114,7 @@ public:
     };
 
     // The most that one process has. Only used pages take memory.
-    static constexpr std::size_t capacity = std::size_t{1} << 30;
+    static constexpr auto capacity = static_cast<std::size_t>(std::uint64_t{1} << 32); // 0 where it has 32 bits
     static constexpr std::size_t alignment = 64;
 
     // Null if the system has none.

@@ -108,8 +108,8 @@ private:
         return static_cast<std::size_t>(info_.region.width()) * static_cast<std::size_t>(info_.region.height());
     }
 
-    // The largest mean of M2 over the pixels of a block. A value that is not a number counts for its pixel alone: it
-    // would have the tile rendered for ever.
+    // The largest mean of M2 over the pixels of a block. Values that are not finite count as 0: with them, the tile
+    // would get samples for ever.
     double worstBlock() const
     {
         constexpr int side = 8;

@@ -276,7 +276,8 @@ public:
                                  fragment.header().children);
         const int generation = fragment.header().generation;
         const bool hides = opaqueHides(this->store_.info());
-        // Else the tracker says so in the end; here the tile may not wait for that.
+        // Where no input hides others, the dependency tracker reports this at the end; here the tile may be finished
+        // before.
         if (hides && std::find(generations_.begin(), generations_.end(), generation) != generations_.end())
             detail::failArgument("inputs in order form a list: there cannot be two of generation %d", generation);
         generations_.push_back(generation);

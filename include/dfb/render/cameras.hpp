@@ -80,7 +80,7 @@ public:
         return {toFloat(meetingPoint(column, row, nearPlane())), toFloat(direction)};
     }
 
-    // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
+    // Returns what the box may cover: the whole image if it reaches behind the eye, nothing if all of it is behind.
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const Plane& w = rows_[3];
@@ -231,8 +231,9 @@ public:
 
     std::optional<Vec3> commonEye() const { return toFloat(pose_.eye); }
 
-    // Around the sphere that holds the box. Angles along a radius come out to scale; across, angles at theta off the
-    // view are stretched by theta / sin(theta).
+    // Returns the image of a sphere around the box, widened to an octagon; the whole image if the eye is in the sphere
+    // or the box is near the point behind the eye; nothing if the box is outside the dome. Distances along a radius of
+    // the image are true to angles; across, at theta off the view, they are stretched by theta / sin(theta).
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const Vec3d lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
@@ -285,8 +286,9 @@ public:
         return {toFloat(pose.eye), toFloat(normalize(pose.through(x, y, width, height)))};
     }
 
-    // One per part of the time. That the camera turns is as if the world turned the other way: a point at distance rho
-    // of the axis is never farther than rho times half the part's angle from where it is in the middle of the part.
+    // Returns a footprint for each part of the time that the shutter is open. A turn of the camera moves the image as a
+    // turn of the world the other way does. So a point at distance rho from the axis is never farther than rho times
+    // half the part's angle from its place in the middle of that part.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {
         double rho = 0;

@@ -36,7 +36,8 @@ struct Segment {
 // largest c' / a'.
 class DeepTile {
 public:
-    explicit DeepTile(int maxSegments) : maxSegments_(std::max(1, maxSegments)) {}
+    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. For one thread at a time.
+    explicit DeepTile(int maxSegments) : maxSegments_(std::clamp(maxSegments, 1, 65535)) {}
 
     int maxSegments() const noexcept { return maxSegments_; }
 
@@ -86,7 +87,8 @@ public:
     // How much merging may have changed a pixel, at most; see above.
     double errorBound() const noexcept { return errorBound_; }
 
-    // Writes segment `layer` of each pixel, counted from the front, into a cleared tile of the same region.
+    // Writes segment `layer` of each pixel, counted from 0 at the front, into a cleared tile of the same region; pixels
+    // with fewer segments stay empty. Nobody checks that `layer` is 0 or more and that the regions are equal.
     template <class TileType>
     void writeLayer(int layer, TileType& tile) const
     {
@@ -162,11 +164,14 @@ template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
-// As DataParallelLoop, with bricks that may overlap: their bounds enclose their data.
+// As DataParallelLoop, with bricks that may overlap: their bounds enclose their data. The operation of the framebuffer
+// is DeepBlend, or another with depth and farChannel. Framebuffer and world must outlive it. One thread at a time may
+// use it.
 template <class FrameBuffer>
 class DeepParallelLoop {
 public:
-    // Each pixel of a brick keeps `maxSegments` at most. Throws InvalidArgument if they are not 1 to 65535.
+    // Each pixel of a brick keeps `maxSegments` at most. Not collective. Waits for nothing. Throws InvalidArgument if
+    // they are not 1 to 65535.
     DeepParallelLoop(FrameBuffer& fb, const World& world, int maxSegments)
         : fb_(fb), world_(world), maxSegments_(maxSegments)
     {

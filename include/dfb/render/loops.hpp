@@ -99,8 +99,9 @@ enum class WorkDistribution : std::uint8_t {
 
 namespace detail {
 
-// The multiples of it, modulo `count`, are all numbers below that, and any few in a row are spread evenly: neighbours
-// in an image cost alike, so who gets some of these gets a fair share.
+// Returns a stride whose multiples, modulo `count`, are all numbers below `count`. Consecutive multiples are spread
+// evenly over the image. Neighbours in an image cost alike, so a rank that gets some consecutive ones gets a fair
+// share.
 inline std::int64_t scatteringStride(std::int64_t count)
 {
     auto stride = static_cast<std::int64_t>(0.6180339887498949 * static_cast<double>(count)); // the golden section
@@ -117,7 +118,7 @@ inline std::int64_t scatteringStride(std::int64_t count)
 template <class FrameBuffer>
 class ImageParallelLoop {
 public:
-    // The distribution must be the same on all ranks.
+    // The distribution must be the same on all ranks; nobody checks it. Not collective. Waits for nothing.
     explicit ImageParallelLoop(FrameBuffer& fb, WorkDistribution distribution = WorkDistribution::Owned)
         : fb_(fb), distribution_(distribution)
     {

@@ -46,7 +46,8 @@ struct RoundRobinBricks {
 // The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
-    // Call it on all ranks, between frames.
+    // Takes the costs of the frame of this report, and forgets all others. Call it on all ranks, between frames. Sends
+    // nothing and waits for nothing.
     void update(const FrameReport& report)
     {
         costs_.clear();
@@ -60,6 +61,7 @@ public:
         return std::uint64_t{brickId} << 32 | static_cast<std::uint32_t>(tile);
     }
 
+    // Called by the loop, once a frame: see the top of this file.
     void plan(const SharedWorld& world, const std::vector<BrickInTile>& pairs, const std::vector<int>& passes)
     {
         struct Job {
@@ -203,7 +205,7 @@ struct OrderedWork : MixedWork {
     std::vector<int> place;             // of each brick, from the front
     std::vector<int> firstPair;         // of each tile, or -1
     std::vector<int> empty;             // tiles of this rank
-    std::atomic<bool> anyHidden{false}; // in the last frame: of this rank's inputs, or by one
+    std::atomic<bool> anyHidden{false}; // in the last frame an input of this rank was hidden, or hid others
     std::vector<std::atomic<int>>
         hider;                  // of each tile: the brick of this rank that hid others in the last frame, or -1
     std::vector<int> announced; // of each tile: the brick that may hide others in this frame, or -1

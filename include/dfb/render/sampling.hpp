@@ -14,8 +14,9 @@
 
 DFB_NAMESPACE_BEGIN
 
-// For FrameConfig::samples: only the tiles that meet `region` are rendered, with `passes` samples a pixel; the image
-// keeps the others. Throws InvalidArgument for less than 1 pass.
+// For FrameConfig::samples: only the tiles that meet `region` (pixels of the image) are rendered, with `passes` samples
+// a pixel; the image keeps the others. All ranks must give the same arguments. Any thread. Waits for nothing. Throws
+// InvalidArgument for less than 1 pass.
 inline SamplePlan samplesIn(const TileLayout& layout, const Region& region, int passes = 1)
 {
     if (passes < 1)
@@ -43,16 +44,18 @@ struct SamplingConfig {
 //   while (!sampler.done())
 //       sampler.update(loop.render(renderTile, sampler.next()));
 //
-// Call reset() after a frame that throws FrameError: the accumulated samples are lost.
+// Call reset() after a frame that throws FrameError: the accumulated samples are lost. One thread at a time may use it.
+// Its members send nothing and wait for nothing.
 class AdaptiveSampler {
 public:
-    // Throws InvalidArgument for a configuration that cannot be.
+    // Throws InvalidArgument unless firstSamples is 2 or more, maxSamples at least firstSamples, frameSamples 1 or
+    // more, and maxError 0 or more.
     AdaptiveSampler(const TileLayout& layout, const SamplingConfig& config) : layout_(layout), config_(config)
     {
         if (config.firstSamples < 2 || config.maxSamples < config.firstSamples || config.frameSamples < 1
             || !(config.maxError >= 0))
-            detail::failArgument(
-                "sampling goes from 2 first samples or more up to as many at least, in frames of 1 or more");
+            detail::failArgument("SamplingConfig: firstSamples must be 2 or more, maxSamples at least firstSamples, "
+                                 "frameSamples 1 or more, and maxError 0 or more");
         reset();
     }
 

@@ -182,9 +182,9 @@ private:
 
 } // namespace detail
 
-// Returns the bricks front to back as seen from `eye`, by their place in SharedWorld::bricks(). Takes time with the
-// square of their number. Any thread. Waits for nothing. Throws InvalidArgument if two overlap,
-// or if there is no such order: three boxes can each be in front of the next.
+// Returns the bricks front to back as seen from `eye`, by their place in SharedWorld::bricks(). The time grows with the
+// square of their number. Not collective. Any thread. Waits for nothing. Throws InvalidArgument if two overlap, or if
+// there is no such order: three boxes can each be in front of the next.
 inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& eye)
 {
     detail::FrontToBack bricks;

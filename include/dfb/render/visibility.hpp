@@ -293,7 +293,7 @@ public:
         return {eye(), direction(x, y, width, height)};
     }
 
-    // Of a box that reaches behind the eye: the whole image; of one that is behind it altogether: nothing.
+    // Returns what the box may cover: the whole image if it reaches behind the eye, nothing if all of it is behind.
     Footprint project(const Box3& bounds, int width, int height) const
     {
         return detail::projectBox(bounds, pose_, width, height);
@@ -350,8 +350,8 @@ const auto& brickOf(const AnyWorld& world, const BrickInTile& pair)
 } // namespace detail
 
 // Returns the pairs of a brick and a tile that it may project to, by tile, then by brick. `world`: a World or a
-// SharedWorld. Any thread. Waits for nothing. Throws what camera.project() throws.
-// The result has the memory of `memory`.
+// SharedWorld. Any thread. Waits for nothing. Throws what camera.project() throws. Uses the memory of `memory` for the
+// result.
 template <class AnyWorld, class Camera>
 std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camera, const TileLayout& layout,
                                       std::vector<BrickInTile> memory = {})
@@ -370,8 +370,8 @@ std::vector<BrickInTile> visibleTiles(const AnyWorld& world, const Camera& camer
     return memory;
 }
 
-// Returns the inputs that a rank declares if it renders these pairs; the source is the brick's id. The result has the
-// memory of `memory`.
+// Returns the inputs that a rank declares if it renders these pairs, which must be of this world: nobody checks it. The
+// source is the brick's id. Any thread. Waits for nothing. Uses the memory of `memory` for the result.
 inline std::vector<TileInput> inputsOf(const World& world, const std::vector<BrickInTile>& pairs,
                                        std::vector<TileInput> memory = {})
 {

@@ -1,0 +1,25 @@
+#include "catch.hpp"
+
+#include <dfb/render/deep_parallel.hpp>
+
+#include <memory>
+
+TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
+{
+    CHECK(dfb::DeepTile(0).maxSegments() == 1);
+    CHECK(dfb::DeepTile(65536).maxSegments() == 65535);
+
+    dfb::DeepTile deep(65536);
+    dfb::TileHeader header;
+    header.region = {0, 0, 1, 1};
+    deep.reset(header);
+    for (int i = 0; i < 65536; ++i) {
+        const auto from = static_cast<float>(i);
+        deep.add(0, 0, {{0.1f, 0, 0, 0.1f}, from, from + 0.5f});
+    }
+    CHECK(deep.layers() == 65535);
+    auto front = std::make_unique<dfb::Tile<dfb::allChannels, 1>>();
+    front->clear();
+    deep.writeLayer(0, *front);
+    CHECK(front->depth[0] == 0);
+}
