@@ -18,7 +18,7 @@ TEST_CASE("A deep tile keeps 1 to 65535 segments a pixel")
         deep.add(0, 0, {{0.1f, 0, 0, 0.1f}, from, from + 0.5f});
     }
     CHECK(deep.layers() == 65535);
-    auto front = std::make_unique<dfb::Tile<dfb::allChannels, 1>>();
+    auto front = std::make_unique<dfb::Tile<dfb::allChannels, 8>>();
     front->clear();
     deep.writeLayer(0, *front);
     CHECK(front->depth[0] == 0);
