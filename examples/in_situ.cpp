@@ -11,7 +11,6 @@
 #include <algorithm>
 #include <charconv>
 #include <chrono>
-#include <cinttypes>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -450,6 +449,19 @@ private:
     std::int64_t stepsTaken_ = 0;
 };
 
+// Returns whether the image could be written, on all ranks. Collective.
+bool write(FrameBuffer& fb, const std::string& name)
+{
+    bool isWritten = true;
+    try {
+        if (fb.isDisplayRank())
+            dfb::writePpm(name, fb.image());
+    } catch (const std::runtime_error&) {
+        isWritten = false;
+    }
+    return fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 1; // the others cannot see it
+}
+
 // Returns what went wrong, on all ranks; rank 0 has the best words for it.
 std::string run(MPI_Comm comm, const Options& options)
 {
@@ -468,7 +480,11 @@ std::string run(MPI_Comm comm, const Options& options)
 
     dfb::World world; // what there is to be seen of this rank's slabs
     dfb::DataParallelLoop loop(fb, world);
-    const auto render = [&](const Sight& sight, int step) {
+    const auto render = [&](int step) {
+        const example::LiveWishes& wishes = viewers.wishes();
+        if (viewers.isLive() && (wishes.width != fb.layout().width() || wishes.height != fb.layout().height()))
+            fb.resize(wishes.width, wishes.height);
+        const Sight sight = viewers.isLive() ? wished(n, wishes.camera) : orbit(n, step);
         simulation.prepareRendering();
         world = {};
         for (int slab = begin; slab < end; ++slab) {
@@ -483,18 +499,11 @@ std::string run(MPI_Comm comm, const Options& options)
         };
         viewers.show(loop.render(sight.camera, renderBrick, params), step);
     };
-    const auto renderAsWished = [&](int step) {
-        const example::LiveWishes& wishes = viewers.wishes();
-        if (wishes.width != fb.layout().width() || wishes.height != fb.layout().height())
-            fb.resize(wishes.width, wishes.height);
-        render(wished(n, wishes.camera), step);
-    };
 
     double simulationTime = 0, renderingTime = 0;
     int frames = 0, step = 0;
-    std::string name;
     while (options.steps == 0 || step < options.steps) {
-        if (!viewers.mayGoOn(step % options.every != 0, [&] { renderAsWished(step); }))
+        if (!viewers.mayGoOn(step % options.every != 0, [&] { render(step); }))
             break;
         ++step;
         const double started = MPI_Wtime();
@@ -504,40 +513,23 @@ std::string run(MPI_Comm comm, const Options& options)
         if (step % options.every != 0)
             continue;
 
-        if (viewers.isLive())
-            renderAsWished(step);
-        else
-            render(orbit(n, step), step);
-        bool isWritten = true;
+        render(step);
         if (!options.out.empty()) {
             char number[16];
             std::snprintf(number, sizeof number, "_%04d.ppm", frames);
-            name = options.out + number;
-            try {
-                if (fb.isDisplayRank())
-                    dfb::writePpm(name, fb.image());
-            } catch (const std::runtime_error&) {
-                isWritten = false;
-            }
+            if (const std::string name = options.out + number; !write(fb, name))
+                return name + " cannot be written";
         }
         ++frames;
-        if (fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 0) // the others cannot see it
-            return name + " cannot be written";
         renderingTime += MPI_Wtime() - advanced;
     }
 
     const auto longest =
         fb.allReduce({std::int64_t(1e6 * simulationTime), std::int64_t(1e6 * renderingTime)}, FrameBuffer::Reduce::Max);
     const double simulated = 1e-6 * double(longest[0]), rendered = 1e-6 * double(longest[1]);
-    if (fb.isDisplayRank()) {
+    if (fb.isDisplayRank())
         std::printf("%d ranks: %d steps of %d^3 voxels in %.3f s, %d pictures in %.3f s, %.1f %% of the run\n", ranks,
                     step, n, simulated, frames, rendered, 100 * rendered / (simulated + rendered));
-        std::uint64_t hash = 14695981039346656037u; // FNV-1a
-        for (std::size_t i = 0; i < 4 * fb.image().pixelCount(); ++i)
-            hash = (hash ^ fb.image().rgba8()[i]) * 1099511628211u;
-        if (!name.empty())
-            std::printf("%s: hash %016" PRIx64 "\n", name.c_str(), hash);
-    }
     return {};
 }
 

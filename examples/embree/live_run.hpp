@@ -115,7 +115,8 @@ private:
         LiveWishes home;
         home.camera.azimuth = static_cast<double>(o_.view.azimuth);
         home.camera.elevation = static_cast<double>(o_.view.elevation);
-        home.camera.distance = static_cast<double>(o_.view.distance.value_or(0));
+        if (o_.view.distance) // as near and as far as viewers can go; 0 would show all of the scene
+            home.camera.distance = std::clamp(static_cast<double>(*o_.view.distance), 1e-4, 1000.0);
         home.camera.target = list(o_.view.target.value_or(scene_->info.focus.box.center()));
         home.width = o_.width;
         home.height = o_.height;

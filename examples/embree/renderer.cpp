@@ -48,7 +48,7 @@ std::size_t mostHits(const RenderSettings& settings, float opacity)
 {
     if (settings.pathBounces > 0)
         return 1;
-    double through = 1; // reckoned as in Accumulator
+    double through = 1; // reckoned as in Ray
     for (std::size_t hits = 1; hits <= 100; ++hits) {
         through *= 1 - static_cast<double>(opacity);
         if (through <= 0 || through < static_cast<double>(settings.earlyTermination))
@@ -76,11 +76,9 @@ Vec3 cosineDirection(const Vec3& normal, std::uint64_t key, int index)
 
 Vec3 product(const Vec3& a, const Vec3& b) { return {a.x * b.x, a.y * b.y, a.z * b.z}; }
 
-// The distances at which a ray enters and leaves a box; false if it misses.
+// Narrows a piece of a ray, from `enter` to `leave`, to what is in a box; false if that is nothing.
 bool clip(const Box& box, const Vec3& origin, const Vec3& inverse, float& enter, float& leave)
 {
-    enter = 0;
-    leave = std::numeric_limits<float>::max();
     for (int i = 0; i < 3; ++i) {
         const float from = component(origin, i), steps = component(inverse, i);
         const float a = (component(box.lo, i) - from) * steps, b = (component(box.hi, i) - from) * steps;
@@ -94,32 +92,30 @@ bool clip(const Box& box, const Vec3& origin, const Vec3& inverse, float& enter,
 
 } // namespace
 
-// The colour gathered along a ray so far.
-struct Renderer::Accumulator {
+// A ray, and the colour gathered along it so far.
+struct Renderer::Ray {
+    Vec3 origin, direction;
+    std::uint64_t key = 0; // see RaySample
     double r = 0, g = 0, b = 0, alpha = 0, through = 1;
     float depth = std::numeric_limits<float>::infinity(), farDepth = -std::numeric_limits<float>::infinity();
-    Vec3 normal, albedo; // premultiplied
+    Vec3 normal{}, albedo{}; // premultiplied
     std::uint32_t primitive = dfb::noId, instance = dfb::noId;
     std::int64_t cost = 0;
 
-    void add(float t, float red, float green, float blue, float opacity)
+    // `opacity`: above 0. The colour is premultiplied.
+    void add(float t, const Vec3& color, float opacity)
     {
-        if (!(opacity > 0))
-            return;
         if (alpha == 0)
             depth = t;
         farDepth = t;
-        r += through * static_cast<double>(red);
-        g += through * static_cast<double>(green);
-        b += through * static_cast<double>(blue);
+        r += through * static_cast<double>(color.x);
+        g += through * static_cast<double>(color.y);
+        b += through * static_cast<double>(color.z);
         alpha += through * static_cast<double>(opacity);
         through *= 1 - static_cast<double>(opacity);
     }
-    // To be called before add().
-    void addSurface(const Hit& hit, float opacity)
+    void add(const Hit& hit, const Vec3& color, float opacity)
     {
-        if (!(opacity > 0))
-            return;
         const float weight = static_cast<float>(through) * opacity;
         normal = normal + hit.normal * weight;
         albedo = albedo + hit.color * weight;
@@ -127,6 +123,7 @@ struct Renderer::Accumulator {
             primitive = hit.primitive;
             instance = hit.geometry;
         }
+        add(hit.t, color, opacity);
     }
 };
 
@@ -143,6 +140,13 @@ struct Renderer::VolumeRay {
     Vec3 inverseStep;
     int valueOf = -1; // the sample whose value is known
     float value = 0;
+};
+
+// What the rays of a tile share: the light, and memory.
+struct Renderer::Tools {
+    Light light;
+    std::vector<Hit> hits, scratch;
+    std::vector<VolumeRay> volumes;
 };
 
 Renderer::Renderer(Brick brick, const SceneInfo& scene, const RenderSettings& settings)
@@ -167,9 +171,8 @@ std::int64_t Renderer::render(const Target& to, int frameIndex) const
     const FlushDenormals flush;
     const FrameCamera camera = frameCamera(scene_, settings_, frameIndex);
     const dfb::PerspectiveCamera& view = camera.pinhole();
-    const Light light{unit(view.forward() * -0.75f + view.up() * 0.55f + view.right() * -0.40f)};
-    std::vector<Hit> hits, scratch;
-    std::vector<VolumeRay> rays(volumes_.size());
+    Tools tools{{unit(view.forward() * -0.75f + view.up() * 0.55f + view.right() * -0.40f)}, {}, {}, {}};
+    tools.volumes.resize(volumes_.size());
     std::int64_t cost = 0;
     for (int y = to.region.y0; y < to.region.y1; ++y)
         for (int x = to.region.x0; x < to.region.x1; ++x) {
@@ -177,7 +180,8 @@ std::int64_t Renderer::render(const Target& to, int frameIndex) const
             const auto [origin, direction] = camera.ray(sample.x, sample.y, sample.lens);
             if (!(dot(direction, direction) > 0))
                 continue;
-            const Accumulator sum = trace(origin, direction, light, sample.key, hits, scratch, rays);
+            Ray sum{origin, direction, sample.key};
+            trace(sum, tools);
             cost += sum.cost;
             if (sum.alpha == 0)
                 continue;
@@ -249,13 +253,6 @@ float Renderer::openness(const Hit& hit, const Vec3& point, const Vec3& directio
     return static_cast<float>(open) / static_cast<float>(settings_.aoRays);
 }
 
-// Also of what is beyond the cell, as far as shadows are cast.
-bool Renderer::isInShadow(const Vec3& point, const Light& light) const
-{
-    const float reach = ghostReach(scene_, settings_);
-    return surfaces_.occluded(point, light.direction, 1e-3f * reach, reach);
-}
-
 // Diffuse light from a bright sky, over the bounces of one path that begins at a hit. Volumes are left out.
 Vec3 Renderer::pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits,
                          std::int64_t& cost) const
@@ -279,119 +276,120 @@ Vec3 Renderer::pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key,
     return Vec3{0, 0, 0};
 }
 
-Renderer::Accumulator Renderer::trace(const Vec3& origin, const Vec3& direction, const Light& light, std::uint64_t key,
-                                      std::vector<Hit>& hits, std::vector<Hit>& scratch,
-                                      std::vector<VolumeRay>& rays) const
+void Renderer::trace(Ray& ray, Tools& tools) const
 {
-    Accumulator sum;
+    const Vec3 &origin = ray.origin, &direction = ray.direction;
     const Vec3 inverse{1 / direction.x, 1 / direction.y, 1 / direction.z};
-    float enter = 0, leave = 0;
+    float enter = 0, leave = std::numeric_limits<float>::max();
     // Wider than the cell by more than rounding: it is the points that decide.
     const Box reach = cell_.padded(1e-5f * (scene_.bounds.largestExtent() + length(origin)));
     if (!clip(reach, origin, inverse, enter, leave))
-        return sum;
-    sum.cost = 1;
+        return;
+    ray.cost = 1;
+    std::vector<Hit>& hits = tools.hits;
     surfaces_.intersect(origin, direction, hits, mostHits_);
     if (hits.size() == mostHits_)
         leave = std::min(leave, hits.back().t);
     if (looksAhead_ && !hits.empty()) {
-        ++sum.cost;
-        if (surfaces_.blocks(origin, direction, enter, mostHits_, scratch))
-            return sum;
+        ++ray.cost;
+        if (surfaces_.blocks(origin, direction, enter, mostHits_, tools.scratch))
+            return;
     }
     if (settings_.pathBounces > 0) {
         if (hits.empty())
-            return sum;
+            return;
         const Hit first = hits.front();
-        const Vec3 c = pathLight(first, pointAt(origin, direction, first.t), direction, key, hits, sum.cost);
-        sum.addSurface(first, 1);
-        sum.add(first.t, c.x, c.y, c.z, 1);
-        return sum;
+        ray.add(first, pathLight(first, pointAt(origin, direction, first.t), direction, ray.key, hits, ray.cost), 1);
+        return;
     }
-    const int none = std::numeric_limits<int>::max();
     for (std::size_t i = 0; i < volumes_.size(); ++i) {
-        float first = 0, last = 0;
-        const Box box = volumes_[i].bounds().padded(2 * scene_.step);
-        rays[i] = {none, none, {}, -1, 0};
-        if (!clip(box, origin, inverse, first, last))
+        float first = enter, last = leave;
+        tools.volumes[i] = {};
+        if (!clip(volumes_[i].bounds().padded(2 * scene_.step), origin, inverse, first, last))
             continue;
-        first = std::max(first, enter);
-        last = std::min(last, leave);
-        if (first > last)
-            continue;
-        rays[i].next = std::max(1, static_cast<int>(first / scene_.step) - 1);
-        rays[i].end = static_cast<int>(last / scene_.step) + 2;
-        rays[i].inverseStep = volumes_[i].inverseAdvance(direction, scene_.step);
+        tools.volumes[i].next = std::max(1, static_cast<int>(first / scene_.step) - 1);
+        tools.volumes[i].end = static_cast<int>(last / scene_.step) + 2;
+        tools.volumes[i].inverseStep = volumes_[i].inverseAdvance(direction, scene_.step);
     }
+    march(ray, tools);
+}
 
-    auto hit = hits.begin();
+// Adds what hits and volumes show, front to back.
+void Renderer::march(Ray& ray, Tools& tools) const
+{
+    auto hit = tools.hits.cbegin();
     const double least = static_cast<double>(settings_.earlyTermination);
-    const auto isDone = [&] { return sum.through <= 0 || sum.through < least; };
-    const bool isAlone = surfaces_.empty(); // isosurfaces neither cast shadows nor hide the sky
-    const auto addHit = [&](const Hit& surface) {
-        const float opacity = surface.opacity.value_or(settings_.opacity);
-        const Vec3 point = pointAt(origin, direction, surface.t);
-        const bool inShadow = settings_.shadows && !isAlone && opacity > 0 && isInShadow(point, light);
-        Vec3 c = (inShadow ? surface.color * light.ambient : light.shade(surface.color, surface.normal, direction))
-                 * opacity;
-        sum.cost += settings_.shadows && !isAlone;
-        if (settings_.aoRays > 0 && !isAlone && opacity > 0) {
-            c = c * (0.3f + 0.7f * openness(surface, point, direction, key)); // some comes by many bounces
-            sum.cost += settings_.aoRays;
-        }
-        sum.addSurface(surface, opacity);
-        sum.add(surface.t, c.x, c.y, c.z, opacity);
-    };
+    const auto isDone = [&] { return ray.through <= 0 || ray.through < least; };
     const auto addHits = [&](float before) {
-        for (; hit != hits.end() && hit->t <= before && !isDone(); ++hit)
-            addHit(*hit);
+        for (; hit != tools.hits.cend() && hit->t <= before && !isDone(); ++hit)
+            addHit(ray, *hit, tools.light);
     };
     while (!isDone()) {
+        const int none = std::numeric_limits<int>::max();
         int k = none;
-        for (const VolumeRay& ray : rays)
-            k = std::min(k, ray.next < ray.end ? ray.next : none);
+        for (const VolumeRay& volume : tools.volumes)
+            k = std::min(k, volume.next < volume.end ? volume.next : none);
         if (k == none)
             break;
         // All bricks take their samples from one grid along the ray.
         const float t = static_cast<float>(k) * scene_.step;
-        const Vec3 point = pointAt(origin, direction, t);
+        const Vec3 point = pointAt(ray.origin, ray.direction, t);
         const bool mine = cell_.contains(point);
         if (hasIsosurfaces_) {
-            findCrossings(origin, direction, k, rays, scratch);
-            for (auto crossing = scratch.begin(); crossing != scratch.end() && !isDone(); ++crossing) {
-                addHits(crossing->t);
+            findCrossings(ray.origin, ray.direction, k, tools.volumes, tools.scratch);
+            for (const Hit& crossing : tools.scratch) {
+                addHits(crossing.t);
                 if (!isDone())
-                    addHit(*crossing);
+                    addHit(ray, crossing, tools.light);
             }
             if (isDone())
                 break;
         }
-        for (std::size_t i = 0; i < rays.size(); ++i) {
-            if (rays[i].next != k)
+        for (std::size_t i = 0; i < volumes_.size(); ++i) {
+            VolumeRay& along = tools.volumes[i];
+            if (along.next != k)
                 continue;
-            rays[i].next = k + 1;
+            along.next = k + 1;
             const VolumeSampler& volume = volumes_[i];
             const Vec3 voxel = volume.toVoxel(point);
             if (!mine || !volume.inDomain(voxel))
                 continue;
-            const int skip = volume.emptySteps(voxel, rays[i].inverseStep);
-            if (skip > 0) {
-                rays[i].next = k + skip;
+            if (const int skip = volume.emptySteps(voxel, along.inverseStep); skip > 0) {
+                along.next = k + skip;
                 continue;
             }
-            ++sum.cost;
-            const TransferFunction::Entry entry = volume.shade(voxel, direction, light);
+            ++ray.cost;
+            const TransferFunction::Entry entry = volume.shade(voxel, ray.direction, tools.light);
             if (entry.alpha > 0) {
                 addHits(t);
                 if (isDone())
                     break;
-                sum.albedo = sum.albedo + Vec3{entry.r, entry.g, entry.b} * static_cast<float>(sum.through);
-                sum.add(t, entry.r, entry.g, entry.b, entry.alpha);
+                const Vec3 color{entry.r, entry.g, entry.b};
+                ray.albedo = ray.albedo + color * static_cast<float>(ray.through);
+                ray.add(t, color, entry.alpha);
             }
         }
     }
     addHits(std::numeric_limits<float>::infinity());
-    return sum;
+}
+
+// Adds the light of a surface, which is less where others are near.
+void Renderer::addHit(Ray& ray, const Hit& hit, const Light& light) const
+{
+    const float opacity = hit.opacity.value_or(settings_.opacity);
+    if (!(opacity > 0))
+        return;
+    const Vec3 point = pointAt(ray.origin, ray.direction, hit.t);
+    const float reach = ghostReach(scene_, settings_); // also beyond the cell
+    Vec3 c = light.shade(hit.color, hit.normal, ray.direction) * opacity;
+    if (!surfaces_.empty()) { // isosurfaces neither cast shadows nor hide the sky
+        if (settings_.shadows && surfaces_.occluded(point, light.direction, 1e-3f * reach, reach))
+            c = hit.color * light.ambient * opacity;
+        if (settings_.aoRays > 0)
+            c = c * (0.3f + 0.7f * openness(hit, point, ray.direction, ray.key)); // some comes by many bounces
+        ray.cost += settings_.shadows + settings_.aoRays;
+    }
+    ray.add(hit, c, opacity);
 }
 
 // Where the ray meets isosurfaces between samples k - 1 and k, front to back: those of its points that are in the

@@ -94,18 +94,19 @@ private:
         dfb::DeepTile* deep = nullptr;
     };
 
-    struct Accumulator;
+    struct Ray;
     struct RaySample;
     struct VolumeRay;
+    struct Tools;
 
     std::int64_t render(const Target& to, int frameIndex) const;
     RaySample sampleAt(int x, int y, int index, int frameIndex) const;
     float openness(const Hit& hit, const Vec3& point, const Vec3& direction, std::uint64_t key) const;
-    bool isInShadow(const Vec3& point, const Light& light) const;
     Vec3 pathLight(Hit hit, Vec3 point, Vec3 direction, std::uint64_t key, std::vector<Hit>& hits,
                    std::int64_t& cost) const;
-    Accumulator trace(const Vec3& origin, const Vec3& direction, const Light& light, std::uint64_t key,
-                      std::vector<Hit>& hits, std::vector<Hit>& scratch, std::vector<VolumeRay>& rays) const;
+    void trace(Ray& ray, Tools& tools) const;
+    void march(Ray& ray, Tools& tools) const;
+    void addHit(Ray& ray, const Hit& hit, const Light& light) const;
     void findCrossings(const Vec3& origin, const Vec3& direction, int k, std::vector<VolumeRay>& rays,
                        std::vector<Hit>& crossings) const;
 

@@ -18,7 +18,6 @@
 #include <vtkRTAnalyticSource.h>
 #include <vtkRenderWindow.h>
 #include <vtkRenderer.h>
-#include <vtkSmartPointer.h>
 #include <vtkSynchronizedTemplates3D.h>
 #include <vtkUnsignedCharArray.h>
 #include <vtkVolume.h>
@@ -26,12 +25,10 @@
 #include <vtkXMLImageDataReader.h>
 
 #include <algorithm>
-#include <cstdint>
 #include <cstdio>
 #include <exception>
 #include <stdexcept>
 #include <string>
-#include <vector>
 
 namespace {
 
@@ -70,11 +67,6 @@ void addVolume(vtkRenderer* renderer, vtkImageData* part, vtkColorTransferFuncti
     volume->GetProperty()->SetScalarOpacityUnitDistance(4 * part->GetSpacing()[0]);
     volume->GetProperty()->SetInterpolationTypeToLinear();
     renderer->AddVolume(volume);
-}
-
-dfb::Vec3 toVec3(double x, double y, double z)
-{
-    return {static_cast<float>(x), static_cast<float>(y), static_cast<float>(z)};
 }
 
 } // namespace
@@ -136,10 +128,10 @@ try {
 
     dfb::ImageCompositor compositor(mpi.communicator(), isVolume ? dfb::ImageBlend::InOrder : dfb::ImageBlend::Nearest,
                                     {width, height});
-    const dfb::Box3 bounds{toVec3(box[0], box[2], box[4]), toVec3(box[1], box[3], box[5])};
-    const dfb::SharedWorld world(compositor, dfb::World({{static_cast<std::uint32_t>(mpi.rank()), bounds}}));
+    const dfb::Box3 bounds{dfb::toFloat({box[0], box[2], box[4]}), dfb::toFloat({box[1], box[3], box[5]})};
+    const dfb::SharedWorld world(compositor, dfb::World({{unsigned(mpi.rank()), bounds}}));
     const double* eye = renderer->GetActiveCamera()->GetPosition();
-    const std::vector<int> order = dfb::visibilityOrder(world, toVec3(eye[0], eye[1], eye[2]));
+    const auto order = dfb::visibilityOrder(world, dfb::toFloat({eye[0], eye[1], eye[2]}));
     const auto place = std::find(order.begin(), order.end(), mpi.rank()) - order.begin();
     dfb::InputImage image(rgba->GetPointer(0), isVolume ? nullptr : depths->GetPointer(0));
     image.bottomUp = true;

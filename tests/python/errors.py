@@ -110,6 +110,9 @@ class Errors(unittest.TestCase):
                              ({"depth": None}, r"tile.depth is "), ({"rgba": "red"}, "tile.rgba is 'red'")):
             with self.subTest(text=text):
                 self.assertRegex(str(errors_of(framebuffer, tile_of(**values))[2]), text)
+        error = errors_of(framebuffer, lambda thing, rank: thing.render(
+            [brick(rank)], CAMERA, lambda _, tile: (tile.rgba, tile.depth)))[1]
+        self.assertIn("the renderer returned a tuple: it fills tile.rgba and tile.depth, and returns None", str(error))
         for result, text in ((None, "the operation's rgba is "), ((1, 2, 3), "a tuple of 3"),
                              (np.zeros((3, 3, 4)), r"the operation's rgba is \(3, 3, 4\)")):
             with self.subTest(text=text):
@@ -213,7 +216,7 @@ class Errors(unittest.TestCase):
         self.assertRegex(str(errors[0]), "operation")
         for comm in ("world", 5):
             self.assertRegex(str(error_of(lambda: dfb.FrameBuffer(comm, 8, 8))), f"comm is {comm!r}: it must be a")
-        self.assertRegex(str(error_of(lambda: dfb.PerspectiveCamera((0, 0, 0), (0, 0, 0)))), "degenerate")
+        self.assertRegex(str(error_of(lambda: dfb.PerspectiveCamera((0, 0, 0), (0, 0, 0)))), "looks nowhere")
         self.assertRegex(str(error_of(lambda: dfb.MatrixCamera(np.zeros((4, 4)), np.eye(4)))), "singular")
         self.assertRegex(str(error_of(lambda: dfb.MatrixCamera(np.eye(3), np.eye(4)))), r"view is \(3, 3\)")
         self.assertRegex(str(error_of(lambda: dfb.run_ranks(0, print))), "number of ranks is 0")

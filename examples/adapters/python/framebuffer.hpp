@@ -162,7 +162,12 @@ public:
         const RenderBrick render = [&](const dfb::Brick& brick, RenderTile& tile) {
             withPython(*cause, [&] {
                 const py::object given = py::cast(PythonTile(tile, picture.width, picture.height));
-                draw(objects[static_cast<std::size_t>(&brick - world.bricks().data())], given);
+                const py::object returned =
+                    draw(objects[static_cast<std::size_t>(&brick - world.bricks().data())], given);
+                if (!returned.is_none())
+                    throw dfb::InvalidArgument(std::string("the renderer returned a ")
+                                               + Py_TYPE(returned.ptr())->tp_name
+                                               + ": it fills tile.rgba and tile.depth, and returns None");
                 given.cast<const PythonTile&>().copyTo(tile);
             });
         };

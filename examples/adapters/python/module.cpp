@@ -16,6 +16,7 @@
 
 namespace py = pybind11;
 using namespace py::literals;
+using namespace dfb_python;
 
 namespace {
 
@@ -26,7 +27,7 @@ dfb::Vec3 vecOf(const Three& v) { return {v[0], v[1], v[2]}; }
 // Of a matrix in rows, as numpy has it, the columns one after another.
 std::array<float, 16> columnsOf(const py::object& matrix, const char* name)
 {
-    const auto rows = dfb_python::pixelsOf<float>(matrix, {0, 0, 4, 4}, 0, name);
+    const auto rows = pixelsOf<float>(matrix, {0, 0, 4, 4}, 0, name);
     std::array<float, 16> columns{};
     for (py::ssize_t row = 0; row < 4; ++row)
         for (py::ssize_t column = 0; column < 4; ++column)
@@ -50,16 +51,65 @@ py::tuple eyeOf(const Camera& camera)
 std::string reportText(const dfb::FrameReport& report)
 {
     return dfb::detail::printed("<dfb.Report: frame %lld, %.1f ms, %.1f ms of it after the call of this rank's end, "
-                                "%lld of %lld tiles with pixels, %lld bytes in %lld messages>",
+                                "%lld of %lld tiles with inputs, %lld bytes in %lld messages>",
                                 static_cast<long long>(report.frame), report.totalMs, report.compositingOverheadMs,
                                 static_cast<long long>(report.tilesTouched), static_cast<long long>(report.tilesTotal),
                                 static_cast<long long>(report.bytesSent), static_cast<long long>(report.messagesSent));
 }
 
-template <class Object>
-void addCollective(py::class_<Object>& type)
+void addReport(py::module_& module)
 {
-    type.def_property_readonly("rank", &Object::rank)
+    py::class_<dfb::FrameReport>(module, "Report", "Figures of a finished frame: see dfb/frame.hpp.")
+        .def("__repr__", &reportText)
+        .def_readonly("frame", &dfb::FrameReport::frame, "The number of the frame, from 1.")
+        .def_readonly("total_ms", &dfb::FrameReport::totalMs, "This rank's time for it, in ms.")
+        .def_readonly("render_ms", &dfb::FrameReport::renderMs, "The part until this rank had rendered and sent.")
+        .def_readonly("compositing_overhead_ms", &dfb::FrameReport::compositingOverheadMs, "The rest of it.")
+        .def_readonly("render_ms_max", &dfb::FrameReport::renderMsMax, "The longest render_ms of a rank.")
+        .def_readonly("threads", &dfb::FrameReport::threads, "Threads of this rank.")
+        .def_readonly("bytes_sent", &dfb::FrameReport::bytesSent, "Sum over the ranks.")
+        .def_readonly("messages_sent", &dfb::FrameReport::messagesSent, "Sum over the ranks.")
+        .def_readonly("tiles_total", &dfb::FrameReport::tilesTotal, "Tiles of the image.")
+        .def_readonly("tiles_touched", &dfb::FrameReport::tilesTouched, "Tiles that had an input.")
+        .def_readonly("non_finite_pixels", &dfb::FrameReport::nonFinitePixels,
+                      "Input pixels with an infinity or NaN, of all ranks.")
+        .def_readonly("alpha_outside_pixels", &dfb::FrameReport::alphaOutsidePixels,
+                      "Input pixels whose alpha is not within 0 and 1, of all ranks.")
+        .def_readonly("order_undefined_pixels", &dfb::FrameReport::orderUndefinedPixels,
+                      "Pixels whose inputs overlap in depth: no order is right.")
+        .def_readonly("peak_inbox_bytes", &dfb::FrameReport::peakInboxBytes, "The most that a rank's inbox held.")
+        .def_readonly("peak_memory_bytes", &dfb::FrameReport::peakMemoryBytes,
+                      "The most message and image memory that a rank ever held.");
+}
+
+void addTiles(py::module_& module)
+{
+    py::class_<PythonTile>(module, "Tile", "The pixels that a renderer is asked for.")
+        .def_readwrite("rgba", &PythonTile::rgba,
+                       "Premultiplied linear colours, (height, width, 4) of float32: fill them.")
+        .def_readwrite("depth", &PythonTile::depth, "Depths, (height, width) of float32, that grow away from the eye.")
+        .def_readonly("x0", &PythonTile::x0, "The column of the picture that its first one is.")
+        .def_readonly("y0", &PythonTile::y0, "The row of the picture that its first one is; 0 is on top.")
+        .def_readonly("width", &PythonTile::width)
+        .def_readonly("height", &PythonTile::height)
+        .def_readonly("index", &PythonTile::index, "Its number, as in Error.tile.")
+        .def_readonly("image_width", &PythonTile::imageWidth)
+        .def_readonly("image_height", &PythonTile::imageHeight);
+    py::class_<OperationInput>(module, "Input", "What one brick has in a tile.")
+        .def_readonly("rgba", &OperationInput::rgba, "(height, width, 4) of float32; 0 where there is nothing.")
+        .def_readonly("depth", &OperationInput::depth, "(height, width) of float32; infinity where there is nothing.")
+        .def_readonly("source", &OperationInput::source, "The id of the brick.");
+}
+
+template <class Object, class ObjectSettings>
+py::class_<Object> addCollective(py::module_& module, const char* name)
+{
+    return py::class_<Object>(module, name)
+        .def(py::init([](const py::object& comm, const py::dict& settings) {
+                 return std::make_unique<Object>(comm, ObjectSettings(settings));
+             }),
+             "comm"_a, "settings"_a)
+        .def_property_readonly("rank", &Object::rank)
         .def_property_readonly("size", &Object::size)
         .def_property_readonly("width", &Object::width)
         .def_property_readonly("height", &Object::height)
@@ -78,8 +128,6 @@ void addCollective(py::class_<Object>& type)
 
 PYBIND11_MODULE(_dfb, module)
 {
-    using namespace dfb_python;
-
     py::register_exception_translator([](std::exception_ptr thrown) {
         try {
             if (thrown)
@@ -105,44 +153,8 @@ PYBIND11_MODULE(_dfb, module)
         .def_property_readonly("size", &dfb::InprocCommunicator::size, "How many ranks there are.");
     module.def("run_ranks", &runRanks, "count"_a, "function"_a);
 
-    py::class_<dfb::FrameReport> report(module, "Report", "Figures of a finished frame: see dfb/frame.hpp.");
-    report.def("__repr__", &reportText)
-        .def_readonly("frame", &dfb::FrameReport::frame, "The number of the frame, from 1.")
-        .def_readonly("total_ms", &dfb::FrameReport::totalMs, "This rank's time for it, in ms.")
-        .def_readonly("render_ms", &dfb::FrameReport::renderMs, "The part until this rank had rendered and sent.")
-        .def_readonly("compositing_overhead_ms", &dfb::FrameReport::compositingOverheadMs, "The rest of it.")
-        .def_readonly("render_ms_max", &dfb::FrameReport::renderMsMax, "The longest render_ms of a rank.")
-        .def_readonly("threads", &dfb::FrameReport::threads, "Threads of this rank.")
-        .def_readonly("bytes_sent", &dfb::FrameReport::bytesSent, "Sum over the ranks.")
-        .def_readonly("messages_sent", &dfb::FrameReport::messagesSent, "Sum over the ranks.")
-        .def_readonly("tiles_total", &dfb::FrameReport::tilesTotal, "Tiles of the image.")
-        .def_readonly("tiles_touched", &dfb::FrameReport::tilesTouched, "Tiles that had an input.")
-        .def_readonly("non_finite_pixels", &dfb::FrameReport::nonFinitePixels,
-                      "Input pixels with an infinity or NaN, of all ranks.")
-        .def_readonly("alpha_outside_pixels", &dfb::FrameReport::alphaOutsidePixels,
-                      "Input pixels whose alpha is not within 0 and 1, of all ranks.")
-        .def_readonly("order_undefined_pixels", &dfb::FrameReport::orderUndefinedPixels,
-                      "Pixels whose inputs overlap in depth: no order is right.")
-        .def_readonly("peak_inbox_bytes", &dfb::FrameReport::peakInboxBytes, "The most that a rank's inbox held.")
-        .def_readonly("peak_memory_bytes", &dfb::FrameReport::peakMemoryBytes,
-                      "The most message and image memory that a rank ever held.");
-
-    py::class_<PythonTile>(module, "Tile", "The pixels that a renderer is asked for.")
-        .def_readwrite("rgba", &PythonTile::rgba,
-                       "Premultiplied linear colours, (height, width, 4) of float32: fill them.")
-        .def_readwrite("depth", &PythonTile::depth, "Depths, (height, width) of float32, that grow away from the eye.")
-        .def_readonly("x0", &PythonTile::x0, "The column of the picture that its first one is.")
-        .def_readonly("y0", &PythonTile::y0, "The row of the picture that its first one is; 0 is on top.")
-        .def_readonly("width", &PythonTile::width)
-        .def_readonly("height", &PythonTile::height)
-        .def_readonly("index", &PythonTile::index, "Its number, as in Error.tile.")
-        .def_readonly("image_width", &PythonTile::imageWidth)
-        .def_readonly("image_height", &PythonTile::imageHeight);
-    py::class_<OperationInput>(module, "Input", "What one brick has in a tile.")
-        .def_readonly("rgba", &OperationInput::rgba, "(height, width, 4) of float32; 0 where there is nothing.")
-        .def_readonly("depth", &OperationInput::depth, "(height, width) of float32; infinity where there is nothing.")
-        .def_readonly("source", &OperationInput::source, "The id of the brick.");
-
+    addReport(module);
+    addTiles(module);
     py::class_<dfb::PerspectiveCamera>(module, "PerspectiveCamera", "A pinhole that looks from `eye` to `target`.")
         .def(py::init([](const Three& eye, const Three& target, const Three& up, float fovY) {
                  return dfb::PerspectiveCamera(vecOf(eye), vecOf(target), vecOf(up), fovY);
@@ -166,23 +178,10 @@ PYBIND11_MODULE(_dfb, module)
             "rays", &raysOf<dfb::MatrixCamera>, "tile"_a,
             "Returns origins and unit directions, (height, width, 3) of float32, of the rays through a tile's pixels.");
 
-    py::class_<Compositor> compositor(module, "Compositor");
-    compositor
-        .def(py::init([](const py::object& comm, const py::dict& settings) {
-                 return std::make_unique<Compositor>(comm, CompositorSettings(settings));
-             }),
-             "comm"_a, "settings"_a)
+    addCollective<Compositor, CompositorSettings>(module, "Compositor")
         .def("composite", &Compositor::composite, "rgba"_a, "depth"_a, "options"_a);
-    addCollective(compositor);
-
-    py::class_<FrameBuffer> framebuffer(module, "FrameBuffer");
-    framebuffer
-        .def(py::init([](const py::object& comm, const py::dict& settings) {
-                 return std::make_unique<FrameBuffer>(comm, FrameBufferSettings(settings));
-             }),
-             "comm"_a, "settings"_a)
+    addCollective<FrameBuffer, FrameBufferSettings>(module, "FrameBuffer")
         .def("render", &FrameBuffer::render, "bricks"_a, "camera"_a, "draw"_a);
-    addCollective(framebuffer);
 
     for (const char* name : {"ThreadCommunicator", "Report", "Tile", "Input", "PerspectiveCamera", "MatrixCamera"})
         module.attr(name).attr("__module__") = "dfb";

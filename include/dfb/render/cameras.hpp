@@ -95,7 +95,8 @@ public:
             const double largest = detail::length(p) + detail::length(eye_) + 2 * way;
             return detail::SeenCorner{
                 depth,
-                isOrthographic_ ? 0 : 1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) * unit,
+                isOrthographic_ ? 0
+                                : unit * (1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest),
                 {0.5 * width * (1 + rows_[0].at(p) / depth), 0.5 * height * (1 - rows_[1].at(p) / depth)},
                 5e-7 * largest * pixels / depth};
         });
@@ -197,6 +198,7 @@ public:
             pose.eye = pose_.eye + offset * pose_.right;
             both.push_back(
                 detail::projectBox(bounds, pose, width, height, side * 0.25 * width + scale * offset / convergence_));
+            both.back().cut(side < 0 ? Region{0, 0, (width + 1) / 2, height} : Region{width / 2, 0, width, height});
         }
         return both;
     }

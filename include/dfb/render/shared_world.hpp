@@ -81,7 +81,7 @@ namespace detail {
 
 DFB_DETECTS(has_common_eye_v, std::declval<const T&>().commonEye());
 
-// Finds the order of bricks. Keeps its memory.
+// Finds the order of bricks. Keeps it, for as long as boxes and eye stay.
 class FrontToBack {
 public:
     // Returns null, or why there is no order.
@@ -93,8 +93,12 @@ public:
 private:
     enum class Before { Either, First, Second, Overlaps };
 
-    static Before before(const Box3& a, const Box3& b, const Vec3& eye);
+    const char* findAgain();
+    Before before(std::size_t i, std::size_t j) const;
 
+    std::vector<Box3> boxes_;
+    Vec3 eye_;
+    const char* why_ = nullptr;
     std::vector<int> order_, inFront_;
 };
 
@@ -102,49 +106,66 @@ private:
 DFB_COMPILED_ONCE const char* FrontToBack::find(const SharedWorld& world, const Vec3& eye)
 {
     const auto& bricks = world.bricks();
-    const auto compare = [&](std::size_t a, std::size_t b) { return before(bricks[a].bounds, bricks[b].bounds, eye); };
+    const auto same = [](const auto& a, const auto& b) { return std::memcmp(&a, &b, sizeof a) == 0; }; // also of NaNs
+    if (same(eye, eye_)
+        && std::equal(bricks.begin(), bricks.end(), boxes_.begin(), boxes_.end(),
+                      [&](const Brick& brick, const Box3& box) { return same(brick.bounds, box); }))
+        return why_;
+    order_.reserve(bricks.size()); // nothing throws once the boxes are there
+    inFront_.reserve(bricks.size());
+    eye_ = eye;
+    boxes_.clear();
+    for (const Brick& brick : bricks)
+        boxes_.push_back(brick.bounds);
+    return why_ = findAgain();
+}
+
+DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
+{
     order_.clear();
-    inFront_.assign(bricks.size(), 0);
-    for (std::size_t a = 0; a < bricks.size(); ++a)
-        for (std::size_t b = a + 1; b < bricks.size(); ++b) {
-            const Before which = compare(a, b);
+    inFront_.assign(boxes_.size(), 0);
+    for (std::size_t a = 0; a < boxes_.size(); ++a)
+        for (std::size_t b = a + 1; b < boxes_.size(); ++b) {
+            const Before which = before(a, b);
             if (which == Before::Overlaps)
                 return "two bricks overlap: there is no order in which they could be blended";
             if (which != Before::Either)
                 ++inFront_[which == Before::First ? b : a];
         }
-    for (std::size_t i = 0; i < bricks.size(); ++i)
+    for (std::size_t i = 0; i < boxes_.size(); ++i)
         if (inFront_[i] == 0)
             order_.push_back(static_cast<int>(i));
     for (std::size_t i = 0; i < order_.size(); ++i)
-        for (std::size_t b = 0; b < bricks.size(); ++b)
-            if (inFront_[b] > 0 && compare(static_cast<std::size_t>(order_[i]), b) == Before::First
+        for (std::size_t b = 0; b < boxes_.size(); ++b)
+            if (inFront_[b] > 0 && before(static_cast<std::size_t>(order_[i]), b) == Before::First
                 && --inFront_[b] == 0)
                 order_.push_back(static_cast<int>(b));
-    return order_.size() == bricks.size()
+    return order_.size() == boxes_.size()
                ? nullptr
                : "the bricks are in front of each other in a circle: no order is right for all pixels";
 }
 
 // A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
 // Either is right if no ray crosses it: the eye's coordinate is then NaN, and no comparison holds.
-DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(const Box3& a, const Box3& b, const Vec3& eye)
+DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(std::size_t i, std::size_t j) const
 {
+    const Box3 &a = boxes_[i], &b = boxes_[j];
     bool apart = false, first = false, second = false;
     const auto alongAxis = [&](float aLower, float aUpper, float bLower, float bUpper, float e) {
         if (aUpper <= bLower) { // a plane between, at any of [aUpper, bLower]
             apart = true;
             first = first || !(e > bLower);
             second = second || !(e < aUpper);
-        } else if (bUpper <= aLower) {
+        }
+        if (bUpper <= aLower) {
             apart = true;
             first = first || !(e < bUpper);
             second = second || !(e > aLower);
         }
     };
-    alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye.x);
-    alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye.y);
-    alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye.z);
+    alongAxis(a.lower.x, a.upper.x, b.lower.x, b.upper.x, eye_.x);
+    alongAxis(a.lower.y, a.upper.y, b.lower.y, b.upper.y, eye_.y);
+    alongAxis(a.lower.z, a.upper.z, b.lower.z, b.upper.z, eye_.z);
     if (!apart)
         return Before::Overlaps;
     return first == second ? Before::Either : first ? Before::First : Before::Second;

@@ -46,6 +46,13 @@ public:
         return Footprint({{0, 0}, {w, 0}, {w, h}, {0, h}}, 0, width, height);
     }
 
+    // Leaves only what is in a rectangle of pixels.
+    void cut(const Region& r)
+    {
+        region_ = intersection(region_, r);
+        region_ = region_.empty() ? Region{} : region_;
+    }
+
     // The smallest rectangle of pixels around it.
     const Region& region() const noexcept { return region_; }
 
@@ -158,7 +165,9 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 {
     const Vec3d v = toDouble(view), side = cross(v, toDouble(up));
     if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
-        failArgument("the camera's view or up vector is degenerate");
+        failArgument(
+            "the camera looks nowhere: its view has no length, `up` has none or is along the view, or a number "
+            "is not finite");
     Pose pose;
     pose.eye = toDouble(eye);
     pose.forward = normalize(v);
@@ -236,11 +245,13 @@ DFB_COMPILED_ONCE Footprint projectBox(const Box3& bounds, const Pose& pose, int
     return footprintOf(bounds, width, height, [&](const Vec3d& p) {
         const Vec3d d = p - pose.eye;
         const double depth = dot(d, pose.forward);
+        const double largest = length(p) + length(pose.eye);
         return SeenCorner{depth,
-                          1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)), // the axes are rounded to float
+                          // Axes and origins of rays are rounded to float.
+                          1e-6 * (std::fabs(d.x) + std::fabs(d.y) + std::fabs(d.z)) + 1e-7 * largest,
                           {0.5 * width + shiftX + pixelsPerUnit * dot(d, pose.right) / depth,
                            0.5 * height - pixelsPerUnit * dot(d, pose.up) / depth},
-                          5e-7 * (length(p) + length(pose.eye)) / depth * pixelsPerUnit,
+                          5e-7 * largest / depth * pixelsPerUnit,
                           pixelsPerUnit * lensRadius * std::fabs(1 / depth - 1 / focusDistance)};
     });
 }

@@ -407,6 +407,16 @@ TEST_CASE("For a camera without a common eye there is no order", "[visibility_or
     });
 }
 
+TEST_CASE("Flat bricks beside each other have an order from both sides", "[visibility_order]")
+{
+    const std::vector<dfb::Brick> flat{{1, {{0, 0, 0}, {1, 1, 0}}}, {2, {{1, 0, 0}, {2, 1, 0}}}};
+    withWorld(flat, [](const dfb::SharedWorld& world) {
+        for (const float x : {0.5f, 1.5f})
+            for (const float z : {-9.0f, 0.0f, 9.0f})
+                CHECK(dfb::visibilityOrder(world, dfb::Vec3{x, 0.5f, z}).size() == 2);
+    });
+}
+
 TEST_CASE("Bricks that overlap or stand in a circle have no order", "[visibility_order]")
 {
     const auto outcome = [](const std::vector<dfb::Brick>& bricks) {
