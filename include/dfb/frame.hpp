@@ -175,7 +175,9 @@ struct FrameSums {
     std::int64_t bytesSent = 0;
     std::int64_t messagesSent = 0;
     std::int64_t tilesTouched = 0;         // tiles that had an input
-    std::int64_t nonFinitePixels = 0;      // input pixels with an infinite or NaN colour, or a NaN depth
+    // Input pixels with an infinite or NaN colour, or a NaN depth. Of inputs that are read in place only those that
+    // were read: none that an opaque input hides.
+    std::int64_t nonFinitePixels = 0;
     std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid

@@ -388,6 +388,7 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     }
     if (order.size() != layers.size())
         detail::resetOrder(order, layers.size());
+    detail::sortAt(0, layers, order); // where inputs are infinite, pixels would show which order was before
     const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(detail::SortNetwork::mostLayers)
                          && !layers.front().aux && row.rgbaLow.empty();
     // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.

@@ -34,7 +34,6 @@ public:
         rule_ = rule;
         cursors_.clear();
         isFull_ = true;
-        order_.clear(); // of another tile: where inputs are infinite, pixels would show which one was before
         std::size_t made = 0;
         for (; begin != end; ++begin)
             if ((*begin)->isMadeByRow())
@@ -250,7 +249,14 @@ private:
             detail::resetOrder(order_, layers_.size());
         if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
             return true;
-        detail::sortAt(0, layers_, order_);
+        // Of copies: another process may change a depth while it is sorted, or it may be a NaN, and no sort bears that.
+        float depths[detail::mostInPlace];
+        firsts_.resize(layers_.size());
+        for (std::size_t k = 0; k < firsts_.size(); ++k) {
+            depths[k] = detail::canonicalDepth(layers_[k].depth[0]);
+            firsts_[k].depth = &depths[k];
+        }
+        detail::sortAt(0, firsts_, order_);
         return detail::firstOutOfOrder(layers_, order_, 0, count) == count;
     }
 
@@ -416,7 +422,7 @@ private:
     std::vector<int> edges_;               // the first edgeCount_
     std::size_t edgeCount_ = 0;
     std::vector<Run> runs_;
-    std::vector<Layer> layers_;
+    std::vector<Layer> layers_, firsts_;
     std::vector<int> order_;
 };
 

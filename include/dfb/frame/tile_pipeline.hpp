@@ -229,6 +229,7 @@ public:
     // Returns the input that a message has. Throws Error (MalformedMessage).
     Fragment inputOf(Buffer&& message, const SharedBytes& sharedBytes)
     {
+        const FloatEnvironment floatEnvironment;
         return decodeFragment(
             *pool_, std::move(message), table_.layout(), [this](int tile) { return table_.samples(tile).count; },
             config_.messages.codec.get(), coder_, sharedBytes, &faults_);

@@ -248,7 +248,7 @@ public:
 // Blends inputs in the order of their generation, front to back. Use it if one order of the bricks is right for all
 // pixels of a tile. It sorts nothing, and no depth travels unless the image has it. The tree is a list: each input
 // announces one child, the last none. A tile that no brick covers needs an empty input of generation 0, which
-// OrderedLoop sends.
+// OrderedLoop sends. If several declared inputs have one generation, they are blended by (source, part).
 //
 // In a tile with one pass, if the image has colour alone, inputs behind an opaque one are not blended, and the tile
 // does not wait for them.
@@ -397,7 +397,7 @@ DFB_COMPILED_ONCE void FragmentStore::sort(std::vector<const Fragment*>& pointer
         if (info_.order)
             return {h.pass, info_.order->placeOf(h.source), h.part, h.generation};
         if (rule_ == BlendRule::InOrder)
-            return {h.pass, h.generation, h.source, 0};
+            return {h.pass, h.generation, h.source, h.part};
         return {h.pass, h.source, h.part, h.generation};
     };
     std::sort(pointers.begin(), pointers.end(),
