@@ -231,8 +231,8 @@ private:
                                        int otherRank)
     {
         ErrorInfo info = detail::errorInfo(ErrorKind::DuplicateInput,
-                                           detail::printed("source %u (in the library's loops the id of a brick; in an "
-                                                           "ImageCompositor the place of an image)",
+                                           detail::printed("source %u (the id of a brick, or the place of an image in "
+                                                           "an order)",
                                                            source));
         info.from = std::max(rank, otherRank);
         info.generation = generation;
@@ -245,8 +245,7 @@ private:
             info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
         else
             info.message +=
-                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only. For "
-                                "bricks that several ranks hold there are SharedWorld and MixedParallelLoop",
+                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only",
                                 std::min(rank, otherRank), std::max(rank, otherRank));
         throw Error(std::move(info));
     }

@@ -11,6 +11,8 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
+#include <cstdio>
+#include <cstdlib>
 #include <exception>
 #include <functional>
 #include <memory>
@@ -319,7 +321,14 @@ public:
 
     // Collective. No frame may be open. Must come before MPI_Finalize(). The last object of a connection waits for all
     // ranks.
-    ~DistributedFrameBuffer() = default;
+    ~DistributedFrameBuffer()
+    {
+        for (const auto& engine : engines_)
+            if (engine->isOpen()) { // its Frame would use what is gone
+                std::fputs("dfb: a framebuffer is destroyed before a Frame of it: end() the frame first\n", stderr);
+                std::abort();
+            }
+    }
 
     // These wait for nothing and throw nothing. Any thread, but not during resize(). config() has the values in use:
     // poolBytes is raised to its minimum, and a missing executor is filled in.
@@ -345,7 +354,7 @@ public:
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
     // bytes travel along a tree of the ranks. Takes memory for several more images on every rank while it runs.
     // Collective, outside frames. Waits and throws as allGather().
-    Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(); }
+    Image imageOnAllRanks() { return lastEnded_->imageOnAllRanks(engine()); }
 
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }

@@ -152,7 +152,7 @@ public:
     // memory for several more images on every rank while it runs. Waits for all ranks, without a time-out. Throws
     // InvalidArgument on all ranks if one makes another collective call; TransportError; and std::bad_alloc on a rank
     // that lacks memory.
-    Image imageOnAllRanks() { return engine_->imageOnAllRanks(); }
+    Image imageOnAllRanks() { return engine_->imageOnAllRanks(*engine_); }
 
     // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
     // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of
@@ -214,9 +214,10 @@ public:
 // Between nodes bytes cost more than pages. Squares are smaller than most images: many have pixels of one rank alone,
 // which owns them and sends them once.
 template <class TileOp>
-std::unique_ptr<Operations> imageOperations(const ImageConfig& image, int ranks, bool isOneNode)
+std::unique_ptr<Operations> imageOperations(const char* name, const ImageConfig& image, int ranks, bool isOneNode)
 {
     auto traits = OperationTraits::of<TileOp, NoPixelOp>();
+    traits.tileOp = name;
     traits.tileWidth = traits.tileHeight = 64;
     if (isOneNode) {
         traits.tileWidth = std::clamp(image.width, 1, 4096);
@@ -364,11 +365,13 @@ DFB_COMPILED_ONCE std::unique_ptr<detail::Operations> ImageCompositor::makeOpera
     const int ranks = connection_->size();
     const bool isOneNode = !owners_ || owners_->isOneNode();
     switch (blend_) {
-    case ImageBlend::ByDepth: return detail::imageOperations<AlphaBlend>(image, ranks, isOneNode);
-    case ImageBlend::InOrder: return detail::imageOperations<detail::BlendBySource>(image, ranks, isOneNode);
+    case ImageBlend::ByDepth:
+        return detail::imageOperations<AlphaBlend>("ImageBlend::ByDepth", image, ranks, isOneNode);
+    case ImageBlend::InOrder:
+        return detail::imageOperations<detail::BlendBySource>("ImageBlend::InOrder", image, ranks, isOneNode);
     case ImageBlend::Nearest: break;
     }
-    return detail::imageOperations<DepthComposite>(image, ranks, isOneNode);
+    return detail::imageOperations<DepthComposite>("ImageBlend::Nearest", image, ranks, isOneNode);
 }
 
 DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& config)
@@ -412,6 +415,7 @@ DFB_COMPILED_ONCE void ImageCompositor::resize(int width, int height)
     FrameBufferConfig config = engine_->config();
     config.image.width = width;
     config.image.height = height;
+    engine_->allGather({}, "resize()"); // the new engine does not hear of other calls
     makeEngine(config);
 }
 
@@ -490,8 +494,11 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         detail::failArgument("an image with depth and without colour");
     const bool isThere = (image.rgba8 || image.rgba32f) && !region.empty();
     if (isThere && usesDepth && !image.depth)
-        detail::failArgument("an image without depth, which %s needs",
-                             blend_ == ImageBlend::InOrder ? "the depth of the picture" : "this way to blend");
+        detail::failArgument("an image without depth: %s", blend_ == ImageBlend::InOrder
+                                                               ? "the picture is to have depth"
+                                                               : "images that are not blended in order need it");
+    if (std::isnan(image.farDepth))
+        detail::failArgument("farDepth is not a number");
     if (image.rowPixels != 0 && image.rowPixels < region.width())
         detail::failArgument("rows of %d pixels that are %lld pixels apart", region.width(),
                              static_cast<long long>(image.rowPixels));
@@ -513,6 +520,7 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
     const auto sendTile = [&](std::size_t i) {
         if (engine_->failed())
             return;
+        const detail::FloatEnvironment floatEnvironment; // straight alpha is multiplied here
         detail::InputTile::View view;
         static_cast<TileHeader&>(view) = engine_->headerOf(inputs_[i].tile, 0);
         view.generation = 1;

@@ -386,6 +386,12 @@ static void check_errors(void)
     expect_error(dfb_resize(fb, rank == 0 ? 0 : 20, 20), DFB_INVALID_ARGUMENT, "0x20", "rank 0", "dfb_resize");
     expect(dfb_width(fb) == scene_width, "the size after an error");
     composite_bytes(fb);
+    for (int has_bricks = 0; has_bricks < 2 && ranks > 1; ++has_bricks) {
+        if (has_bricks)
+            render(fb);
+        expect_error(rank == 0 ? dfb_resize(fb, 20, 20) : dfb_image_on_all_ranks(fb), DFB_INVALID_ARGUMENT,
+                     "rank 0 calls resize(), rank 1 imageOnAllRanks()", "", "ranks in different calls");
+    }
     dfb_destroy(fb);
 
     dfb_brick bricks[2];

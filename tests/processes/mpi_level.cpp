@@ -170,7 +170,7 @@ std::string invalidArgumentOf(const std::function<void()>& call)
 // What waits for messages on a thread that may not move them says so; it would wait for ever.
 void otherThread()
 {
-    const char* const owner = "belong to the thread that initialised";
+    const char* const owner = "only the thread that has initialised MPI";
     FrameBuffer fb(MPI_COMM_WORLD, smallConfig());
     const std::string begin = invalidArgumentOf([&] { (void)fb.begin(); });
     check(has(begin, owner), "begin() on another thread", begin);

@@ -3,6 +3,8 @@
 //   mpirun -n 3 mpi_session highest      without a level: what the MPI library has, if that is a low one, too
 //   mpirun -n 3 mpi_session lower        the MPI library has a lower thread level than is asked for
 //   mpirun -n 3 mpi_session finalised    the user has finalised MPI
+//   mpirun -n 1 mpi_session too_early    the same while there is a framebuffer: the process ends and says why
+//   mpirun -n 1 mpi_session open_frame   a framebuffer is destroyed before a frame of it: so it does then
 //   mpirun -n 3 mpi_session exception    rank 1 leaves with an exception: the job ends, with code 1
 //   mpirun -n 3 mpi_session give_up      rank 1 cannot go on, and the others neither: the same
 // With a file as second argument, the last two append to it what each rank caught: a launcher may drop what a rank
@@ -123,6 +125,23 @@ void emptyFrame(dfb::DistributedFrameBuffer<dfb::AlphaBlend>& fb)
     frame.end();
 }
 
+void finaliseTooEarly(int& argc, char**& argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    dfb::DistributedFrameBuffer<dfb::AlphaBlend> fb(mpi.communicator(), {64, 64});
+    emptyFrame(fb);
+    MPI_Finalize();
+}
+
+void leaveFrameOpen(int& argc, char**& argv)
+{
+    dfb::MpiSession mpi(argc, argv);
+    std::optional<dfb::DistributedFrameBuffer<dfb::AlphaBlend>> fb(std::in_place, mpi.communicator(),
+                                                                   dfb::FrameBufferConfig{64, 64});
+    auto frame = fb->begin();
+    fb.reset();
+}
+
 // Between two frames: the other ranks wait for this one in the second.
 void leaveFrameBuffer(int& argc, char**& argv)
 {
@@ -188,6 +207,10 @@ int main(int argc, char** argv)
     } else if (what == "finalised") {
         dfb::MpiSession mpi(argc, argv);
         MPI_Finalize();
+    } else if (what == "too_early") {
+        finaliseTooEarly(argc, argv);
+    } else if (what == "open_frame") {
+        leaveFrameOpen(argc, argv);
     } else if (what == "exception" || what == "exception_frame") {
         try {
             (what == "exception" ? leaveWithException : leaveFrameBuffer)(argc, argv);

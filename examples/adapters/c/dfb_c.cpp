@@ -323,11 +323,13 @@ void dfb_destroy(dfb_framebuffer* framebuffer) { delete framebuffer; }
 int dfb_resize(dfb_framebuffer* framebuffer, int width, int height)
 {
     return inFramebuffer(framebuffer, [&](dfb_framebuffer& fb) {
+        if (fb.showsBricks) // another rank may have called dfb_image_on_all_ranks() on it
+            std::visit([&](auto& bricks) { bricks.resize(width, height); }, *fb.bricks);
+        newPicture(fb, false);
+        fb.bricks.reset(); // is made anew when it is needed
         fb.images->resize(width, height);
         fb.frameBufferConfig.image.width = width;
         fb.frameBufferConfig.image.height = height;
-        newPicture(fb, false);
-        fb.bricks.reset(); // is made anew when it is needed
     });
 }
 

@@ -66,8 +66,9 @@ public:
     }
 
     // From now on only messages of this epoch count for which `matters(message)` is true. Forgets the others that wait,
-    // and drops those that still come. What credit was asked for still goes: the receiver would set aside for nothing.
-    void drop(std::function<bool(const Buffer&)> matters)
+    // and drops those that still come. `keepsAsked`: what credit was asked for still goes, as the receiver sets room
+    // aside for it that others need.
+    void drop(std::function<bool(const Buffer&)> matters, bool keepsAsked)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         matters_ = std::move(matters);
@@ -77,7 +78,7 @@ public:
             for (std::size_t left = out.queue.size(); left > 0; --left) {
                 Buffer message = out.queue.pop();
                 total += message.size();
-                if (total <= out.askedForAll || matters_(message))
+                if ((keepsAsked && total <= out.askedForAll) || matters_(message))
                     out.queue.push(std::move(message));
                 else
                     underWay_ -= message.size();

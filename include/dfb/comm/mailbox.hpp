@@ -190,7 +190,7 @@ public:
     void requireProgress() const
     {
         if (connection_->needsCaller() && !connection_->mayPoll())
-            failArgument("at this thread level of MPI calls that wait belong to the thread that initialised it");
+            failArgument("below MPI_THREAD_SERIALIZED only the thread that has initialised MPI may make this call");
     }
 
     // Counts a message of the epoch as taken.
@@ -447,9 +447,11 @@ private:
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
         const std::chrono::milliseconds late = connection_->config().peerTimeout;
+        if (!isFirst && late.count() == 0)
+            damage.reset(); // that is no limit; what is damaged from now on sets one
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
-        if (damage && (isFirst || late.count() > 0)) // a peerTimeout of 0 is no limit
+        if (damage)
             deadline = Clock::now() + (isFirst ? soon : late);
         do { // also if the parts of all were here: with Progress::Caller wait() sends the result on
             if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {

@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
+#include <cstdlib>
 #include <thread>
 
 DFB_NAMESPACE_BEGIN
@@ -39,6 +40,9 @@ inline void checkMpi(int code, const char* call, int rank, int peer = -1)
                          rank);
 }
 
+inline constexpr const char* finalizedTooEarly =
+    "dfb: MPI_Finalize() was called before the last framebuffer, compositor or wall was destroyed\n";
+
 // Asks MPI_Initialized, MPI_Finalized or MPI_Is_thread_main.
 inline bool mpiSays(int (*ask)(int*))
 {
@@ -46,6 +50,42 @@ inline bool mpiSays(int (*ask)(int*))
     ask(&answer);
     return answer != 0;
 }
+
+// Ends the process, and says why, if MPI_Finalize() is called while this lives. For transports that another thread
+// polls: it would call MPI meanwhile. (MPI_Finalize() deletes the attributes of MPI_COMM_SELF first.)
+class NoFinalize {
+public:
+    explicit NoFinalize(bool isNeeded)
+    {
+        if (isNeeded) {
+            MPI_Comm_create_keyval(MPI_COMM_NULL_COPY_FN, deleted, &key_, nullptr);
+            MPI_Comm_set_attr(MPI_COMM_SELF, key_, &lives_);
+        }
+    }
+    NoFinalize(const NoFinalize&) = delete;
+    NoFinalize& operator=(const NoFinalize&) = delete;
+    ~NoFinalize()
+    {
+        if (key_ == MPI_KEYVAL_INVALID)
+            return;
+        lives_ = false;
+        MPI_Comm_delete_attr(MPI_COMM_SELF, key_);
+        MPI_Comm_free_keyval(&key_);
+    }
+
+private:
+    static int deleted(MPI_Comm, int, void* lives, void*)
+    {
+        if (*static_cast<bool*>(lives)) {
+            std::fputs(finalizedTooEarly, stderr);
+            std::abort();
+        }
+        return MPI_SUCCESS;
+    }
+
+    int key_ = MPI_KEYVAL_INVALID;
+    bool lives_ = true;
+};
 
 // The thread level of MPI. Throws TransportError if MPI is not initialised, or is finalised.
 inline int mpiLevel()

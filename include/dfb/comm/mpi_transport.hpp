@@ -53,7 +53,9 @@ public:
     // rank and the reason. The others cannot be told, and wait, only if a collective of MPI fails on one rank, or finds
     // no memory there for its result. Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
-        : onlyThread_(threadFor(progress)), pool_(std::move(pool)), ranks_(communicator, *pool_), packet_(pool_)
+        : onlyThread_(threadFor(progress)),
+          noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
+          pool_(std::move(pool)), ranks_(communicator, *pool_), packet_(pool_)
     {
         int failed = size();
         try {
@@ -162,8 +164,7 @@ public:
     void stop(bool orderly)
     {
         if (detail::mpiSays(MPI_Finalized)) {
-            std::fputs("dfb: MPI_Finalize() was called before the last framebuffer, compositor or wall was destroyed\n",
-                       stderr);
+            std::fputs(detail::finalizedTooEarly, stderr);
         } else if (orderly && !failed_) {
             if (guarded([this] { return finish(); }))
                 return;
@@ -707,6 +708,7 @@ private:
     }
 
     const std::thread::id onlyThread_; // that may call MPI; none if all may
+    detail::NoFinalize noFinalize_;
     std::shared_ptr<MemoryPool> pool_;
     detail::MpiRanks ranks_;
     TransportHandler* handler_ = nullptr;

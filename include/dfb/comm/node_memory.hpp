@@ -24,6 +24,7 @@
 #include <linux/futex.h>
 #include <sys/mman.h>
 #include <sys/random.h>
+#include <sys/resource.h>
 #include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
@@ -121,6 +122,9 @@ public:
     static std::shared_ptr<NodeMemory> create()
     {
 #if defined(MFD_CLOEXEC)
+        rlimit longest; // a longer file would end the process by a signal
+        if (getrlimit(RLIMIT_FSIZE, &longest) != 0 || longest.rlim_cur < capacity)
+            return nullptr;
         const int file = sizeof(void*) < 8 ? -1 : memfd_create("dfb", MFD_CLOEXEC);
         if (file < 0)
             return nullptr;

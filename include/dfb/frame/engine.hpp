@@ -37,7 +37,7 @@ public:
     virtual const std::vector<int>& nodeOf() const noexcept = 0; // of each rank: the lowest rank of its node
     virtual const Image& image() const noexcept = 0;
     virtual std::int64_t imageFrame() const noexcept = 0;
-    virtual Image imageOnAllRanks() = 0;
+    virtual Image imageOnAllRanks(Engine& gatherer) = 0; // by an allGather() of that engine
     virtual bool isComplete(int tile) const = 0;
     virtual bool poll() = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;

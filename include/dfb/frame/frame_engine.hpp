@@ -69,6 +69,7 @@ public:
                 nodeOf_[static_cast<std::size_t>(its.rank)] = its.first;
         tellImagePlace();
     }
+    ~FrameEngine() override { mailbox_->stop(); } // before mailbox_ is null: its tasks use it
 
     int rank() const noexcept override { return mailbox_->rank(); }
     int size() const noexcept override { return mailbox_->size(); }
@@ -110,7 +111,8 @@ public:
         info.firstSample = accumulation_.firstSample(params, traits(), lastFailed);
         info.accumulationId = params.accumulationId;
         info.wanted = TilePipeline::imageChannels(config_);
-        info.background = params.background;
+        for (std::size_t c = 0; c < info.background.size(); ++c)
+            info.background[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
         info.order = params_.order.get();
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
@@ -346,7 +348,7 @@ public:
         const EndOfFrame ending{*this};
         try {
             if (outcome_->failed())
-                outcome_->dropRest();
+                outcome_->dropRest(ErrorKind::Cancelled);
             else
                 outcome_->failWhole(errorInfo(ErrorKind::Cancelled,
                                               "the frame was left without end(). If by an exception: Frame::guard() "
@@ -367,12 +369,12 @@ public:
         });
     }
 
-    Image imageOnAllRanks() override
+    Image imageOnAllRanks(Engine& gatherer) override
     {
         std::vector<std::byte> mine;
         image().forEachPlane(
             [&](const std::byte* bytes, std::size_t count) { mine.insert(mine.end(), bytes, bytes + count); });
-        const auto all = mailbox_->allGather(mine, "imageOnAllRanks()");
+        const auto all = gatherer.allGather(mine, "imageOnAllRanks()");
         const std::vector<std::byte>& displayed = all[static_cast<std::size_t>(config_.image.displayRank)];
         if (displayed.empty())
             return {};
@@ -532,7 +534,9 @@ private:
     void handle(int source, const MessageHeader& header, Buffer&& message)
     {
         const MessageKind kind = header.kind;
-        if (mailbox_->receiveCredit(source, header, message) || outcome_->receive(source, header, message))
+        if (mailbox_->receiveCredit(source, header, message))
+            return outcome_->tryVote(); // it may have waited for that
+        if (outcome_->receive(source, header, message))
             return;
         FinalGather& gather = pipeline_->gather();
         if (kind == MessageKind::ImagePlace) {

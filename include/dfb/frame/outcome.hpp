@@ -89,18 +89,21 @@ public:
             tellOthers(placed(reason));
         if (!failure.inTime)
             frame_.countLate(); // too late to matter to this frame
-        dropRest();
+        dropRest(reason.kind);
         tryVote();
         return failure.inTime;
     }
 
     // The frame has failed: messages that have not left count no more, unless finished tiles are wanted.
-    void dropRest()
+    void dropRest(ErrorKind why)
     {
-        mailbox_.flow().drop([this](const Buffer& message) {
-            return terms_.allowPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
-        });
-        if (terms_.allowPartial && !frame_.areTilesFinished())
+        const bool isPartial = terms_.allowPartial;
+        const auto matters = [isPartial](const Buffer& message) {
+            return isPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
+        };
+        // Where something is missing, credit may be missing, too: nobody waits for it then.
+        mailbox_.flow().drop(matters, isPartial && !isMissing(why));
+        if (isPartial && !frame_.areTilesFinished())
             tiles_.gather().flush();
     }
 
@@ -257,7 +260,7 @@ private:
             info.tile = info.expected = -1; // it must not pass for the list of the rank that it came from
         }
         frame_.failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
-        dropRest();
+        dropRest(info.kind);
         tryVote();
     }
 
@@ -297,11 +300,14 @@ private:
     bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
 
     // Where only end() moves messages, all that others have sent must have been taken before any rank may leave: who
-    // polls no more takes nothing, and its sender would wait in end() for it to go.
+    // polls no more takes nothing, and its sender would wait in end() for it to go. In a frame that may be partial
+    // credit must not be waited for after that, either: who has left gives none.
     bool mayVote() const
     {
         Connection& connection = mailbox_.connection();
-        return !connection.needsCaller() || (mailbox_.flow().allSent() && connection.quiet());
+        if (connection.needsCaller() && !connection.quiet())
+            return false;
+        return !(connection.needsCaller() || terms_.allowPartial) || mailbox_.flow().allSent();
     }
 
     // ---- waiting

@@ -143,7 +143,7 @@ private:
         s.add("FrameConfig::order", hashText(orderHash));
         s.add("FrameConfig::owners", hashText(ownersHash));
         s.add("FrameConfig::declared", declared != 0);
-        s.add("FrameConfig::timeout", timeoutMs);
+        s.add("FrameConfig::timeout", printed("%lld ms", static_cast<long long>(timeoutMs)));
         s.add("FrameConfig::allowPartial", allowPartial != 0);
         return s.text();
     }

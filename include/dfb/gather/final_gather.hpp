@@ -590,13 +590,16 @@ private:
             spareBatches_.push_back(std::move(batch));
         }
         if (compresses_) {
-            Buffer packed = pool_->acquire(prefix + config_.messages.codec->bound(h.rawBytes));
-            const std::size_t bytes =
-                config_.messages.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
-            if (bytes < h.rawBytes) {
-                packed.shrink(prefix + bytes);
-                message = std::move(packed);
-                h.codec = config_.messages.codec->id();
+            try {
+                Buffer packed = pool_->acquire(prefix + config_.messages.codec->bound(h.rawBytes));
+                const std::size_t bytes =
+                    config_.messages.codec->compress(message.data() + prefix, h.rawBytes, packed.data() + prefix);
+                if (bytes < h.rawBytes) {
+                    packed.shrink(prefix + bytes);
+                    message = std::move(packed);
+                    h.codec = config_.messages.codec->id();
+                }
+            } catch (const OutOfMemory&) { // as it is, then: it has been counted
             }
         }
         const auto m = MessageHeader::of(MessageKind::FinishedTiles, address_, frame_);

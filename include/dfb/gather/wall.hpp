@@ -47,6 +47,7 @@ public:
             return Agreement{true, describe(), mailbox_->rank()};
         });
     }
+    ~Wall() { mailbox_->stop(); } // before mailbox_ is null: its tasks use it
 
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {

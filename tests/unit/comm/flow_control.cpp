@@ -483,7 +483,7 @@ TEST_CASE("After an epoch that lost messages or was dropped the next one works l
             const bool lose = random() % 2; // else what is on its way comes when its epoch is over
             for (int rank = 0; rank < c.ranks; ++rank)
                 if (random() % 2)
-                    network.flow(rank).drop([](const dfb::Buffer&) { return false; });
+                    network.flow(rank).drop([](const dfb::Buffer&) { return false; }, random() % 2 == 0);
             network.run(random() % 20);
             if (lose)
                 network.loseAll();
@@ -674,13 +674,21 @@ TEST_CASE("More than a pool is neither granted nor asked for", "[flow]")
     CHECK(link.credits[0].granted == 350);
 }
 
-TEST_CASE("drop() forgets what waits and nobody has asked for, and keeps nothing more; a new epoch does", "[flow]")
+TEST_CASE("drop() forgets what waits, or what nobody has asked for, and keeps nothing more; a new epoch does", "[flow]")
 {
+    for (const bool keepsAsked : {false, true}) {
+        Link link(2, 400);
+        for (int i = 0; i < 10; ++i)
+            link.send(50);
+        CHECK(link.flow->underWay() == 500);
+        link.flow->drop([](const dfb::Buffer&) { return false; }, keepsAsked);
+        CHECK(link.flow->underWay() == (keepsAsked ? 250 : 200));
+        CHECK(link.flow->allSent() != keepsAsked);
+    }
     Link link(2, 400);
     for (int i = 0; i < 10; ++i)
         link.send(50);
-    CHECK(link.flow->underWay() == 500);
-    link.flow->drop([](const dfb::Buffer&) { return false; });
+    link.flow->drop([](const dfb::Buffer&) { return false; }, true);
     // What is on its way, and the message whose credit the receiver will set aside: if it stayed unused, others would
     // get none.
     CHECK(link.flow->underWay() == 250);

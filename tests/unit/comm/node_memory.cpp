@@ -18,6 +18,7 @@
 
 #if defined(__linux__)
 #include <sys/mman.h>
+#include <sys/resource.h>
 #include <sys/wait.h>
 #include <unistd.h>
 
@@ -106,6 +107,18 @@ TEST_CASE("A doorbell ends a nap, or the next one, and wakes only who wants to b
     };
     CHECK(timeOf(minutes(1)) < seconds(30));
     CHECK(timeOf(milliseconds(20)) >= milliseconds(20));
+}
+
+TEST_CASE("Where files may not be that long there is no memory, and the process goes on", "[memory]")
+{
+    rlimit before;
+    REQUIRE(getrlimit(RLIMIT_FSIZE, &before) == 0);
+    rlimit low = before;
+    low.rlim_cur = 1 << 20;
+    REQUIRE(setrlimit(RLIMIT_FSIZE, &low) == 0);
+    const auto memory = NodeMemory::create(); // no assertion yet: it may write to a file
+    REQUIRE(setrlimit(RLIMIT_FSIZE, &before) == 0);
+    CHECK_FALSE(memory);
 }
 
 TEST_CASE("What one process writes another reads in the same place, and gives back", "[memory]")
