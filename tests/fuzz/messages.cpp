@@ -565,8 +565,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
                        ToAnother);
         return text;
     };
-    const std::string wallVote =
-        of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "", 1}.bytes()), ToAnother);
+    const std::string wallVote = of(MessageKind::ReduceUp, reductionOf(OwnScope, {}), ToAnother);
     const auto frameOf = [&](Way way, bool isFirst = true) {
         std::string text = inputs(way);
         if (way.has(Declared)) {
@@ -604,7 +603,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
     add("wall_twice", {0, Wall}, partsOf({{8, 0, 10, 8}, {8, 1, 10, 2}}) + frameOf({0, Wall}));
     add("wall_part_beyond", {0, Wall}, partsOf({{8, 0, 11, 8}}) + frameOf({0, Wall}));
     add("wall_vote_broken", {0, Wall},
-        of(MessageKind::ReduceUp, reductionOf(OwnScope, {}), ToAnother) + frameOf({0, Wall}));
+        of(MessageKind::ReduceUp, Output().put(+OwnScope).text("no").bytes(), ToAnother) + frameOf({0, Wall}));
     add("to_nobody", {}, of(MessageKind::Fragment, "lost", ToAnother) + frameOf({}));
     const auto jobs = [](std::int64_t from, std::int64_t to) {
         return of(MessageKind::Jobs, Output().put(from).put(to).bytes(), Awaited);

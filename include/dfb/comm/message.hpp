@@ -123,7 +123,7 @@ enum class MessageKind : std::uint8_t {
 
 struct MessageHeader {
     static constexpr std::uint16_t magicNumber = 0x0dfb, magicSwapped = 0xfb0d;
-    static constexpr std::uint8_t formatVersion = 12;
+    static constexpr std::uint8_t formatVersion = 13;
 
     std::uint16_t magic = magicNumber; // in the sender's byte order
     std::uint8_t version = formatVersion;

@@ -20,7 +20,6 @@
 #include <new>
 #include <optional>
 #include <string>
-#include <string_view>
 #include <utility>
 #include <vector>
 
@@ -65,30 +64,27 @@ public:
             deadline = std::chrono::steady_clock::now() + timeout;
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
-        const std::string missing = whatIsMissing(frame);
-        Agreement mine{missing.empty(), missing, mailbox_->rank()};
-        const auto all = Agreement::from(mailbox_->reduce(mine.bytes(), Agreement::combine));
+        const std::optional<ErrorInfo> mine = whatIsMissing(frame);
+        ByteWriter missing; // empty if nothing is
+        if (mine)
+            detail::put(missing, *mine);
+        const Bytes all =
+            mailbox_->reduce(missing.bytes(), [](const Bytes& a, const Bytes& b) { return a.empty() ? b : a; });
         const std::lock_guard<std::mutex> lock(mutex_);
-        if (const auto done = coming_.find(frame); done != coming_.end() && all.fine)
+        if (const auto done = coming_.find(frame); done != coming_.end() && all.empty())
             for (auto& [display, picture] : *done->second)
                 std::swap(shown_.at(display), picture.image);
-        if (all.fine)
+        if (all.empty())
             shownFrame_ = frame;
         mailbox_->reductions().forget(SentPixels, frame);
         coming_.erase(coming_.begin(), coming_.upper_bound(frame)); // also parts of failed frames
         sent_.erase(sent_.begin(), sent_.upper_bound(frame));
         allSent_.erase(allSent_.begin(), allSent_.upper_bound(frame));
         last_ = frame;
-        if (isMalformed(missing) && frame >= errorFrame_)
+        if (mine && mine->kind == ErrorKind::MalformedMessage && frame >= errorFrame_)
             error_.clear();
-        if (!all.fine) {
-            const bool isUnsent = all.text.find(unsent) != std::string::npos;
-            ErrorInfo info = isMalformed(all.text)
-                                 ? errorInfo(ErrorKind::MalformedMessage, all.text.substr(malformed.size()))
-                                 : errorInfo(isUnsent ? ErrorKind::MissingInput : ErrorKind::TimedOut, all.text);
-            info.frame = frame;
-            throw Error(std::move(info), mailbox_->connection().throwByAll());
-        }
+        if (ByteReader in(all); in.left() > 0)
+            throw Error(getErrorInfo(in), mailbox_->connection().throwByAll());
     }
 
     const Image& image(int display) const
@@ -147,12 +143,6 @@ private:
     static constexpr std::int64_t framesAhead = 16;
     static constexpr std::size_t framesKept = 16;
 
-    // In front of an Agreement's text that is not about time.
-    static constexpr std::string_view malformed = "malformed: ";
-    static bool isMalformed(const std::string& text) { return text.compare(0, malformed.size(), malformed) == 0; }
-    // Ends the text on the parts that a display misses.
-    static constexpr const char* unsent = " that no rank has sent";
-
     enum Scope : std::uint32_t { SentPixels = Mailbox::ownScope + 1 }; // of reductions
 
     struct Picture {
@@ -161,7 +151,7 @@ private:
         std::vector<std::uint64_t> covered{}; // a bit for each pixel, each row from a word on
     };
     using Pictures = std::map<int, Picture>; // by display
-    using Sums = ReductionTable::Bytes;
+    using Bytes = ReductionTable::Bytes;
 
     std::string describe() const
     {
@@ -368,15 +358,15 @@ private:
         mine.resize(static_cast<std::size_t>(layout_.displayCount()));
         const auto* first = reinterpret_cast<const std::byte*>(mine.data());
         mailbox_->reductions().enter(
-            {SentPixels, frame}, Sums(first, first + mine.size() * sizeof mine[0]),
-            [](const Sums& a, const Sums& b) { // equally long: receiveSent()
+            {SentPixels, frame}, Bytes(first, first + mine.size() * sizeof mine[0]),
+            [](const Bytes& a, const Bytes& b) { // equally long: receiveSent()
                 ByteReader x(a), y(b);
                 ByteWriter sums;
                 while (x.left() > 0)
                     sums.put(x.get<std::uint64_t>() + y.get<std::uint64_t>());
                 return sums.bytes();
             },
-            [this, frame](const Sums& all) {
+            [this, frame](const Bytes& all) {
                 {
                     const std::lock_guard<std::mutex> lock(mutex_);
                     if (frame <= last_)
@@ -426,20 +416,23 @@ private:
         return !error_.empty();
     }
 
-    std::string whatIsMissing(std::int64_t frame)
+    std::optional<ErrorInfo> whatIsMissing(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
+        ErrorInfo info = errorInfo(ErrorKind::MalformedMessage, error_);
+        info.frame = frame;
         if (!error_.empty())
-            return std::string(malformed) + error_;
-        std::string text;
-        for (const auto& [display, image] : shown_) {
-            const std::int64_t left = pixelsLeft(frame, display);
-            if (left > 0)
-                text +=
-                    printed("%sdisplay %d of rank %d misses %lld pixels%s", text.empty() ? "" : ", ", display,
-                            mailbox_->rank(), static_cast<long long>(left), hasAllSent(frame, display) ? unsent : "");
-        }
-        return text;
+            return info;
+        info.kind = ErrorKind::TimedOut;
+        for (const auto& [display, image] : shown_)
+            if (const std::int64_t left = pixelsLeft(frame, display); left > 0) {
+                const bool isUnsent = hasAllSent(frame, display);
+                info.kind = isUnsent ? ErrorKind::MissingInput : info.kind;
+                info.message +=
+                    printed("%sdisplay %d of rank %d misses %lld pixels%s", info.message.empty() ? "" : ", ", display,
+                            mailbox_->rank(), static_cast<long long>(left), isUnsent ? " that no rank has sent" : "");
+            }
+        return info.message.empty() ? std::nullopt : std::optional<ErrorInfo>(std::move(info));
     }
 
     WallLayout layout_;
