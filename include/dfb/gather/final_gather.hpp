@@ -37,8 +37,8 @@ public:
 
     // Where a finished tile goes.
     struct Place : FinishedPlanes {
-        Buffer own;         // of the planes, if they are to be sent
-        ImageWriter writer; // into the image of another rank
+        Buffer own;               // of the planes, if they are to be sent
+        ImageGate::Writer writer; // into the image of another rank
         // In the image: see BackgroundPixels. Else 0.
         std::int64_t imageEpoch = 0;
     };
@@ -200,7 +200,7 @@ public:
         if (isDisplay())
             return inImage(image_.planesAt(0), region);
         if (SharedImage image = remote(); image.gate)
-            if (ImageWriter writer(*image.gate, frame_); writer) {
+            if (auto writer = image.gate->enter(frame_)) {
                 place = inImage(image.planes, region);
                 place.writer = std::move(writer);
                 return place;

@@ -9,6 +9,7 @@
 #include <atomic>
 #include <chrono>
 #include <cstdint>
+#include <memory>
 #include <thread>
 #include <utility>
 
@@ -18,16 +19,20 @@ namespace detail {
 // Lies in shared memory. A writer says that it is there and then looks whether the gate is open; who closes it closes
 // it and then looks whether anybody is there: one of them sees the other.
 class ImageGate {
+    struct Leave {
+        void operator()(ImageGate* gate) const noexcept { gate->writers_.fetch_sub(1); }
+    };
+
 public:
-    bool enter(std::int64_t frame) noexcept
+    // Somebody who is inside; null: nobody.
+    using Writer = std::unique_ptr<ImageGate, Leave>;
+
+    Writer enter(std::int64_t frame) noexcept
     {
         writers_.fetch_add(1);
-        if (frame_.load() == frame)
-            return true;
-        leave();
-        return false;
+        Writer writer(this);
+        return frame_.load() == frame ? std::move(writer) : nullptr;
     }
-    void leave() noexcept { writers_.fetch_sub(1); }
 
     void open(std::int64_t frame) noexcept { frame_.store(frame); } // not 0
     // False if a writer does not leave in time; it may have died.
@@ -48,28 +53,6 @@ private:
     std::atomic<std::int32_t> writers_{0};
 };
 static_assert(std::atomic<std::int64_t>::is_always_lock_free && std::atomic<std::int32_t>::is_always_lock_free);
-
-// Somebody who is inside.
-class ImageWriter {
-public:
-    ImageWriter() = default;
-    ImageWriter(ImageGate& gate, std::int64_t frame) : gate_(gate.enter(frame) ? &gate : nullptr) {}
-    ImageWriter(ImageWriter&& other) noexcept : gate_(std::exchange(other.gate_, nullptr)) {}
-    ImageWriter& operator=(ImageWriter&& other) noexcept
-    {
-        std::swap(gate_, other.gate_);
-        return *this;
-    }
-    ~ImageWriter()
-    {
-        if (gate_)
-            gate_->leave();
-    }
-    explicit operator bool() const noexcept { return gate_ != nullptr; }
-
-private:
-    ImageGate* gate_ = nullptr;
-};
 
 // Where the gate and the planes of an image lie in its rank's shared memory, as that counts places; -1: nowhere. The
 // display rank tells it to the ranks that see its memory.

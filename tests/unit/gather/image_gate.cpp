@@ -13,34 +13,33 @@
 namespace image_gate_cases {
 
 using dfb::detail::ImageGate;
-using dfb::detail::ImageWriter;
 using std::chrono::milliseconds;
 
 TEST_CASE("Only writers of the frame that is open get in", "[gather]")
 {
     ImageGate gate;
-    CHECK_FALSE(ImageWriter(gate, 1));
+    CHECK_FALSE(gate.enter(1));
     gate.open(1);
-    CHECK(ImageWriter(gate, 1));
-    CHECK_FALSE(ImageWriter(gate, 2));
+    CHECK(gate.enter(1));
+    CHECK_FALSE(gate.enter(2));
     CHECK(gate.close(milliseconds(0)));
-    CHECK_FALSE(ImageWriter(gate, 1));
+    CHECK_FALSE(gate.enter(1));
     gate.open(2);
-    CHECK_FALSE(ImageWriter(gate, 1));
-    CHECK(ImageWriter(gate, 2));
+    CHECK_FALSE(gate.enter(1));
+    CHECK(gate.enter(2));
 }
 
 TEST_CASE("A gate does not close before all writers have left, and says if it cannot", "[gather]")
 {
     ImageGate gate;
     gate.open(5);
-    ImageWriter first(gate, 5), second(gate, 5);
-    ImageWriter moved = std::move(first);
+    ImageGate::Writer first = gate.enter(5), second = gate.enter(5);
+    ImageGate::Writer moved = std::move(first);
     CHECK_FALSE(gate.close(milliseconds(1)));
-    CHECK_FALSE(ImageWriter(gate, 5));
-    moved = ImageWriter();
+    CHECK_FALSE(gate.enter(5));
+    moved = nullptr;
     CHECK_FALSE(gate.close(milliseconds(1)));
-    second = ImageWriter();
+    second = nullptr;
     CHECK(gate.close(milliseconds(0)));
 }
 
@@ -60,7 +59,7 @@ TEST_CASE("Nobody writes once the gate is closed", "[gather]")
                     std::this_thread::yield();
                     continue;
                 }
-                if (const ImageWriter writer(gate, frame); writer) {
+                if (const auto writer = gate.enter(frame)) {
                     ++image;
                     ++written;
                 }
