@@ -350,16 +350,13 @@ private:
         Bytes bytes() const
         {
             ByteWriter out;
-            out.put(terms);
-            out.put(report);
+            out.put(*this);
             return out.bytes();
         }
         static Round from(const Bytes& bytes)
         {
             ByteReader in(bytes);
-            Round round;
-            round.terms = in.get<FrameTerms>();
-            round.report = in.get<Quiescence::Report>();
+            const auto round = in.get<Round>();
             in.end();
             return round;
         }
