@@ -423,19 +423,10 @@ private:
 
     static bool allComplete(const Slot& slot)
     {
-        for (const DependencyTracker& tree : slot.trees)
-            if (!tree.complete())
-                return false;
-        return true;
+        return std::all_of(slot.trees.begin(), slot.trees.end(), [](const auto& tree) { return tree.complete(); });
     }
 
-    static bool becomesReady(Slot& slot, bool now)
-    {
-        if (slot.ready || !now)
-            return false;
-        slot.ready = true;
-        return true;
-    }
+    static bool becomesReady(Slot& slot, bool now) { return now && !std::exchange(slot.ready, true); }
 
     const OperationTraits& traits() const noexcept { return operations_.traits(); }
 
