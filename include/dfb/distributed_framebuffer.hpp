@@ -239,7 +239,11 @@ public:
         // Makes the frame fail on all ranks with ErrorKind::Cancelled, because nobody needs it any more. Call end() all
         // the same. Tiles that are set later are dropped. Does nothing after end(). Any thread, also during end().
         // Waits for nothing.
-        void cancel() const { engine_->cancel(number_); }
+        void cancel() const
+        {
+            const Error reason(detail::errorInfo(ErrorKind::Cancelled, "the frame was cancelled"));
+            engine_->abort(number_, std::make_exception_ptr(reason), -1);
+        }
 
         // Ends the frame. Call it once. Collective; with several framebuffers, in the same order on all ranks. This
         // rank's last setTile() must have returned: an input that is not sent when all ranks are in end() counts as

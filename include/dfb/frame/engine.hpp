@@ -63,7 +63,6 @@ public:
     virtual void noteMergeError(int tile, double bound) = 0;
     virtual bool failed() const noexcept = 0;
     virtual void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) = 0;
-    virtual void cancel(std::int64_t frame) = 0;
     virtual void requireProgress() const = 0;
     virtual void tryVote() = 0; // again, as messages have moved
     // Those of one framebuffer: when one has moved messages, all try to vote. At first it is alone.

@@ -334,14 +334,6 @@ public:
         return report;
     }
 
-    void cancel(std::int64_t frame) override
-    {
-        if (!open_.enter(frame))
-            return; // it is over
-        const OpenFrame::Inside inside(open_);
-        outcome_->fail(errorInfo(ErrorKind::Cancelled, "the frame was cancelled"));
-    }
-
     // A frame that is left without end(), mostly while an exception passes.
     void leave() noexcept override
     {
