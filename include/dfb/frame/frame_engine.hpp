@@ -38,11 +38,11 @@ public:
     // `operations` must live as long as this; `slot`: which of config.framesInFlight engines this is.
     FrameEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config, Operations& operations, int slot = 0)
         : pool_(connection->pool()), config_(std::move(config)), operations_(operations),
-          open_(slot + 1, std::max(1, config_.framesInFlight))
+          open_(slot + 1, std::max(1, config_.framesInFlight)),
+          compression_(config_.messages.codec, config_.messages.compression, connection->size())
     {
         config_.messages.poolBytes =
             std::max(config_.messages.poolBytes, 4 * TilePipeline::largestMessage(traits(), config_));
-        compression_.emplace(config_.messages.codec, config_.messages.compression, connection->size());
         MailboxOwner& self = *this;
         mailbox_ = std::make_unique<Mailbox>(std::move(connection), config_.executor, config_.messages.poolBytes, self,
                                              config_.trace.get());
@@ -309,10 +309,10 @@ public:
         const Verdict verdict = outcome_->conclude();
         if (verdict.error && !outcome_->isPartial(verdict))
             throw FrameError(*verdict.error, mailbox_->connection().throwByAll());
-        const bool compressed = compression_->isOn();
+        const bool compressed = compression_.isOn();
         pipeline_->fillBackground();
         if (!verdict.error) {
-            compression_->endFrame(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
+            compression_.endFrame(static_cast<double>(verdict.maxima[Verdict::TotalNs]));
             accumulation_.ended(params_, pipeline_->table().frameInfo().firstSample);
         }
 
@@ -391,7 +391,7 @@ private:
     // See Compression.
     const Codec* codecFor(int other) const
     {
-        return other == rank() ? nullptr : compression_->codecFor(other, mailbox_->connection().isSeenBy(other));
+        return other == rank() ? nullptr : compression_.codecFor(other, mailbox_->connection().isSeenBy(other));
     }
 
     // Tells the trace of the frame when it has ended, in whatever way.
@@ -476,7 +476,7 @@ private:
     void sendToDisplay(Buffer&& message, std::size_t raw)
     {
         if (raw > 0)
-            compression_->sent(config_.image.displayRank, raw, message.size());
+            compression_.sent(config_.image.displayRank, raw, message.size());
         mailbox_->send(config_.image.displayRank, std::move(message));
     }
 
@@ -591,7 +591,7 @@ private:
         const Codec* codec = codecFor(owner);
         Buffer message = pipeline_->encode(tile, codec, isFar(owner));
         if (codec)
-            compression_->sent(owner, rawFragmentBytes(message), message.size());
+            compression_.sent(owner, rawFragmentBytes(message), message.size());
         return message;
     }
 
@@ -662,13 +662,6 @@ private:
         }
     }
 
-    // False if an operation has thrown.
-    bool finish(int tile, const ErrorInfo& where)
-    {
-        const TraceSpan span(config_.trace.get(), TraceEvent::Kind::Finish, open_.number(), tile);
-        return outcome_->guarded([&] { pipeline_->finish(tile); }, where);
-    }
-
     // A tile that is complete.
     void work(int tile) override
     {
@@ -676,7 +669,11 @@ private:
         ErrorInfo where;
         where.tile = tile;
         if (open_.beginReading()) {
-            const bool finished = finish(tile, where);
+            const auto finish = [&] {
+                const TraceSpan span(config_.trace.get(), TraceEvent::Kind::Finish, open_.number(), tile);
+                pipeline_->finish(tile);
+            };
+            const bool finished = outcome_->guarded(finish, where);
             if ((finished || params_.allowPartial) && open_.tileFinished())
                 outcome_->guarded([&] { allFinished(); }, where);
             endReading();
@@ -748,7 +745,7 @@ private:
         v.sums.repeatedMessages = repeated - repeatedBefore_;
         v.sums.orderUndefinedPixels = reports.orderUndefinedPixels;
         v.sums.alphaOutsidePixels = pipeline_->faults().alphaOutside;
-        v.sums.compressedLinks = compression_->links();
+        v.sums.compressedLinks = compression_.links();
         v.sums.inputsLeft = inputsSent_ - pipeline_->table().arrivedCount();
         v.sums.tilesEndedEarly = pipeline_->table().endedEarlyCount();
         v.maxima[Verdict::PeakMemoryBytes] = static_cast<std::int64_t>(pool_->peakBytes());
@@ -798,7 +795,7 @@ private:
     FrameConfig params_;
     Accumulation accumulation_;
     FrameFigures figures_;
-    std::optional<Compression> compression_;
+    Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
     std::atomic<std::int64_t> renderNs_{-1};  // until end() was called; -1: it was not
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
