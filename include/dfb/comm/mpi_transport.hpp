@@ -259,12 +259,6 @@ private:
         std::vector<Transfer> items;
     };
 
-    struct Announced {
-        int source;
-        int tag;
-        std::uint64_t byteCount;
-    };
-
     struct Peer {
         detail::Fifo<Buffer> waiting;
         int inFlight = 0; // sends to it that have not completed
@@ -494,7 +488,7 @@ private:
             packet.data.data(), byteCountOf(status), [&](const Record& record, const std::byte* payload) {
                 const auto payloadBytes = static_cast<std::size_t>(record.byteCount);
                 if (record.kind == Record::Announcement) {
-                    announced_.push({source, record.tag, record.byteCount});
+                    announced_.push({source, record});
                 } else if (record.kind == Record::Lent) {
                     const auto& memory = ranks_[source].itsMemory;
                     Buffer message = memory ? memory->borrow(record.tag, record.byteCount) : Buffer();
@@ -519,8 +513,8 @@ private:
     bool receiveBodies()
     {
         while (!announced_.empty() && receives_.requests.size() < bodiesAtOnce) {
-            const Announced next = announced_.pop();
-            receive(receives_, {pool_->acquire(static_cast<std::size_t>(next.byteCount)), 0, next.source, next.tag});
+            const auto [source, record] = announced_.pop();
+            receive(receives_, {pool_->acquire(static_cast<std::size_t>(record.byteCount)), 0, source, record.tag});
         }
         return testSome(receives_, [this](Transfer& body, const MPI_Status& status) {
             if (byteCountOf(status) != static_cast<std::size_t>(body.count()))
@@ -732,7 +726,7 @@ private:
     detail::PacketWriter packet_;                    // that is being filled
     std::vector<Transfer> bodies_;                   // to follow it
     Transfers sends_, receives_, notices_, packets_; // packets_: the posted receives
-    detail::Fifo<Announced> announced_;
+    detail::Fifo<std::pair<int, Record>> announced_; // messages of these ranks that are to follow
     std::vector<int> indices_;
     std::vector<MPI_Status> statuses_;
 };
