@@ -4,6 +4,7 @@
 #include <dfb/buffer.hpp>
 #include <dfb/error.hpp>
 
+#include <algorithm>
 #include <array>
 #include <cstddef>
 #include <cstdint>
@@ -153,6 +154,15 @@ T loadAs(const std::byte* bytes)
     return value;
 }
 
+// Writes values one after the other; returns where the last ends.
+template <class... Values>
+std::byte* storeAll(std::byte* to, const Values&... values)
+{
+    static_assert((std::is_trivially_copyable_v<Values> && ...));
+    ((std::memcpy(to, &values, sizeof values), to += sizeof values), ...);
+    return to;
+}
+
 // Returns the body of a message that has a header, one Body, and nothing else. Throws Error (MalformedMessage)
 // otherwise.
 template <class Body>
@@ -193,9 +203,7 @@ struct Arrival {
 inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const std::byte* body, std::size_t byteCount)
 {
     Buffer message = pool.acquire(sizeof header + byteCount);
-    std::memcpy(message.data(), &header, sizeof header);
-    if (byteCount > 0)
-        std::memcpy(message.data() + sizeof header, body, byteCount);
+    std::copy_n(body, byteCount, storeAll(message.data(), header));
     return message;
 }
 

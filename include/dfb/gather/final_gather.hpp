@@ -288,10 +288,8 @@ public:
                 return;
             const auto header = MessageHeader::of(MessageKind::TilesDone, address_, frame_);
             done = pool_->acquire(sizeof header + sizeof sent_ + sizeof(std::int32_t) * placed_.size()); // may throw
-            std::memcpy(done.data(), &header, sizeof header);
-            std::memcpy(done.data() + sizeof header, &sent_, sizeof sent_);
-            std::copy(placed_.begin(), placed_.end(),
-                      reinterpret_cast<std::int32_t*>(done.data() + sizeof header + sizeof sent_));
+            std::byte* const tiles = storeAll(done.data(), header, sent_);
+            std::copy(placed_.begin(), placed_.end(), reinterpret_cast<std::int32_t*>(tiles));
             flushed_ = true;
             if (batch_) {
                 batch_->closed = true;
@@ -602,9 +600,7 @@ private:
             } catch (const OutOfMemory&) { // as it is, then: it has been counted
             }
         }
-        const auto m = MessageHeader::of(MessageKind::FinishedTiles, address_, frame_);
-        std::memcpy(message.data(), &m, sizeof m);
-        std::memcpy(message.data() + sizeof m, &h, sizeof h);
+        storeAll(message.data(), MessageHeader::of(MessageKind::FinishedTiles, address_, frame_), h);
         send_(std::move(message), compresses_ ? prefix + h.rawBytes : 0);
     }
 

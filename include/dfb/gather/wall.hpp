@@ -117,9 +117,7 @@ public:
                 d, {part.x0 - display.x0, part.y0 - display.y0, part.x1 - display.x0, part.y1 - display.y0}};
             const auto width = static_cast<std::size_t>(part.width());
             Buffer message = pool_->acquire(prefix + width * static_cast<std::size_t>(part.height()) * pixelBytes);
-            std::memcpy(message.data(), &header, sizeof header);
-            std::memcpy(message.data() + sizeof header, &where, sizeof where);
-            std::byte* out = message.data() + prefix;
+            std::byte* out = storeAll(message.data(), header, where);
             for (int y = part.y0; y < part.y1; ++y, out += width * pixelBytes) {
                 const std::size_t first = static_cast<std::size_t>(y - tile.region.y0) * tileWidth
                                           + static_cast<std::size_t>(part.x0 - tile.region.x0);

@@ -184,9 +184,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     });
     if (codec && payload > 0)
         compress(pool, *codec, h, message);
-    const auto m = MessageHeader::of(MessageKind::Fragment, receiver, tile.frame);
-    std::memcpy(message.data(), &m, sizeof m);
-    std::memcpy(message.data() + sizeof m, &h, sizeof h);
+    storeAll(message.data(), MessageHeader::of(MessageKind::Fragment, receiver, tile.frame), h);
     return message;
 }
 
@@ -231,7 +229,6 @@ template <class OffsetOf>
 Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPlace& pixels, ChannelMask channels,
                      std::uint32_t receiver, const OffsetOf& offsetOf)
 {
-    const std::int64_t colorBytes = pixels.activity.hasBytes ? 4 : 16;
     // Offset of a plane's first pixel, if all of its valid ones are in the memory.
     const auto placeOf = [&](const std::byte* plane, std::int64_t pixelBytes) -> std::int64_t {
         const ByteRange bytes = bytesOfPlane(0, pixels.stride, pixels.valid, pixelBytes);
@@ -239,7 +236,7 @@ Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPl
         return begin < 0 || end != begin + (bytes.end - bytes.begin) - 1 ? -1 : begin - bytes.begin;
     };
     PlaceInMemory place;
-    place.color = placeOf(pixels.color, colorBytes);
+    place.color = placeOf(pixels.color, pixels.activity.colorBytes());
     place.depth = pixels.depth ? placeOf(reinterpret_cast<const std::byte*>(pixels.depth), 4) : -1;
     if (place.color < 0 || (pixels.depth && place.depth < 0))
         return Buffer();
@@ -253,11 +250,8 @@ Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPl
     h.shape.encoding = FragmentEncoding::InPlace;
     h.colorFormat = tile.hasBytes ? WireFormat::Bytes : WireFormat::Float32;
     h.rawPayloadBytes = sizeof place;
-    const auto m = MessageHeader::of(MessageKind::Fragment, receiver, tile.frame);
     Buffer message = pool.acquire(fragmentPrefix + sizeof place);
-    std::memcpy(message.data(), &m, sizeof m);
-    std::memcpy(message.data() + sizeof m, &h, sizeof h);
-    std::memcpy(message.data() + fragmentPrefix, &place, sizeof place);
+    storeAll(message.data(), MessageHeader::of(MessageKind::Fragment, receiver, tile.frame), h, place);
     return message;
 }
 
@@ -363,7 +357,7 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
     };
     p.activity = {byDepth, h.colorFormat == WireFormat::Bytes, place.depthLimit};
     p.stride = static_cast<std::ptrdiff_t>(place.stride);
-    p.color = planeAt(place.color, p.activity.hasBytes ? 4 : 16);
+    p.color = planeAt(place.color, p.activity.colorBytes());
     if (hasChannel(h.channels, Depth)) {
         if (place.depth % 4 != 0)
             failMalformed("a depth between two words", 0, place.depth % 4);
