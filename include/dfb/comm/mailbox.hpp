@@ -22,7 +22,6 @@
 #include <mutex>
 #include <optional>
 #include <thread>
-#include <type_traits>
 #include <utility>
 #include <vector>
 
@@ -140,9 +139,9 @@ public:
     template <class Body>
     void sendBody(int destination, MessageKind kind, std::int64_t number, const Body& body)
     {
-        static_assert(std::is_trivially_copyable_v<Body>);
-        const auto* first = reinterpret_cast<const std::byte*>(&body);
-        send(destination, kind, number, Bytes(first, first + sizeof body));
+        ByteWriter bytes;
+        bytes.put(body);
+        send(destination, kind, number, bytes.bytes());
     }
 
     static bool needsCredit(MessageKind kind)
@@ -625,10 +624,10 @@ private:
 
     void sendReduction(int destination, const ReductionKey& key, bool up, const Bytes& bytes)
     {
-        const auto* scope = reinterpret_cast<const std::byte*>(&key.scope);
-        Bytes body(scope, scope + sizeof key.scope);
-        body.append(bytes.begin(), bytes.end());
-        send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body);
+        ByteWriter body;
+        body.put(key.scope);
+        body.putBytes(bytes.begin(), bytes.end());
+        send(destination, up ? MessageKind::ReduceUp : MessageKind::ReduceDown, key.number, body.bytes());
     }
 
     void receive(int source, const MessageHeader& header, Buffer&& message) override
