@@ -314,19 +314,10 @@ public:
         gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
     }
 
-    // The frame has ended without these tiles; on the display rank also without those that have not come, and those
-    // that are background if that could not be made.
+    // The frame has ended without these tiles; see FinalGather.
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
-        for (int tile = 0; tile < table_.layout().tileCount(); ++tile)
-            if (gather_.hasNothing(tile)
-                && (gather_.isMissingFrom(table_.owner(tile))
-                    || (!backgroundIsFine_ && table_.samples(tile).count > 0)))
-                tiles.push_back(tile);
-        std::sort(tiles.begin(), tiles.end()); // an owner may have said so already
-        tiles.erase(std::unique(tiles.begin(), tiles.end()), tiles.end());
-        for (const std::int32_t tile : tiles)
-            gather_.setIncomplete(tile);
+        gather_.setIncomplete(tiles, [this](int tile) { return !backgroundIsFine_ && table_.samples(tile).count > 0; });
     }
 
     // Of the inputs of this frame that this rank has copied or read in place.

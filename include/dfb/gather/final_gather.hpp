@@ -374,24 +374,23 @@ public:
         imageFrame_ = frame_;
     }
 
-    // On the display rank: whether some tiles of that rank have not come.
-    bool isMissingFrom(int owner) const
+    // The frame is over without these tiles. On the display rank adds those that have not come, and those of the
+    // background that are `lost(tile)`; and hides them all.
+    template <class Lost>
+    void setIncomplete(std::vector<std::int32_t>& tiles, const Lost& lost)
     {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return isMissing(static_cast<std::size_t>(owner));
-    }
-    // On the display rank: hides a tile of a frame that is over. Called in the order of tiles.
-    void setIncomplete(int tile)
-    {
-        if (tile < 0 || tile >= static_cast<int>(state_.size()))
+        if (!displays())
             return;
-        state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
-        incomplete_.push_back(tile);
-    }
-    // On the display rank: whether nothing has come for the tile in this frame.
-    bool hasNothing(int tile) const
-    {
-        return !state_.empty() && state_[static_cast<std::size_t>(tile)] != TileState::Received;
+        const std::lock_guard<std::mutex> lock(mutex_);
+        for (int tile = 0; tile < layout_.tileCount(); ++tile)
+            if (state_[static_cast<std::size_t>(tile)] != TileState::Received
+                && (isMissing(static_cast<std::size_t>(ownerOf_(tile))) || lost(tile)))
+                tiles.push_back(tile);
+        std::sort(tiles.begin(), tiles.end()); // an owner may have said so already
+        tiles.erase(std::unique(tiles.begin(), tiles.end()), tiles.end());
+        for (const std::int32_t tile : tiles)
+            state_[static_cast<std::size_t>(tile)] = TileState::Undefined;
+        incomplete_ = tiles;
     }
     bool isComplete(int tile) const
     {
