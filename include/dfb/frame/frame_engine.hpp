@@ -104,20 +104,10 @@ public:
         params_ = params;
         declarations_.newFrame(!lastFailed, haveMoved); // after one that failed, owners may know of different ones
 
-        TileInfo info;
-        info.rank = rank();
-        info.frame = open_.next();
-        info.passes = params.passes;
-        info.firstSample = accumulation_.firstSample(params, traits(), lastFailed);
-        info.accumulationId = params.accumulationId;
-        info.wanted = TilePipeline::imageChannels(config_);
-        for (std::size_t c = 0; c < info.background.size(); ++c)
-            info.background[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
-        info.order = params_.order.get();
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            const bool goesOn = accumulation_.goesOn(params, traits(), lastFailed);
-            pipeline_->newFrame(info, params.samples, params.owners, haveMoved, goesOn, params.maxLayers,
+            pipeline_->newFrame(open_.next(), params_, accumulation_.firstSample(params, traits(), lastFailed),
+                                haveMoved, accumulation_.goesOn(params, traits(), lastFailed),
                                 codecFor(config_.image.displayRank) != nullptr);
             copyData();
         } catch (...) {
@@ -141,7 +131,7 @@ public:
                 kept.push_back(tile);
         }
         lastPoll_ = beginTime_ = Clock::now();
-        mailbox_->newEpoch(info.frame);
+        mailbox_->newEpoch(open_.next());
         mailbox_->connection().expectMessages(true);
         open(userError, params.declared ? 0 : rendered, kept);
     }

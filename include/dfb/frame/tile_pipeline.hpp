@@ -72,29 +72,38 @@ public:
     TileTable& table() noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
 
-    // No other member may be running. `haveMoved`: what table().prepare(owners) has returned. `goesOn`: whether
-    // the last frame's samples count on. `compresses`: whether finished tiles are compressed.
-    void newFrame(TileInfo info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved, bool goesOn,
-                  int maxLayers, bool compresses)
+    // No other member may be running. `params` must live until the next one. `firstSample`: see Accumulation.
+    // `haveMoved`: what table().prepare(params.owners) has returned. `goesOn`: whether the last frame's samples count
+    // on. `compresses`: whether finished tiles are compressed.
+    void newFrame(std::int64_t frame, const FrameConfig& params, int firstSample, bool haveMoved, bool goesOn,
+                  bool compresses)
     {
         faults_.reset();
         promises_.clear();
         reports_ = {{}, 0, goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
-        const bool hasPasses =
-            plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; }) : info.passes > 1;
-        if (!traits().takesOrder)
-            info.order = nullptr;
-        sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
+        const SamplePlan& plan = params.samples;
+        const bool hasPasses = plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; })
+                                    : params.passes > 1;
+        TileInfo info;
+        info.frame = frame;
+        info.passes = params.passes;
+        info.firstSample = firstSample;
+        info.accumulationId = params.accumulationId;
         info.minTransmittance = config_.minTransmittance;
-        background_ = info.background;
+        info.wanted = imageChannels(config_);
+        for (std::size_t c = 0; c < background_.size(); ++c)
+            background_[c] = params.background[c] + 0.0f; // -0 becomes 0, as it does where something is blended
+        info.background = background_;
+        info.order = traits().takesOrder ? params.order.get() : nullptr;
+        sent_ = travelling(traits(), config_, traits().keepsState || hasPasses, info.order != nullptr);
         backgroundIsFine_ = true;
-        table_.newFrame(info, plan, owners, haveMoved);
+        table_.newFrame(info, plan, params.owners, haveMoved);
         if (haveMoved)
             gather_.findSenders();
-        gather_.newFrame(info.frame, compresses, info.background);
+        gather_.newFrame(frame, compresses, background_);
         losses_.newFrame(isLossy() ? table_.layout().tileCount() : 0, config_.precision.maxColor, largestBackground(),
                          config_.minTransmittance);
-        setLayers(maxLayers);
+        setLayers(params.maxLayers);
     }
 
     ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame

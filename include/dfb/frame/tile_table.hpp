@@ -76,14 +76,15 @@ public:
     }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
-    // `info` is common to all tiles; `owners`: see prepare(), which was called with them. No other member may be
-    // running.
+    // `info` is common to all tiles, and gets this rank; `owners`: see prepare(), which was called with them. No other
+    // member may be running.
     void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved)
     {
         if (haveMoved)
             setOwners(owners ? owners : byMap_);
         expected_ = nullptr;
         info_ = info;
+        info_.rank = rank_;
         plan_ = plan;
         arrived_ = endedEarly_ = 0;
         for (std::size_t tile = 0; tile < series_.size(); ++tile)

@@ -22,7 +22,8 @@ std::string outcomeOf(const dfb::detail::OperationTraits& traits, dfb::WireForma
     dfb::FrameBufferConfig config(8, 8);
     config.precision = format;
     d::TilePipeline pipeline(dfb::MemoryPool::create(), config, operations, 0, 1, false, 0, nullptr);
-    pipeline.newFrame(dfb::TileInfo(), nullptr, nullptr, pipeline.table().prepare(nullptr), false, 1, false);
+    const dfb::FrameConfig params;
+    pipeline.newFrame(0, params, 0, pipeline.table().prepare(nullptr), false, false);
     const std::vector<float> pixels(4 * 64);
     dfb::TileView<Op::channels, 8> view;
     view.tile = 0;
