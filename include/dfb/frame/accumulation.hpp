@@ -13,16 +13,22 @@ namespace detail {
 
 class Accumulation {
 public:
+    struct Start {
+        bool goesOn = false; // whether the last frame's samples count on
+        int firstSample = 0; // of each tile in a frame without a plan of samples
+    };
+
     // Throws InvalidArgument for samples that this framebuffer cannot take. `lastFailed`: the last frame has.
-    void check(const FrameConfig& params, const OperationTraits& traits, int tileCount, int framesInFlight,
-               bool lastFailed) const
+    Start begin(const FrameConfig& params, const OperationTraits& traits, int tileCount, int framesInFlight,
+                bool lastFailed) const
     {
+        const bool goesOn = traits.keepsState && !lastFailed && params.accumulationId == lastId_;
         if (!params.samples) {
-            const int first = firstSample(params, traits, lastFailed);
+            const int first = goesOn ? next_ : 0;
             if (params.passes > std::numeric_limits<int>::max() - first)
                 failArgument("a tile cannot have %d samples from %d on: take another accumulationId", params.passes,
                              first);
-            return;
+            return {goesOn, first};
         }
         if (params.samples->size() != static_cast<std::size_t>(tileCount))
             failArgument("a plan of the samples of %zu tiles for an image of %d", params.samples->size(), tileCount);
@@ -30,7 +36,7 @@ public:
             if (t.first < 0 || t.count < 0 || t.count > std::numeric_limits<int>::max() - t.first)
                 failArgument("a tile cannot have %d samples from %d on", t.count, t.first);
             if (traits.keepsState) {
-                if ((t.first > 0 || t.count == 0) && !goesOn(params, traits, lastFailed))
+                if ((t.first > 0 || t.count == 0) && !goesOn)
                     failArgument("what was accumulated is of no use, as the last frame failed or had another "
                                  "accumulationId: begin again with sample 0 of each tile");
                 continue;
@@ -46,18 +52,7 @@ public:
             if (!traits.pixelOpIsPointwise)
                 failArgument("a tile without samples keeps its pixels, but the pixel operation wants all tiles");
         }
-    }
-
-    // Whether the last frame's samples count on.
-    bool goesOn(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
-    {
-        return traits.keepsState && !lastFailed && params.accumulationId == lastId_;
-    }
-
-    // Of each tile in a frame without a plan of samples.
-    int firstSample(const FrameConfig& params, const OperationTraits& traits, bool lastFailed) const
-    {
-        return !params.samples && goesOn(params, traits, lastFailed) ? next_ : 0;
+        return {goesOn, 0};
     }
 
     // The frame has ended well, and began with that sample.

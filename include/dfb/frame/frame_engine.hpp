@@ -97,7 +97,8 @@ public:
                          static_cast<long long>(frame()), config_.framesInFlight);
         FrameTerms::check(params, traits());
         const bool lastFailed = outcome_->lastFailed();
-        accumulation_.check(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
+        const auto start =
+            accumulation_.begin(params, traits(), layout().tileCount(), config_.framesInFlight, lastFailed);
         mailbox_->requireProgress();
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().prepare(params.owners);
@@ -106,8 +107,7 @@ public:
 
         std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
         try {
-            pipeline_->newFrame(open_.next(), params_, accumulation_.firstSample(params, traits(), lastFailed),
-                                haveMoved, accumulation_.goesOn(params, traits(), lastFailed),
+            pipeline_->newFrame(open_.next(), params_, start, haveMoved,
                                 codecFor(config_.image.displayRank) != nullptr);
             copyData();
         } catch (...) {

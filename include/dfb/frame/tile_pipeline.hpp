@@ -4,6 +4,7 @@
 
 #include <dfb/base/cpu.hpp>
 #include <dfb/frame.hpp>
+#include <dfb/frame/accumulation.hpp>
 #include <dfb/frame/operations.hpp>
 #include <dfb/frame/tile_table.hpp>
 #include <dfb/gather/final_gather.hpp>
@@ -72,22 +73,22 @@ public:
     TileTable& table() noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
 
-    // No other member may be running. `params` must live until the next one. `firstSample`: see Accumulation.
-    // `haveMoved`: what table().prepare(params.owners) has returned. `goesOn`: whether the last frame's samples count
-    // on. `compresses`: whether finished tiles are compressed.
-    void newFrame(std::int64_t frame, const FrameConfig& params, int firstSample, bool haveMoved, bool goesOn,
+    // No other member may be running. `params` must live until the next one. `haveMoved`: what
+    // table().prepare(params.owners) has returned. `compresses`: whether finished tiles are compressed.
+    void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool haveMoved,
                   bool compresses)
     {
         faults_.reset();
         promises_.clear();
-        reports_ = {{}, 0, goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
+        reports_ = {
+            {}, 0, start.goesOn ? reports_.wireErrorBound : 0}; // a mean is off by no more than its worst sample
         const SamplePlan& plan = params.samples;
         const bool hasPasses = plan ? std::any_of(plan->begin(), plan->end(), [](const auto& s) { return s.count > 1; })
                                     : params.passes > 1;
         TileInfo info;
         info.frame = frame;
         info.passes = params.passes;
-        info.firstSample = firstSample;
+        info.firstSample = start.firstSample;
         info.accumulationId = params.accumulationId;
         info.minTransmittance = config_.minTransmittance;
         info.wanted = imageChannels(config_);
