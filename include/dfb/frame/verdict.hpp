@@ -225,7 +225,7 @@ struct Verdict {
                && std::all_of(incomplete.begin(), incomplete.end(), [=](auto tile) { return tile < tileCount; });
     }
 
-    // Sets the figures of `report` that are the same on all ranks.
+    // Sets the figures of a new report that are the same on all ranks.
     void addTo(FrameReport& report) const
     {
         static_cast<FrameSums&>(report) = sums;
@@ -233,10 +233,8 @@ struct Verdict {
         report.renderMsMax = static_cast<double>(maxima[RenderNs]) / 1e6;
         report.peakInboxBytes = maxima[PeakInboxBytes];
         report.wireErrorBound = wireErrorBound;
-        report.mergeErrorBound = 0;
         for (const Figure& f : mergeErrors)
             report.mergeErrorBound = std::max(report.mergeErrorBound, f.value);
-        report.tileErrors.clear();
         for (const Figure& f : tileErrors)
             report.tileErrors.push_back({static_cast<int>(f.key), f.value});
         report.figures = figures;
