@@ -8,9 +8,9 @@ set(level_1 base/detect.hpp base/fifo.hpp base/function_ref.hpp channels.hpp com
             frame/hidden_tiles.hpp fwd.hpp testing/reference.hpp trace.hpp)
 set(level_2 base/cpu.hpp base/double_double.hpp buffer.hpp comm/compression.hpp comm/heartbeat.hpp error.hpp
             testing/error_report.hpp)
-set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/byte_io.hpp
-            comm/message.hpp comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp
-            comm/transport.hpp exec.hpp gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
+set(level_3 blend/background_pixels.hpp blend/blend_kernels.hpp blend/sort_kernels.hpp comm/message.hpp
+            comm/mpi_calls.hpp comm/node_memory.hpp comm/packet.hpp comm/snappy_codec.hpp comm/transport.hpp exec.hpp
+            gather/image_gate.hpp levels.hpp render/world.hpp wire/wire_format.hpp)
 set(level_4 blend/compositing.hpp comm/flow_control.hpp comm/mpi_ranks.hpp comm/mpi_session.hpp comm/progress.hpp
             comm/reduction.hpp frame/open_frame.hpp image.hpp tbb_executor.hpp testing/detail/conformance_tools.hpp
             trace_file.hpp)

@@ -1,7 +1,7 @@
 // ErrorInfo: what its one line says of ranks, and that all of it travels.
 #include "catch.hpp"
 
-#include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/error.hpp>
 
 #include <string>

@@ -3,7 +3,6 @@
 #pragma once
 
 #include <dfb/base/cpu.hpp>
-#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/comm/progress.hpp>
@@ -331,7 +330,7 @@ public:
         const auto header = detail::MessageHeader::of(detail::MessageKind::Failure);
         for (int other = 0; other < size(); ++other)
             if (other != rank())
-                send(other, detail::makeMessage(*pool_, header, body.bytes().data(), body.bytes().size()));
+                send(other, detail::makeMessage(*pool_, header, body.bytes()));
         tellReceivers();
         return true;
     }
@@ -487,7 +486,7 @@ private:
 
     void sendSign(int other, detail::MessageKind kind)
     {
-        send(other, detail::makeMessage(*pool_, detail::MessageHeader::of(kind), nullptr, 0));
+        send(other, detail::makeMessage(*pool_, detail::MessageHeader::of(kind)));
     }
 
     // Between two polls, by the thread that polls.

@@ -4,9 +4,9 @@
 
 #include <dfb/base/fifo.hpp>
 #include <dfb/base/function_ref.hpp>
-#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/connection.hpp>
 #include <dfb/comm/flow_control.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/comm/quiescence.hpp>
 #include <dfb/comm/reduction.hpp>
 #include <dfb/exec.hpp>
@@ -132,7 +132,7 @@ public:
     void send(int destination, MessageKind kind, std::int64_t number, const Bytes& body = {})
     {
         const auto header = MessageHeader::of(kind, address_, number);
-        send(destination, makeMessage(*connection_->pool(), header, body.data(), body.size()));
+        send(destination, makeMessage(*connection_->pool(), header, body));
     }
 
     // Sends a message whose body is a trivially copyable struct.

@@ -6,7 +6,6 @@
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
-#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/message.hpp>
 
 #include <algorithm>
@@ -61,11 +60,12 @@ public:
             states_.emplace_back(children_.size() + 1);
     }
 
-    // Combines what ranks bring to a call. In front stand (int32) the lowest rank that it is of, and the call's name; or
-    // -1 and a text, if ranks make different calls. `combine(a, b, out)` does so with the rest. Throws Error
+    // Combines what ranks bring to a call. In front stand (int32) the lowest rank that it is of, and the call's name;
+    // or -1 and a text, if ranks make different calls. `combine(a, b, out)` does so with the rest. Throws Error
     // (MalformedMessage).
-    static Bytes combineParts(const Bytes& a, const Bytes& b,
-                              detail::FunctionRef<void(detail::ByteReader&, detail::ByteReader&, detail::ByteWriter&)> combine)
+    static Bytes
+    combineParts(const Bytes& a, const Bytes& b,
+                 detail::FunctionRef<void(detail::ByteReader&, detail::ByteReader&, detail::ByteWriter&)> combine)
     {
         detail::ByteReader as(a), bs(b);
         const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
@@ -80,7 +80,7 @@ public:
         } else {
             out.put(std::int32_t{-1});
             out.putText(detail::printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
-                                callA.c_str(), rankB, callB.c_str()));
+                                        callA.c_str(), rankB, callB.c_str()));
         }
         return std::move(out).bytes();
     }

@@ -2,8 +2,8 @@
 // configuration.
 #pragma once
 
-#include <dfb/comm/byte_io.hpp>
 #include <dfb/comm/mailbox.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/operations.hpp>
 

@@ -8,7 +8,7 @@
 // the same inputs as before.
 #pragma once
 
-#include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
 
 #include <algorithm>

@@ -3,7 +3,7 @@
 // frame that must be equal on all ranks. FrameFigures: the figures that a rank collects while the frame is open.
 #pragma once
 
-#include <dfb/comm/byte_io.hpp>
+#include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/agreement.hpp>
 

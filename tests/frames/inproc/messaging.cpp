@@ -752,7 +752,7 @@ public:
         header.kind = MessageKind::Fragment;
         header.number = 1;
         ++header.sequence;
-        inner_.send(to, dfb::detail::makeMessage(*pool_, header, nullptr, 0));
+        inner_.send(to, dfb::detail::makeMessage(*pool_, header));
         sentBoth().set_value();
     }
     static std::promise<void>& sentBoth()

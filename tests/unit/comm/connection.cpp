@@ -97,7 +97,8 @@ Buffer messageOf(dfb::MemoryPool& pool, std::uint32_t receiver, std::int64_t num
     MessageHeader header;
     header.receiver = receiver;
     header.number = number;
-    return dfb::detail::makeMessage(pool, header, reinterpret_cast<const std::byte*>(text.data()), text.size());
+    const auto* first = reinterpret_cast<const std::byte*>(text.data());
+    return dfb::detail::makeMessage(pool, header, {first, first + text.size()});
 }
 
 Buffer copyOf(dfb::MemoryPool& pool, const Buffer& message)
