@@ -70,7 +70,7 @@ private:
     {
         onMessage_(source, header, std::move(message));
     }
-    void malformed(int, const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
+    void malformed(const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
     void connectionFailed() override { std::abort(); }
 
     Connection& connection_;
@@ -319,7 +319,7 @@ private:
         default: done_.set();
         }
     }
-    void undecodable(int, const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
+    void undecodable(const dfb::ErrorInfo& error) override { throw dfb::Error(error); }
 
     Stream stream_;
     std::shared_ptr<Connection> connection_;

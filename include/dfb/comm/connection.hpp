@@ -54,7 +54,7 @@ namespace detail {
 class MessageReceiver {
 public:
     virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
-    virtual void malformed(int source, const ErrorInfo& error) = 0; // may have been for this one
+    virtual void malformed(const ErrorInfo& error) = 0; // a message of rank error.from; it may have been for this one
     virtual void connectionFailed() = 0;
 
 protected:
@@ -167,7 +167,7 @@ public:
         for (detail::Arrival& e : its)
             receiver.receive(e.source, e.header, std::move(e.message));
         if (stray_)
-            receiver.malformed(stray_->first, stray_->second);
+            receiver.malformed(*stray_);
         stray_.reset();
     }
 
@@ -403,11 +403,13 @@ private:
             if (header.kind == detail::MessageKind::Ping || header.kind == detail::MessageKind::Pong)
                 return;
         } catch (const Error& e) {
+            ErrorInfo error = e.info();
+            error.from = source;
             const std::lock_guard<std::mutex> lock(mutex_);
             for (const auto& [address, receiver] : receivers_)
-                receiver->malformed(source, e.info());
+                receiver->malformed(error);
             if (receivers_.empty())
-                stray_.emplace(source, e.info());
+                stray_ = error;
             return;
         }
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -557,8 +559,8 @@ private:
 
     std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
     std::vector<Receiver> receivers_;
-    std::vector<detail::Arrival> unexpected_;        // for receivers to come
-    std::optional<std::pair<int, ErrorInfo>> stray_; // the malformed message that came before its receiver
+    std::vector<detail::Arrival> unexpected_; // for receivers to come
+    std::optional<ErrorInfo> stray_;          // of the malformed message that came before its receiver
     std::uint32_t addresses_ = 0;
 
     mutable std::mutex failureMutex_;

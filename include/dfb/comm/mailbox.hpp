@@ -34,9 +34,9 @@ public:
     // Takes a message. Called in tasks, for several messages at once and in any order. Messages of reductions come
     // here, too, and are passed on to receiveReduction(); those of reduce() do not.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    // Is told of a message that could not be read. Nobody knows its kind, or for whom it was. If this cannot make a
-    // frame fail, it calls keepDamage().
-    virtual void undecodable(int source, const ErrorInfo& error) = 0;
+    // Is told of a message of rank error.from that could not be read. Nobody knows its kind, or for whom it was. If
+    // this cannot make a frame fail, it calls keepDamage().
+    virtual void undecodable(const ErrorInfo& error) = 0;
     virtual void work(int) {} // runs the work of submitWork(number), in a task
     virtual void polled() {}  // called by wait() after it has moved messages itself
 
@@ -257,12 +257,12 @@ public:
 
     // Keeps the error of a message that could not be read. It may have been for something that this rank has not begun
     // yet, which then fails: the next frame, or the next reduce().
-    void keepDamage(int source, const ErrorInfo& error)
+    void keepDamage(const ErrorInfo& error)
     {
         const std::lock_guard<std::mutex> lock(damageMutex_);
-        damage_.emplace(source, error);
+        damage_ = error;
     }
-    std::optional<std::pair<int, ErrorInfo>> takeDamage()
+    std::optional<ErrorInfo> takeDamage()
     {
         const std::lock_guard<std::mutex> lock(damageMutex_);
         return std::exchange(damage_, std::nullopt);
@@ -442,7 +442,7 @@ private:
 
     // A message that could not be read may have been a part of this reduction, if others are not here yet, or of the
     // next, if they are through. The first reduction is that of its owner's constructor. `damage`: from before.
-    void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<std::pair<int, ErrorInfo>> damage)
+    void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<ErrorInfo> damage)
     {
         constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
         const std::chrono::milliseconds late = connection_->config().peerTimeout;
@@ -454,13 +454,13 @@ private:
             deadline = Clock::now() + (isFirst ? soon : late);
         do { // also if the parts of all were here: with Progress::Caller wait() sends the result on
             if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {
-                giveUp(damage->first, damage->second);
+                giveUp(damage->from, *damage);
             } else if (!damage && (damage = takeDamage())) {
                 deadline = Clock::now() + soon;
             }
         } while (!ready());
         if (damage && !wasBefore)
-            keepDamage(damage->first, damage->second);
+            keepDamage(*damage);
     }
 
     bool isDamaged()
@@ -696,9 +696,9 @@ private:
             failMalformed("a reduction that no rank can be at", begun, number);
     }
 
-    void malformed(int source, const ErrorInfo& error) override
+    void malformed(const ErrorInfo& error) override
     {
-        submit([source, error](Mailbox& self) { self.handler_.undecodable(source, error); });
+        submit([error](Mailbox& self) { self.handler_.undecodable(error); });
     }
 
     void connectionFailed() override { notify(); }
@@ -715,7 +715,7 @@ private:
     std::atomic<std::uint64_t> sentOn_{0}, takenOn_{0}; // see countsAtRest()
     std::atomic<std::int64_t> reductionCount_{0};       // of reduce()
     std::mutex damageMutex_;
-    std::optional<std::pair<int, ErrorInfo>> damage_; // under damageMutex_
+    std::optional<ErrorInfo> damage_; // under damageMutex_
 
     std::mutex mutex_;
     std::condition_variable changed_;

@@ -448,9 +448,10 @@ private:
             if (entry == OpenFrame::Entry::Absurd) {
                 ErrorInfo info =
                     errorInfo(ErrorKind::MalformedMessage, "a message of a frame that no rank can have begun");
+                info.from = source;
                 info.expected = open_.next();
                 info.got = header.number;
-                undecodable(source, info);
+                undecodable(info);
             }
             return;
         }
@@ -492,9 +493,9 @@ private:
 
     // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
     // next one cannot do without it.
-    void undecodable(int source, const ErrorInfo& error) override
+    void undecodable(const ErrorInfo& error) override
     {
-        mailbox_->keepDamage(source, error); // first: begin() opens the gate and then looks
+        mailbox_->keepDamage(error); // first: begin() opens the gate and then looks
         if (!open_.enter(open_.number()))
             return;
         const OpenFrame::Inside inside(open_); // until the end: the next begin() waits for it
@@ -503,13 +504,8 @@ private:
 
     void failForDamage()
     {
-        const auto damage = mailbox_->takeDamage();
-        if (!damage)
-            return;
-        ErrorInfo info = damage->second;
-        info.from = info.from < 0 ? damage->first : info.from;
-        if (!outcome_->fail(std::move(info)))
-            mailbox_->keepDamage(damage->first, damage->second);
+        if (const auto damage = mailbox_->takeDamage(); damage && !outcome_->fail(*damage))
+            mailbox_->keepDamage(*damage);
     }
 
     // Each kind of message goes to the object that it is for.

@@ -230,10 +230,10 @@ private:
         }
     }
 
-    void undecodable(int source, const ErrorInfo& error) override
+    void undecodable(const ErrorInfo& error) override
     {
-        mailbox_->keepDamage(source, error); // finish() may be waiting for it
-        refuse(source, error, 0);
+        mailbox_->keepDamage(error); // finish() may be waiting for it
+        refuse(error.from, error, 0);
     }
 
     // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: the one that the message

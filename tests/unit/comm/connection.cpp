@@ -77,10 +77,10 @@ struct Receiver : dfb::detail::MessageReceiver {
                        std::string(reinterpret_cast<const char*>(message.data()) + sizeof header,
                                    message.size() - sizeof header)});
     }
-    void malformed(int source, const dfb::ErrorInfo& error) override
+    void malformed(const dfb::ErrorInfo& error) override
     {
         CHECK(error.kind == dfb::ErrorKind::MalformedMessage);
-        malformedFrom.push_back(source);
+        malformedFrom.push_back(error.from);
     }
     void connectionFailed() override { ++failures; }
 };
