@@ -154,8 +154,7 @@ public:
             mailbox_->send(owner, message.empty() ? encode(tile, owner) : std::move(message));
             ++inputsSent_;
             waitForRoom();
-        } else if (open_.enter(tile.frame)) {
-            const OpenFrame::Inside inside(open_);
+        } else if (const auto inside = open_.enter(tile.frame)) {
             if (isInPlace)
                 arrive([&] { return pipeline_->inputOf(tile); }, rank(), true);
             else
@@ -223,9 +222,9 @@ public:
 
     void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) override
     {
-        if (!open_.enter(frame))
+        const auto inside = open_.enter(frame);
+        if (!inside)
             return; // it is over
-        const OpenFrame::Inside inside(open_);
         ErrorInfo where;
         where.tile = tile;
         outcome_->fail(reason, where);
@@ -425,10 +424,8 @@ private:
         early.clear(); // some may still be there, if the frame has failed
         failForDamage();
         for (const int tile : withoutSamples)
-            if (open_.enter(open_.number())) {
-                const OpenFrame::Inside inside(open_);
+            if (const auto inside = open_.enter(open_.number()))
                 submitFinish(tile);
-            }
         if (!params_.declared && open_.expectNoMore())
             allFinished();
     }
@@ -455,7 +452,7 @@ private:
             }
             return;
         }
-        const OpenFrame::Inside inside(open_);
+        const OpenFrame::Inside inside(&open_);
         if (hasCredit)
             mailbox_->flow().consumed(source, byteCount);
         mailbox_->countTaken(source, header, message);
@@ -495,11 +492,9 @@ private:
     // next one cannot do without it.
     void undecodable(const ErrorInfo& error) override
     {
-        mailbox_->keepDamage(error); // first: begin() opens the gate and then looks
-        if (!open_.enter(open_.number()))
-            return;
-        const OpenFrame::Inside inside(open_); // until the end: the next begin() waits for it
-        failForDamage();
+        mailbox_->keepDamage(error);                         // first: begin() opens the gate and then looks
+        if (const auto inside = open_.enter(open_.number())) // until the end: the next begin() waits for it
+            failForDamage();
     }
 
     void failForDamage()
@@ -639,19 +634,15 @@ private:
 
     void submitFinish(int tile)
     {
-        open_.enterAgain(); // we are inside; work() leaves
-        try {
-            mailbox_->submitWork(tile);
-        } catch (...) {
-            open_.leave();
-            throw;
-        }
+        OpenFrame::Inside inside = open_.enterAgain(); // we are inside already
+        mailbox_->submitWork(tile);
+        static_cast<void>(inside.release()); // work() leaves
     }
 
     // A tile that is complete.
     void work(int tile) override
     {
-        const OpenFrame::Inside inside(open_);
+        const OpenFrame::Inside inside(&open_);
         ErrorInfo where;
         where.tile = tile;
         if (open_.beginReading()) {
@@ -681,10 +672,8 @@ private:
         mailbox_->reductions().enter(
             {FrameOutcome::AllDeclared, open_.number()}, {}, [](const Bytes& a, const Bytes&) { return a; },
             [this, frame = open_.number()](const Bytes&) {
-                if (!open_.enter(frame))
-                    return;
-                const OpenFrame::Inside inside(open_);
-                applyDeclarations();
+                if (const auto inside = open_.enter(frame))
+                    applyDeclarations();
             });
     }
 

@@ -13,6 +13,7 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstdint>
+#include <memory>
 #include <mutex>
 #include <optional>
 #include <utility>
@@ -208,23 +209,6 @@ public:
         return Entry::Inside;
     }
 
-    // For work that is no message: whether it may go on. leave() must follow if so.
-    bool enter(std::int64_t number)
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        const bool isOpen = number == number_ && state_ != FrameState::Closed;
-        inside_ += isOpen;
-        return isOpen;
-    }
-
-    // Enters once more from inside, for work that goes on after the caller has left: close() waits for that, too, also
-    // if it has begun to wait already.
-    void enterAgain()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        ++inside_;
-    }
-
     void leave()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -232,17 +216,29 @@ public:
             empty_.notify_all();
     }
 
-    // Leaves at the end of a scope that has entered, also while an exception passes.
-    class Inside {
-    public:
-        explicit Inside(OpenFrame& frame) : frame_(frame) {}
-        Inside(const Inside&) = delete;
-        Inside& operator=(const Inside&) = delete;
-        ~Inside() { frame_.leave(); }
-
-    private:
-        OpenFrame& frame_;
+    struct Leave {
+        void operator()(OpenFrame* frame) const { frame->leave(); }
     };
+    // Somebody who has entered, and leaves at the end of this; null: nobody.
+    using Inside = std::unique_ptr<OpenFrame, Leave>;
+
+    // For work that is no message. Null: it may not go on.
+    Inside enter(std::int64_t number)
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        const bool isOpen = number == number_ && state_ != FrameState::Closed;
+        inside_ += isOpen;
+        return Inside(isOpen ? this : nullptr);
+    }
+
+    // Enters once more from inside, for work that goes on after the caller has left: close() waits for that, too, also
+    // if it has begun to wait already.
+    Inside enterAgain()
+    {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        ++inside_;
+        return Inside(this);
+    }
 
     // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So this rank
     // does not vote while a task reads inputs, once the frame has one that `isInPlace`. False if the frame has failed:

@@ -235,17 +235,19 @@ TEST_CASE("Closing does itself what it waits for", "[open_frame]")
 {
     OpenFrame frame;
     frame.open();
-    int inside = 3, asked = 0;
-    for (int i = 0; i < inside; ++i)
-        CHECK(frame.enter(1));
+    int asked = 0;
+    std::vector<OpenFrame::Inside> inside;
+    for (int i = 0; i < 3; ++i) {
+        inside.push_back(frame.enter(1));
+        CHECK(inside.back());
+    }
     frame.close([&] {
         if (++asked % 2 == 0) // not at once
             return false;
-        frame.leave();
-        --inside;
+        inside.pop_back();
         return true;
     });
-    CHECK(inside == 0);
+    CHECK(inside.empty());
 }
 
 TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[open_frame]")
@@ -253,22 +255,21 @@ TEST_CASE("Closing waits for work that somebody inside has begun meanwhile", "[o
     OpenFrame frame;
     for (int number = 1; number <= 3; ++number) { // the count must be right again for the next
         frame.open();
-        REQUIRE(frame.enter(number));
+        OpenFrame::Inside first = frame.enter(number);
+        REQUIRE(first);
         std::atomic<bool> closed{false};
         std::thread closing([&] {
             frame.close(noHelp);
             closed = true;
         });
-        while (frame.enter(number)) { // until it has begun to close
-            frame.leave();
+        while (frame.enter(number)) // until it has begun to close
             std::this_thread::yield();
-        }
-        frame.enterAgain();
-        frame.leave();
+        OpenFrame::Inside second = frame.enterAgain();
+        first.reset();
         for (int i = 0; i < 1000; ++i)
             std::this_thread::yield();
         CHECK_FALSE(closed);
-        frame.leave();
+        second.reset();
         closing.join();
         CHECK(closed);
         CHECK_FALSE(frame.enter(number));
