@@ -18,9 +18,11 @@
 #include <condition_variable>
 #include <cstdint>
 #include <exception>
+#include <functional>
 #include <memory>
 #include <mutex>
 #include <optional>
+#include <string>
 #include <thread>
 #include <utility>
 #include <vector>
@@ -412,7 +414,8 @@ public:
     }
 
 private:
-    // The beginning of this rank's part of a call of this name: see ReductionTable::combineParts().
+    // The beginning of what this rank brings to a call: the lowest rank that it is of, and the call's name. Once ranks
+    // have turned out to make different calls: -1, and a text.
     ByteWriter partOf(const std::string& call) const
     {
         ByteWriter out;
@@ -421,15 +424,31 @@ private:
         return out;
     }
 
-    template <class Combine>
-    Bytes reduceParts(ByteWriter&& mine, Combine combine)
+    // `combine(a, b, out)` does so with what comes after that.
+    Bytes reduceParts(ByteWriter&& mine, std::function<void(ByteReader&, ByteReader&, ByteWriter&)> combine)
     {
-        return reduce(std::move(mine).bytes(), [combine](const Bytes& a, const Bytes& b) {
-            return ReductionTable::combineParts(a, b, combine);
+        return reduce(std::move(mine).bytes(), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
+            ByteReader as(a), bs(b);
+            const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
+            if (rankA < 0 || rankB < 0)
+                return rankA < 0 ? a : b;
+            const std::string callA = as.getText(), callB = bs.getText();
+            ByteWriter out;
+            if (callA == callB) {
+                out.put(rankA);
+                out.putText(callA);
+                combine(as, bs, out);
+            } else {
+                out.put(std::int32_t{-1});
+                out.putText(printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
+                                    callA.c_str(), rankB, callB.c_str()));
+            }
+            return std::move(out).bytes();
         });
     }
 
-    // A reader of the parts of all, behind the call's name. Throws InvalidArgument if they have made different calls.
+    // A reader of what all have brought, behind the call's name. Throws InvalidArgument if they have made different
+    // calls.
     ByteReader partIn(const Bytes& result) const
     {
         ByteReader in(result);

@@ -5,7 +5,6 @@
 // same order, also by a rank whose frame has failed.)
 #pragma once
 
-#include <dfb/base/function_ref.hpp>
 #include <dfb/comm/message.hpp>
 
 #include <algorithm>
@@ -14,7 +13,6 @@
 #include <functional>
 #include <mutex>
 #include <optional>
-#include <string>
 #include <utility>
 #include <vector>
 
@@ -58,31 +56,6 @@ public:
             children_.erase(children_.begin());
         for (int i = 0; i < 4; ++i) // more are hardly under way at once
             states_.emplace_back(children_.size() + 1);
-    }
-
-    // Combines what ranks bring to a call. In front stand (int32) the lowest rank that it is of, and the call's name;
-    // or -1 and a text, if ranks make different calls. `combine(a, b, out)` does so with the rest. Throws Error
-    // (MalformedMessage).
-    static Bytes
-    combineParts(const Bytes& a, const Bytes& b,
-                 detail::FunctionRef<void(detail::ByteReader&, detail::ByteReader&, detail::ByteWriter&)> combine)
-    {
-        detail::ByteReader as(a), bs(b);
-        const auto rankA = as.get<std::int32_t>(), rankB = bs.get<std::int32_t>();
-        if (rankA < 0 || rankB < 0)
-            return rankA < 0 ? a : b;
-        const std::string callA = as.getText(), callB = bs.getText();
-        detail::ByteWriter out;
-        if (callA == callB) {
-            out.put(rankA);
-            out.putText(callA);
-            combine(as, bs, out);
-        } else {
-            out.put(std::int32_t{-1});
-            out.putText(detail::printed("rank %d calls %s, rank %d %s: all ranks must make the same calls", rankA,
-                                        callA.c_str(), rankB, callB.c_str()));
-        }
-        return std::move(out).bytes();
     }
 
     // Takes part with `own`; every rank does so once per key, or again when it has got the result. `done` gets the
