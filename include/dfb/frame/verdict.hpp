@@ -42,9 +42,8 @@ inline ErrorInfo errorInfoOf(const std::exception_ptr& reason, const ErrorInfo& 
     } catch (...) {
         info = errorInfo(ErrorKind::UserCode, "an exception that is not a std::exception");
     }
-    const auto fill = [](std::int64_t& to, std::int64_t from) { to = to < 0 ? from : to; };
-    if (info.from < 0)
-        info.from = where.from;
+    const auto fill = [](auto& to, auto from) { to = to < 0 ? from : to; };
+    fill(info.from, where.from);
     fill(info.tile, where.tile);
     fill(info.pass, where.pass);
     fill(info.generation, where.generation);
@@ -335,8 +334,7 @@ struct Verdict {
         a.tileErrors = merged(a.tileErrors, b.tileErrors);
         a.figures = merged(a.figures, b.figures);
         a.mergeErrors = merged(a.mergeErrors, b.mergeErrors);
-        for (const std::int32_t tile : b.incomplete) // each tile has one owner
-            a.incomplete.push_back(tile);
+        a.incomplete.insert(a.incomplete.end(), b.incomplete.begin(), b.incomplete.end()); // each tile has one owner
         return a.bytes();
     }
 };

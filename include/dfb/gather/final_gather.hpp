@@ -56,8 +56,7 @@ public:
         if (displays()) {
             image_ = Image(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
             state_ = std::vector<std::atomic<TileState>>(static_cast<std::size_t>(layout_.tileCount()));
-            for (auto& s : state_)
-                s = TileState::Undefined;
+            invalidate();
         }
         if (!isDisplay() && enabled())
             for (int i = 0; i < 3; ++i) // as many as one worker and a thread that waits have at once
@@ -148,8 +147,8 @@ public:
         const std::size_t pixels =
             static_cast<std::size_t>(layout_.width()) * static_cast<std::size_t>(layout_.height());
         for (std::size_t c = 0; c < channelCount; ++c)
-            if (travels(c)) {
-                image.planes.at[c] = blockAt(places.planes[c], pixels * record_.pixelBytes(c));
+            if (const std::size_t bytes = record_.pixelBytes(c); bytes > 0) {
+                image.planes.at[c] = blockAt(places.planes[c], pixels * bytes);
                 all = all && image.planes.at[c];
             }
         if (!all)
@@ -460,7 +459,6 @@ private:
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
     bool isDisplay() const noexcept { return rank_ == config_.image.displayRank; }
-    bool travels(std::size_t channel) const { return hasChannel(channels_ | colorChannel, channel); }
     // `planes`: of the whole image.
     Place inImage(const Planes& planes, const Region& region) const
     {
