@@ -461,13 +461,6 @@ private:
         outcome_->guarded([&] { handle(source, header, std::move(message)); }, where);
     }
 
-    void sendToDisplay(Buffer&& message, std::size_t raw)
-    {
-        if (raw > 0)
-            compression_.sent(config_.image.displayRank, raw, message.size());
-        mailbox_->send(config_.image.displayRank, std::move(message));
-    }
-
     // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
     // not heard of it by the end of the first frame goes on sending tiles.
     void tellImagePlace()
@@ -579,10 +572,8 @@ private:
     // The message that tells the owner where the pixels lie. Empty if it does not see them.
     Buffer encodePlace(const InputPixels& tile, int owner)
     {
-        const Connection& connection = mailbox_->connection();
-        if (!connection.isSeenBy(owner))
-            return Buffer();
-        return pipeline_->encodePlace(tile, [&](const std::byte* address) { return connection.offsetOf(address); });
+        const auto offsetOf = [this](const std::byte* address) { return mailbox_->connection().offsetOf(address); };
+        return mailbox_->connection().isSeenBy(owner) ? pipeline_->encodePlace(tile, offsetOf) : Buffer();
     }
 
     // The message with an input of rank `source`.
@@ -744,9 +735,13 @@ private:
         bool hasFarRanks = false;
         for (int other = 0; other < size(); ++other)
             hasFarRanks = hasFarRanks || isFar(other);
-        pipeline_ = std::make_unique<TilePipeline>(
-            pool_, config_, operations_, rank(), size(), hasFarRanks, mailbox_->address(),
-            [this](Buffer&& message, std::size_t raw) { sendToDisplay(std::move(message), raw); });
+        const auto sendToDisplay = [this](Buffer&& message, std::size_t raw) {
+            if (raw > 0)
+                compression_.sent(config_.image.displayRank, raw, message.size());
+            mailbox_->send(config_.image.displayRank, std::move(message));
+        };
+        pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
+                                                   mailbox_->address(), sendToDisplay);
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
         // The rank after the display rank hands out jobs, as that one has enough to do.
