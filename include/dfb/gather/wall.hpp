@@ -63,7 +63,7 @@ public:
         if (timeout.count() > 0)
             deadline = std::chrono::steady_clock::now() + timeout;
         tellSent(frame);
-        mailbox_->wait([&] { return isOver(frame) || hasError(); }, deadline);
+        mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);
         ByteWriter missing; // empty if nothing is
         if (mine)
@@ -196,8 +196,7 @@ private:
             if (layout_.ranks[static_cast<std::size_t>(d)] == mailbox_->rank()) {
                 shown_.emplace(d, Image());
                 for (int i = 0; i < 2; ++i)
-                    images.push_back(
-                        Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, ChannelMask{0}));
+                    images.push_back(makeImage());
             }
     }
 
@@ -308,6 +307,8 @@ private:
         if (twice != 0)
             failMalformed("a part of a display overlaps another");
     }
+    Image makeImage() const { return Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0); }
+    std::int64_t pixelsOfDisplay() const { return std::int64_t{layout_.displayWidth} * layout_.displayHeight; }
     std::size_t wordsPerRow() const { return (static_cast<std::size_t>(layout_.displayWidth) + 63) / 64; }
 
     // Under mutex_.
@@ -327,8 +328,7 @@ private:
         if (!pictures) {
             pictures = std::make_shared<Pictures>();
             for (const auto& [d, shown] : shown_)
-                pictures->emplace(d, Picture{Image(*pool_, layout_.displayWidth, layout_.displayHeight, format_, 0),
-                                             static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight,
+                pictures->emplace(d, Picture{makeImage(), pixelsOfDisplay(),
                                              std::vector<std::uint64_t>(static_cast<std::size_t>(layout_.displayHeight)
                                                                         * wordsPerRow())});
         }
@@ -395,23 +395,18 @@ private:
     bool hasAllSent(std::int64_t frame, int display)
     {
         const auto found = allSent_.find(frame);
-        const std::int64_t pixels = static_cast<std::int64_t>(layout_.displayWidth) * layout_.displayHeight;
         return found != allSent_.end()
-               && found->second[static_cast<std::size_t>(display)] == pixels - pixelsLeft(frame, display);
+               && found->second[static_cast<std::size_t>(display)] == pixelsOfDisplay() - pixelsLeft(frame, display);
     }
 
-    // No display of this rank has to wait any more.
+    // No display of this rank has to wait any more, or a part could not be read.
     bool isOver(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
-        return frame <= dropped_ || std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
-                   return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
-               });
-    }
-    bool hasError()
-    {
-        const std::lock_guard<std::mutex> lock(mutex_);
-        return !error_.empty();
+        return !error_.empty() || frame <= dropped_
+               || std::all_of(shown_.begin(), shown_.end(), [&](const auto& shown) {
+                      return pixelsLeft(frame, shown.first) == 0 || hasAllSent(frame, shown.first);
+                  });
     }
 
     std::optional<ErrorInfo> whatIsMissing(std::int64_t frame)
