@@ -376,6 +376,9 @@ struct Failures {
         dfb::InputImage narrow = good;
         narrow.rowPixels = imageWidth - 1;
         expectError(narrow, "narrow rows", "149 pixels apart");
+        dfb::InputImage farNowhere = good;
+        farNowhere.farDepth = std::numeric_limits<float>::quiet_NaN();
+        expectError(farNowhere, "a NaN as farDepth", "farDepth is not a number");
         dfb::InputImage both = good;
         both.rgba32f = depths.data();
         expectError(both, "two images", "of 8 bits and of floats");

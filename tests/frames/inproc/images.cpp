@@ -293,6 +293,14 @@ TEST_CASE("Background does not travel", "[images]")
         });
         CHECK(wrong == std::vector<std::size_t>(4));
     }
+    SECTION("-0 is 0, where something is blended and elsewhere")
+    {
+        Scene s = scene::makeScene(2, 6);
+        s.background = {};
+        const Picture zero = pictureOf(s, Options());
+        s.background = {-0.0f, -0.0f, -0.0f, -0.0f};
+        CHECK((pictureOf(s, Options()).bytes == zero.bytes));
+    }
 }
 
 TEST_CASE("Ordinary: odd sizes, few tiles, empty ranks", "[images]")

@@ -11,6 +11,7 @@
 #include <memory>
 #include <mutex>
 #include <string>
+#include <utility>
 #include <vector>
 #if defined(__SSE2__)
 #include <xmmintrin.h>
@@ -432,29 +433,34 @@ TEST_CASE("A renderer that flushes denormals on its threads does not change the 
 {
     Scene s = scene::makeScene(0);
     s.background = {0, 0, 0, 0};
-    Picture p;
-    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
-        FrameBuffer<Blend> fb(communicator, configFor(s));
-        const std::vector<dfb::Brick> bricks{{7, {{0, 0, 0}, {97, 61, 1}}}};
-        const dfb::World world(fb.rank() == 1 ? bricks : std::vector<dfb::Brick>());
-        const auto report =
-            dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), [](const dfb::Brick&, auto& tile) {
-                flushDenormals(); // and never undone
-                const std::uint32_t denormal = 1000;
-                for (int i = 0; i < 16 * 16; ++i)
-                    std::memcpy(tile.color + 4 * i, &denormal, sizeof denormal);
-            });
-        if (fb.isDisplayRank())
-            p = Picture(fb.image(), report);
-    });
-    std::size_t wrong = 0;
-    for (std::size_t i = 0; i < p.bytes.size(); i += 16) {
-        std::uint32_t bits = 0;
-        std::memcpy(&bits, p.bytes.data() + i, sizeof bits);
-        wrong += bits != 1000;
+    // A denormal, and 2^-31, which is one as it travels.
+    for (const auto& [wire, value] :
+         {std::make_pair(dfb::WireFormat::Float32, 1000u), std::make_pair(dfb::WireFormat::Float16, 0x30000000u)}) {
+        Picture p;
+        dfb::runRanks(2, [&, wire = wire, value = value](dfb::InprocCommunicator communicator) {
+            dfb::FrameBufferConfig config = configFor(s);
+            config.precision = wire;
+            FrameBuffer<Blend> fb(communicator, config);
+            const std::vector<dfb::Brick> bricks{{7, {{0, 0, 0}, {97, 61, 1}}}};
+            const dfb::World world(fb.rank() == 1 ? bricks : std::vector<dfb::Brick>());
+            const auto report =
+                dfb::DataParallelLoop(fb, world).render(scene::FlatCamera(), [&](const dfb::Brick&, auto& tile) {
+                    flushDenormals(); // and never undone
+                    for (int i = 0; i < 4 * 16 * 16; ++i)
+                        std::memcpy(tile.color + i, &value, sizeof value);
+                });
+            if (fb.isDisplayRank())
+                p = Picture(fb.image(), report);
+        });
+        std::size_t wrong = 0;
+        for (std::size_t i = 0; i < p.bytes.size(); i += 4) {
+            std::uint32_t bits = 0;
+            std::memcpy(&bits, p.bytes.data() + i, sizeof bits);
+            wrong += bits != value;
+        }
+        CHECK(p.bytes.size() == 97 * 61 * 16);
+        CHECK(wrong == 0);
     }
-    CHECK(p.bytes.size() == 97 * 61 * 16);
-    CHECK(wrong == 0);
 }
 #endif
 

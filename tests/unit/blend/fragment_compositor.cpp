@@ -316,4 +316,28 @@ TEST_CASE("Rows in place with many gaps are folded pixel by pixel, in order and 
     }
 }
 
+TEST_CASE("An infinity behind what is opaque shows in place what it shows otherwise", "[compositing]")
+{
+    std::mt19937 random(19);
+    std::vector<Pixels> inputs(2, Pixels(random, 1u << 30, false));
+    for (int y = 0; y < height; ++y)
+        for (int x = 0; x < width; ++x)
+            for (std::size_t k = 0; k < 2; ++k) {
+                const auto i = static_cast<std::size_t>(y * width + x);
+                const bool isFront = (k == 0) == (x < (y % 2 ? 6 : 10)); // so rows begin with the order of another
+                inputs[k].depths[i] = isFront ? 1.0f : 2.0f;
+                inputs[k].colors[4 * i] = y % 2 && x == 6 && !isFront ? infinity : 0.25f;
+                inputs[k].colors[4 * i + 3] = y % 2 && isFront && x >= 4 && x < 8 ? 1.0f : 0.5f;
+            }
+    const dfb::Region valid{0, 0, width, height};
+    Stack inPlace(inputs, true, true, valid, valid, 0), copied(inputs, true, true, valid, valid, 0);
+    copied.row.wantsDepth = true; // which is not found in place
+    copied.row.resize(width);
+    for (int y = 0; y < height; ++y) {
+        inPlace.compositor.nextRow(inPlace.row);
+        copied.compositor.nextRow(copied.row);
+        CHECK(std::isnan(inPlace.row.rgba[4 * 6]) == std::isnan(copied.row.rgba[4 * 6]));
+    }
+}
+
 } // namespace fragment_compositor_cases

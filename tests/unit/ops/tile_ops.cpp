@@ -617,6 +617,23 @@ TEST_CASE("OrderedBlend does not take two inputs for the two that an opaque one 
     while (std::next_permutation(order.begin(), order.end()));
 }
 
+TEST_CASE("OrderedBlend blends the parts of a source in one generation by their number", "[ops]")
+{
+    TileInputs<8> in;
+    in.background = {};
+    for (std::uint16_t part = 0; part < 2; ++part) {
+        auto& tile = in.add(0, 0, part);
+        tile.fill({part == 0 ? 0.5f : 0.0f, part == 1 ? 0.5f : 0.0f, 0, 0.5f}, 1.0f);
+        tile.generation = 1;
+    }
+    for (const std::vector<std::size_t>& order : {std::vector<std::size_t>{0, 1}, {1, 0}}) {
+        const TileOutput out =
+            dfb::testing::runTileOp<dfb::BasicOrderedBlend<8>>(in, order, dfb::OutputFormat::RGBA32F);
+        CHECK(out.value(0) == 0.5f);
+        CHECK(out.value(1) == 0.25f);
+    }
+}
+
 TEST_CASE("What a single layer covers comes out the same whether it is taken as it is or composited", "[ops]")
 {
     using Op = dfb::BasicAlphaBlend<64>;

@@ -5,6 +5,8 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstdint>
+#include <cstdlib>
 #include <limits>
 #include <random>
 #include <set>
@@ -145,6 +147,66 @@ TEST_CASE("No ray of any camera meets a box in a tile that its projection leaves
     for (const Matrix& p : projections)
         checkAll(dfb::MatrixCamera(v.at, p.at), 8, 0.25);
     checkAll(dfb::MatrixCamera(inside.at, projections[1].at), 9, 0.6);
+}
+
+TEST_CASE("No ray meets a box as small as roundings of the eye in a tile that its projection leaves out", "[cameras]")
+{
+    Random random(12);
+    std::size_t hits = 0, missed = 0;
+    const auto check = [&](const auto& camera, const dfb::Vec3& at) {
+        const auto moved = [&](float value, int ulps) {
+            for (int i = 0; i < std::abs(ulps); ++i)
+                value = std::nextafter(value, ulps < 0 ? -1e9f : 1e9f);
+            return value;
+        };
+        int from[3], to[3];
+        for (int k = 0; k < 3; ++k) {
+            from[k] = static_cast<int>(random() % 8) - 4;
+            to[k] = from[k] + 1 + static_cast<int>(random() % static_cast<std::uint64_t>(4 - from[k]));
+        }
+        const dfb::Box3 box{{moved(at.x, from[0]), moved(at.y, from[1]), moved(at.z, from[2])},
+                            {moved(at.x, to[0]), moved(at.y, to[1]), moved(at.z, to[2])}};
+        std::set<int> found;
+        const dfb::TileLayout layout(64, 48, 8);
+        for (const auto& pair : dfb::visibleTiles(dfb::World({{1, box}}), camera, layout))
+            found.insert(pair.tile);
+        for (int i = 0; i < 40; ++i) {
+            const double x = uniform(random, 0, 64), y = uniform(random, 0, 48);
+            if (!meets(camera.ray(x, y, 64, 48, {uniform(random, 0, 1), uniform(random, 0, 1), 0}), box))
+                continue;
+            ++hits;
+            missed += found.count(layout.tileAt(static_cast<int>(x) / 8, static_cast<int>(y) / 8)) == 0;
+        }
+    };
+    for (int i = 0; i < 3000; ++i) {
+        const dfb::Vec3 at = point(random, std::pow(10.0, uniform(random, -1, 5))), along = point(random, 1);
+        const float wide = 3e-7f * std::sqrt(dot(at, at)); // some roundings
+        check(dfb::ThinLensCamera(at, along, up, 60, wide, 1), at);
+        check(dfb::StereoCamera(at, along, up, 60, wide, 1), at);
+        const dfb::MatrixCamera matrix(lookAlong(at, along, up).at, projections[1].at);
+        check(matrix, matrix.eye());
+    }
+    CHECK(missed == 0);
+    CHECK(hits > 500);
+}
+
+TEST_CASE("The footprints of two eyes stay in their halves of the image", "[cameras]")
+{
+    Random random(13);
+    const dfb::StereoCamera camera(eye, view, up, 45, 0.5f, 7);
+    int across = 0, beyond = 0;
+    for (int i = 0; i < 400; ++i) {
+        const int width = 120 + i % 2, height = 90;
+        const dfb::Vec3 center = point(random, 2.5), half = {0.5f, 0.4f, 0.3f};
+        const auto both = camera.project({center - half, center + half}, width, height);
+        const dfb::Region halves[] = {{0, 0, (width + 1) / 2, height}, {width / 2, 0, width, height}};
+        for (std::size_t k = 0; k < 2; ++k) {
+            beyond += !(intersection(both.at(k).region(), halves[k]) == both[k].region());
+            across += both[k].meets({width / 2 - 1, 0, width / 2, height});
+        }
+    }
+    CHECK(beyond == 0);
+    CHECK(across > 20);
 }
 
 TEST_CASE("Without a lens, between the eyes and at rest cameras are the pinhole", "[cameras]")

@@ -440,4 +440,25 @@ TEST_CASE("Bricks that overlap or stand in a circle have no order", "[visibility
     CHECK(outcome(circle).find("circle") != std::string::npos);
 }
 
+TEST_CASE("An order that is kept is that of the last eye and boxes", "[visibility_order]")
+{
+    dfb::detail::FrontToBack kept;
+    const auto check = [&](const std::vector<dfb::Brick>& bricks, const dfb::Vec3& eye, const std::vector<int>& order) {
+        withWorld(bricks, [&](const dfb::SharedWorld& world) {
+            CHECK((kept.find(world, eye) == nullptr) == !order.empty());
+            CHECK(kept.order() == order);
+        });
+    };
+    const dfb::Box3 a{{0, 0, 0}, {1, 1, 1}}, b{{1, 0, 0}, {2, 1, 1}}, c{{-2, 0, 0}, {-1, 1, 1}};
+    check({{1, a}, {2, b}}, {-5, 0, 0}, {0, 1});
+    check({{1, a}, {2, b}}, {5, 0, 0}, {1, 0}); // the eye has moved
+    check({{1, a}, {2, b}}, {5, 0, 0}, {1, 0});
+    check({{1, a}}, {5, 0, 0}, {0});
+    check({{1, a}, {2, c}}, {5, 0, 0}, {0, 1}); // a box has
+    check({{3, c}, {4, a}}, {5, 0, 0}, {1, 0}); // another world with as many
+    check({{3, a}, {4, a}}, {5, 0, 0}, {});
+    check({{3, a}, {4, a}}, {5, 0, 0}, {}); // that there is no order is kept as well
+    check({{3, a}, {4, c}}, {5, 0, 0}, {0, 1});
+}
+
 } // namespace visibility_order_cases
