@@ -239,17 +239,25 @@ struct BlamedCalls {
             image{"imageOnAllRanks()", [](Fb&fb) { fb.imageOnAllRanks(); }},
             resize{"resize()", [](Fb&fb) { fb.resize(40, 30); }};
         Result result;
-        Fb fb(communicator, configOf(scene::makeScene(3)));
-        for (const int odd : oddRanks(fb.size()))
-            for (const auto& [its, usual] : {std::pair{sum, largest}, {share, image}, {resize, sum}}) {
-                const Call& mine = fb.rank() == odd ? its : usual;
-                const std::string text = scene::outcomeOf([&] { mine.second(fb); });
-                expectText(result, "rank " + std::to_string(odd) + " in " + its.first, text,
-                           {"InvalidArgument: dfb: invalid argument: rank ",
-                            rankText(odd) + (odd == 0 ? " calls " : " ") + its.first, usual.first,
-                            ": all ranks must make the same calls"});
-                result.expect(fb.allReduce({1}, Fb::Reduce::Sum).front() == fb.size(), "a wrong sum after it");
-            }
+        const scene::Scene s = scene::makeScene(3);
+        dfb::FrameBufferConfig config = configOf(s);
+        for (const int inFlight : {1, 2}) {
+            config.framesInFlight = inFlight;
+            Fb fb(communicator, config);
+            for (int frame = 0; frame < inFlight; ++frame) // the next would be the first engine's again
+                expectGoodFrame(result, fb, s, "no call");
+            for (const int odd : oddRanks(fb.size()))
+                for (const auto& [its, usual] :
+                     {std::pair{sum, largest}, {share, image}, {resize, sum}, {resize, image}}) {
+                    const Call& mine = fb.rank() == odd ? its : usual;
+                    const std::string text = scene::outcomeOf([&] { mine.second(fb); });
+                    expectText(result, "rank " + std::to_string(odd) + " in " + its.first, text,
+                               {"InvalidArgument: dfb: invalid argument: rank ",
+                                rankText(odd) + (odd == 0 ? " calls " : " ") + its.first, usual.first,
+                                ": all ranks must make the same calls"});
+                    result.expect(fb.allReduce({1}, Fb::Reduce::Sum).front() == fb.size(), "a wrong sum after it");
+                }
+        }
         return result;
     }
 };

@@ -433,6 +433,28 @@ struct Failures {
         result.expect(text.find("InvalidArgument") != std::string::npos, "resize() to nothing: " + text);
         expectGood(300, 200, "resize() that failed");
 
+        const bool isLast = compositor.rank() == compositor.size() - 1;
+        if (compositor.size() > 1) {
+            const std::string calls = scene::outcomeOf([&] {
+                if (isLast)
+                    compositor.imageOnAllRanks();
+                else
+                    compositor.resize(64, 31);
+            });
+            const std::string last = " rank " + std::to_string(compositor.size() - 1);
+            result.expect(scene::has(calls, "InvalidArgument") && scene::has(calls, " calls resize(),")
+                              && scene::has(calls, last + " imageOnAllRanks(): all ranks must make the same calls"),
+                          "different calls: " + calls);
+            expectGood(300, 200, "different calls");
+            const std::string blends = scene::outcomeOf([&] {
+                dfb::ImageCompositor(dfb::connect<Transport>(communicator),
+                                     isLast ? dfb::ImageBlend::ByDepth : dfb::ImageBlend::Nearest, config);
+            });
+            result.expect(scene::has(blends, "ImageBlend::Nearest on rank ")
+                              && scene::has(blends, " and ImageBlend::ByDepth on" + last),
+                          "different ways to blend: " + blends);
+        }
+
         compositor.start(good);
         for (const std::string& misuse :
              {scene::outcomeOf([&] { compositor.start(good); }), scene::outcomeOf([&] { compositor.resize(8, 8); })})

@@ -639,6 +639,7 @@ struct TakesMemory {
 
 TEST_CASE("A lack of memory for finished tiles costs a partial frame no other tile", "[counters]")
 {
+    const bool compresses = GENERATE(false, true); // then there is no memory for the compressed bytes of a batch either
     std::vector<std::int64_t> incomplete(2);
     int shown = 0;
     dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
@@ -646,6 +647,10 @@ TEST_CASE("A lack of memory for finished tiles costs a partial frame no other ti
         dfb::FrameBufferConfig config(64 * 8, 64, dfb::OutputFormat::RGBA32F); // a batch has room for 3 tiles
         config.executor = std::make_shared<dfb::ThreadExecutor>(1);
         config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+#if defined(DFB_HAS_SNAPPY)
+        config.messages.codec = compresses ? std::make_shared<dfb::SnappyCodec>() : nullptr;
+        config.messages.compression = dfb::CompressionMode::Always;
+#endif
         dfb::NetworkConfig network;
         network.sharedMemory = false;
         Fb fb(communicator, config, network);
@@ -662,6 +667,7 @@ TEST_CASE("A lack of memory for finished tiles costs a partial frame no other ti
             shown += fb.isComplete(tile);
     });
     largestAllocation = std::numeric_limits<std::size_t>::max();
+    INFO((compresses ? "compressed" : "not compressed"));
     CHECK(incomplete == std::vector<std::int64_t>(2, 5));
     CHECK(shown == 3);
 }

@@ -460,6 +460,97 @@ TEST_CASE("A flood with progress by the caller: setTile() makes the progress tha
             }
 }
 
+TEST_CASE("Who has voted on a partial frame that was cancelled sends no more inputs", "[messaging][flood]")
+{
+    // Their owner may have left the frame, and would give no credit for them. No input arrives before the frame is
+    // cancelled. Of the pool a quarter is the sender's without asking, and half of it on request.
+    constexpr int pool = 1 << 20, bytes = static_cast<int>(fullMessage);
+    const auto board = std::make_shared<Board>();
+    std::atomic<int> held{0};
+    std::promise<void> noCreditLeft;
+    std::atomic<int> sentLate{0};
+    std::atomic<bool> voted{false};
+    board->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (from == 2 && header.kind == MessageKind::ReduceUp && header.number == 1
+            && dfb::detail::loadAs<std::uint32_t>(message.data() + sizeof header) == 2)
+            voted = true;
+        if (header.kind != MessageKind::Fragment)
+            return Board::What::Pass;
+        sentLate += voted;
+        if (++held == pool / 4 * 3 / bytes)
+            noCreditLeft.set_value();
+        return Board::What::Hold;
+    };
+    board->passed = [&](int from, int to, const MessageHeader& header) {
+        if (from == 2 && to == 1 && header.kind == MessageKind::Abort)
+            board->release();
+    };
+    std::vector<std::string> texts(3);
+    runOn(board, 3, [&](const auto& communicator) {
+        auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
+        config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+        AddingFrameBuffer fb(communicator, config);
+        dfb::FrameConfig params;
+        params.declared = params.allowPartial = true;
+        auto frame = fb.begin(params);
+        std::vector<dfb::TileInput> inputs;
+        for (int tile = 0; fb.rank() == 2 && tile < pool / bytes; ++tile) // so many need not wait in setTile()
+            inputs.push_back({tile, 2, 0});
+        frame.declare(inputs);
+        const auto tile = std::make_unique<AddingFrameBuffer::Tile>();
+        for (const dfb::TileInput& input : inputs) {
+            frame.start(*tile, input.tile);
+            tile->generation = 1;
+            fillTile(*tile, 2, 0);
+            frame.setTile(*tile);
+        }
+        if (fb.rank() == 2) {
+            noCreditLeft.get_future().wait_for(std::chrono::seconds(5));
+            frame.cancel();
+        }
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { frame.end(); });
+    });
+    CHECK(voted);
+    CHECK(sentLate == 0);
+    CHECK(texts == std::vector<std::string>(3, "fine"));
+}
+
+TEST_CASE("A frame fails for damaged credit, also if what waits for it never goes", "[messaging][flood]")
+{
+    const auto board = std::make_shared<Board>();
+    std::atomic<bool> done{false};
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer& message) {
+        if (header.kind != MessageKind::Credit || header.number != 1)
+            return Board::What::Pass;
+        if (done.exchange(true)) // it would make good for the damaged one
+            return Board::What::Lose;
+        message.data()[message.size() - 1] ^= std::byte{1};
+        return Board::What::Pass;
+    };
+    std::vector<std::string> texts(2);
+    std::size_t wrong = 1;
+    runOn(
+        board, 2,
+        [&](const auto& communicator) {
+            auto config = floodConfig(256, std::make_shared<dfb::ThreadExecutor>(1));
+            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+            dfb::NetworkConfig options;
+            options.progress = dfb::Progress::Caller;
+            options.checksums = true;
+            options.peerTimeout = std::chrono::milliseconds(0);
+            AddingFrameBuffer fb(communicator, config, options);
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { floodFrame(fb, 2, From::Thread); });
+            floodFrame(fb, 2, From::Thread);
+            if (fb.isDisplayRank())
+                wrong = wrongSums(fb.image(), 2, 2);
+        },
+        5);
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(has(text, "FrameError: dfb: malformed message: noticed by rank 1"));
+    CHECK(wrong == 0);
+}
+
 TEST_CASE("What an owner keeps of inputs is their active bytes, once for each frame in flight", "[messaging][flood]")
 {
     // 16 tiles with 8 full inputs and one that comes when all others have. The owner gets copies in memory of its own,

@@ -672,6 +672,45 @@ TEST_CASE("Without a peerTimeout a damaged message of before does not end a redu
     CHECK(sums == std::vector<std::int64_t>(2, 14));
 }
 
+TEST_CASE("Without a peerTimeout what is damaged during a reduction ends it, also after damage of before",
+          "[messaging]")
+{
+    const auto board = std::make_shared<Board>();
+    std::promise<void> noticed;
+    std::atomic<bool> damages{false};
+    const auto damage = [&board] {
+        board->handlers.at(0)->receive(1, board->pool->acquire(sizeof(MessageHeader) - 1));
+    };
+    board->inspect = [&](int, int, const MessageHeader& header, dfb::Buffer&) {
+        if (header.kind != MessageKind::ReduceUp || !damages)
+            return Board::What::Pass;
+        damage(); // what came of it
+        return Board::What::Lose;
+    };
+    std::vector<std::string> texts(2);
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(sceneFor(Loop::Declared));
+        config.executor = std::make_shared<dfb::CallerExecutor>(); // its tasks run in calls that wait
+        dfb::NetworkConfig options;
+        options.peerTimeout = std::chrono::milliseconds(0);
+        FrameBuffer<Blend> fb(communicator, config, options);
+        if (fb.rank() == 0) {
+            damage();
+            while (fb.poll()) {
+            }
+            damages = true;
+            noticed.set_value();
+        } else {
+            noticed.get_future().wait_for(std::chrono::seconds(20));
+        }
+        texts[static_cast<std::size_t>(fb.rank())] =
+            outcomeOf([&] { fb.allReduce({7}, FrameBuffer<Blend>::Reduce::Sum); });
+    });
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK(has(text, "TransportError: dfb: malformed message: noticed by rank 0, in a message from rank 1"));
+}
+
 TEST_CASE("What is damaged when a rank has given its part of a reduction counts for what comes after it", "[messaging]")
 {
     const Scene s = sceneFor(Loop::Declared);
