@@ -12,8 +12,9 @@
 // communicator must call it, in the same order. What is wrong on one rank in a collective call, such as a null pointer
 // or a failing renderer, is an error on all ranks, with the rank and the reason in dfb_last_error(). Nobody hangs, and
 // the next picture can be made. Only the communicator and the framebuffer must be right on every rank: without them a
-// rank cannot tell the others. One thread at a time may call functions on a framebuffer. With MPI below
-// MPI_THREAD_SERIALIZED it must be the one that has initialised MPI. No exception leaves a function.
+// rank cannot tell the others. A rank that makes another call, or none, is waited for: set timeout_ms. One thread at a
+// time may call functions on a framebuffer. With MPI below MPI_THREAD_SERIALIZED it must be the one that has
+// initialised MPI. No exception leaves a function.
 #ifndef DFB_H
 #define DFB_H
 
