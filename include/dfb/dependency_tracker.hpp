@@ -244,9 +244,8 @@ private:
         if (std::min(rank, otherRank) < 0 || rank == otherRank)
             info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
         else
-            info.message +=
-                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only",
-                                std::min(rank, otherRank), std::max(rank, otherRank));
+            info.message += detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only",
+                                            std::min(rank, otherRank), std::max(rank, otherRank));
         throw Error(std::move(info));
     }
 

@@ -174,7 +174,7 @@ struct FrameSums {
     // display rank's image directly.
     std::int64_t bytesSent = 0;
     std::int64_t messagesSent = 0;
-    std::int64_t tilesTouched = 0;         // tiles that had an input
+    std::int64_t tilesTouched = 0; // tiles that had an input
     // Input pixels with an infinite or NaN colour, or a NaN depth. Of inputs that are read in place only those that
     // were read: none that an opaque input hides.
     std::int64_t nonFinitePixels = 0;

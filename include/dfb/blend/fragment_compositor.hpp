@@ -412,7 +412,7 @@ private:
 
     BlendRule rule_ = BlendRule::SortByDepth;
     std::array<detail::RowInPlace, detail::mostInPlace> rows_,
-        ordered_; // of inputs; and in their order. Not cleared for a row
+        ordered_;         // of inputs; and in their order. Not cleared for a row
     bool isFull_ = false; // rows in place had one order and no gaps so far
     std::vector<FragmentCursor> cursors_;
     std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
