@@ -210,7 +210,7 @@ try {
   // ---- many frames while dragging, and how long they take
 
   await page.select("#moving", "1");
-  const wanted = isStrict ? 100 : 20, repetitions = isStrict ? 41 : 15, atFullSize = await keepDragging(page, wanted);
+  const wanted = isStrict ? 100 : 12, repetitions = isStrict ? 41 : 9, atFullSize = await keepDragging(page, wanted);
   await shows(page, width, height);
   check(atFullSize.frames >= wanted, `${atFullSize.frames} frames of ${width}x${height} while dragging in ${atFullSize.seconds.toFixed(1)} s: ${(atFullSize.frames / atFullSize.seconds).toFixed(1)} a second`);
   console.log(`while the pointer goes on moving: ${median(atFullSize.took).toFixed(1)} ms from an event to its picture (median of ${atFullSize.took.length})`);
