@@ -68,9 +68,9 @@ public:
     {
         return fb_->allReduce(values, how);
     }
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes) override
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call) override
     {
-        return fb_->allGather(bytes);
+        return fb_->allGather(bytes, call);
     }
     const dfb::DisplayWall* wall() const override { return wall_.get(); }
 

@@ -37,7 +37,8 @@ public:
     virtual const dfb::TileLayout& layout() const = 0;
     virtual const dfb::Image& image() const = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, dfb::Reduce how) = 0;
-    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes) = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes,
+                                                          const char* call = "allGather()") = 0;
     bool isDisplayRank() const { return rank() == config().image.displayRank; }
 
     // Null: there is none.

@@ -420,12 +420,12 @@ public:
         return engine().allReduce(values, how);
     }
 
-    // Returns the bytes of each rank, by rank, on all ranks. The sizes may differ and may be 0; each rank needs memory
-    // for the bytes of all, several times. Collective, outside frames. Waits and throws as allReduce(); also throws
-    // std::bad_alloc on a rank that lacks memory.
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
+    // Returns the bytes of each rank, by rank, on all ranks. `call` stands in the error if ranks make different calls.
+    // The sizes may differ and may be 0; each rank needs memory for the bytes of all, several times. Collective,
+    // outside frames. Waits and throws as allReduce(); also throws std::bad_alloc on a rank that lacks memory.
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
-        return engine().allGather(bytes);
+        return engine().allGather(bytes, call);
     }
 
 private:

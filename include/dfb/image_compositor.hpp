@@ -160,11 +160,11 @@ public:
     // compositor is gone. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
-    // Returns the bytes of each rank, by rank, on all ranks. The sizes may differ and may be 0. Collective, while no
-    // picture is open. Waits and throws as imageOnAllRanks().
-    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes)
+    // Returns the bytes of each rank, by rank, on all ranks. `call` stands in the error if ranks make different calls.
+    // The sizes may differ and may be 0. Collective, while no picture is open. Waits and throws as imageOnAllRanks().
+    std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
-        return engine_->allGather(bytes);
+        return engine_->allGather(bytes, call);
     }
 
     // Changes the size of the picture; image() is empty then. Collective. Waits for all ranks. Throws InvalidArgument

@@ -235,7 +235,8 @@ struct BlamedCalls {
         const auto reduce = [](typename Fb::Reduce how) { return [how](Fb& fb) { fb.allReduce({1}, how); }; };
         const Call sum{"allReduce() of 1 values to their sum", reduce(Fb::Reduce::Sum)},
             largest{"allReduce() of 1 values to their maximum", reduce(Fb::Reduce::Max)},
-            share{"allGather() or SharedWorld()", [](Fb&fb) { dfb::SharedWorld(fb, dfb::World()); }},
+            share{"SharedWorld()", [](Fb&fb) { dfb::SharedWorld(fb, dfb::World()); }},
+            gather{"allGather()", [](Fb&fb) { fb.allGather({}); }},
             image{"imageOnAllRanks()", [](Fb&fb) { fb.imageOnAllRanks(); }},
             resize{"resize()", [](Fb&fb) { fb.resize(40, 30); }};
         Result result;
@@ -248,7 +249,7 @@ struct BlamedCalls {
                 expectGoodFrame(result, fb, s, "no call");
             for (const int odd : oddRanks(fb.size()))
                 for (const auto& [its, usual] :
-                     {std::pair{sum, largest}, {share, image}, {resize, sum}, {resize, image}}) {
+                     {std::pair{sum, largest}, {share, gather}, {resize, sum}, {resize, image}}) {
                     const Call& mine = fb.rank() == odd ? its : usual;
                     const std::string text = scene::outcomeOf([&] { mine.second(fb); });
                     expectText(result, "rank " + std::to_string(odd) + " in " + its.first, text,

@@ -663,7 +663,7 @@ std::vector<std::pair<std::string, std::string>> fuzz::seeds()
         of(MessageKind::ReduceUp, reductionOf(OwnScope, d::Agreement{true, "width=4\n", 1}.bytes())) + end);
     add("configuration_broken", {NoConfiguration}, of(MessageKind::ReduceUp, std::string("\0\0\0\0no", 6)) + end);
     const auto gathered = [](std::int32_t rank, std::uint64_t count, const std::string& bytes) {
-        const std::string call = "allGather() or SharedWorld()";
+        const std::string call = "allGather()";
         return of(MessageKind::ReduceUp, Output()
                                              .put(+OwnScope)
                                              .put(std::int32_t{1})

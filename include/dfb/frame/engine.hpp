@@ -41,8 +41,7 @@ public:
     virtual bool isComplete(int tile) const = 0;
     virtual bool poll() = 0;
     virtual std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how) = 0;
-    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own,
-                                                          const char* call = "allGather() or SharedWorld()") = 0;
+    virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call) = 0;
 
     virtual bool isOpen() const noexcept = 0;
     virtual void begin(const FrameConfig& params, FunctionRef<void()> copyData) = 0; // for the operations

@@ -37,7 +37,7 @@ public:
         static_assert(std::is_trivially_copyable_v<Brick>);
         const auto* first = reinterpret_cast<const std::byte*>(world.bricks().data());
         const std::vector<std::vector<std::byte>> all =
-            fb.allGather({first, first + world.bricks().size() * sizeof(Brick)});
+            fb.allGather({first, first + world.bricks().size() * sizeof(Brick)}, "SharedWorld()");
         std::vector<std::pair<Brick, int>> held;
         for (std::size_t rank = 0; rank < all.size(); ++rank) {
             if (all[rank].size() % sizeof(Brick) != 0)

@@ -337,7 +337,7 @@ TEST_CASE("A vote or a verdict that is none ends the connection, as there is no 
 namespace {
 
 // Where a rank's own part of allGather() begins: behind the scope, the lowest rank, and the call's name.
-constexpr std::size_t ownPart = body + 4 + 4 + sizeof(std::uint32_t) + sizeof("allGather() or SharedWorld()") - 1;
+constexpr std::size_t ownPart = body + 4 + 4 + sizeof(std::uint32_t) + sizeof("allGather()") - 1;
 
 } // namespace
 
