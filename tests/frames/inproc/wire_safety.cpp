@@ -336,22 +336,23 @@ TEST_CASE("A vote or a verdict that is none ends the connection, as there is no 
 
 namespace {
 
-// Where a rank's own part of allGather() begins: behind the scope, the lowest rank, and the call's name.
-constexpr std::size_t ownPart = body + 4 + 4 + sizeof(std::uint32_t) + sizeof("allGather()") - 1;
+// Where a rank's own part of a call begins: behind the scope, the lowest rank, and the call's name.
+constexpr std::size_t ownPart(std::string_view call) { return body + 4 + 4 + sizeof(std::uint32_t) + call.size(); }
 
 } // namespace
 
 TEST_CASE("Bytes that are gathered wrongly are an error on every rank", "[wire_safety]")
 {
+    constexpr std::size_t first = ownPart("allGather()");
     for (const bool isRank : {false, true}) {
         std::atomic<bool> armed{false};
         const auto watched = std::make_shared<Board>();
         watched->inspect = [&](int from, int, const MessageHeader& header, dfb::Buffer& message) {
             if (from == 2 && header.kind == MessageKind::ReduceUp && armed.exchange(false)) {
                 if (isRank)
-                    put(message, ownPart, std::int32_t{3});
+                    put(message, first, std::int32_t{3});
                 else
-                    put(message, ownPart + 4, ~std::uint64_t{0});
+                    put(message, first + 4, ~std::uint64_t{0});
             }
             return Board::What::Pass;
         };
@@ -377,7 +378,7 @@ TEST_CASE("Bricks that no rank can have are an error on every rank", "[wire_safe
         std::function<void(dfb::Buffer&)> change;
         std::string part; // of the error
     };
-    constexpr std::size_t record = 4 + 6 * 4, first = ownPart + 4 + 8, second = first + record;
+    constexpr std::size_t record = 4 + 6 * 4, first = ownPart("SharedWorld()") + 4 + 8, second = first + record;
     const float infinity = std::numeric_limits<float>::infinity();
     const std::vector<Lie> lies{
         {"a bound that is NaN", [=](dfb::Buffer& m) { put(m, first + 4, std::numeric_limits<float>::quiet_NaN()); },
