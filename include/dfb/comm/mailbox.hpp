@@ -424,7 +424,7 @@ private:
         return out;
     }
 
-    // `combine(a, b, out)` does so with what comes after that.
+    // Reduces what ranks bring to a call. `combine(a, b, out)` combines what stands behind the call's name.
     Bytes reduceParts(ByteWriter&& mine, std::function<void(ByteReader&, ByteReader&, ByteWriter&)> combine)
     {
         return reduce(std::move(mine).bytes(), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {

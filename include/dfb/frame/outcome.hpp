@@ -304,10 +304,9 @@ private:
     // credit must not be waited for after that, either: who has left gives none.
     bool mayVote() const
     {
-        Connection& connection = mailbox_.connection();
-        if (connection.needsCaller() && !connection.quiet())
-            return false;
-        return !(connection.needsCaller() || terms_.allowPartial) || mailbox_.flow().allSent();
+        const bool needsCaller = mailbox_.connection().needsCaller();
+        return ((!needsCaller && !terms_.allowPartial) || mailbox_.flow().allSent())
+               && (!needsCaller || mailbox_.connection().quiet());
     }
 
     // ---- waiting
