@@ -134,7 +134,7 @@ TEST_CASE("A lost message is found on all ranks, and named")
     faults.maxLethal = 1;
     faults.only = [](int destination, const Buffer& message) { return destination == 1 && message.size() == 65536; };
     ConformanceOptions options = quick();
-    options.timeLimit = std::chrono::milliseconds(300) * rankCount();
+    options.timeLimit = std::chrono::milliseconds(2100); // beside other tests a rank gets no processor for a while
     options.modes = {Progress::Caller};
     const std::string text = check<Faulty>({MPI_COMM_WORLD, faults}, options);
     INFO(text);
