@@ -1,8 +1,9 @@
 #!/bin/sh
 # sh bench/run.sh [--quick] [--launcher CMD]
 # Installs what is missing, builds the preset "release", gets IceT to compare with, if it can be had, and runs all
-# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results. An hour, or 8 minutes. With --launcher bench_compositing also runs on several hosts: CMD, in front
-# of a program, is to start it there, 4 ranks at best, one on each.
+# benchmarks but bench_messaging and bench_gather: tables, figures and pictures go to bench/results. An hour, or 8 minutes
+# with --quick. With --launcher bench_compositing also runs on several hosts: CMD, in front of a program, starts it there,
+# at best 4 ranks, one on each host.
 # The exit status is 1 if what bench_scaling and bench_skip count is not what it should be.
 set -eu
 
@@ -64,7 +65,7 @@ for ranks in 2 3 4 8 16; do
 done
 for ranks in 2 4 8; do
     for way in --moving --reader; do
-        mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,dense --size 1024x1024,2048x2048 $way \
+        mpiexec -n "$ranks" "$bench"/bench_compositing --scene bricks,overlap,dense --size 1024x1024,2048x2048 $way \
             --only "$main_rows" --frames "$compositing_frames" --commit "$commit" \
             --json "$results/compositing.json" --table "$results/compositing.md"
     done
