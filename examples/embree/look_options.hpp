@@ -23,11 +23,12 @@ public:
             "Where the camera is, in place of --azimuth, --elevation and --camera-distance. In the coordinates of the "
             "scene: files fill the cube from 0 to 1, or with --no-fit have their own",
             camera);
-        add("--target", target_, "X,Y,Z", "Where it looks; default: the centre of what there is to see", camera);
+        add("--target", target_, "X,Y,Z", "The point that it looks at; default: the centre of what there is to see",
+            camera);
         add("--up", up_, "X,Y,Z|x|y|z|-x|-y|-z",
-            "What is up in the image, and the axis of the orbit. Files of volumes have y and z run downwards; default "
-            "y, and -z for what looks like computed tomography, so that it stands if its slices go from the feet to "
-            "the head",
+            "Direction that is up in the image, and the axis of the orbit. In volume files y and z run downwards; "
+            "default y, and -z for data that look like computed tomography, so that the body stands upright if its "
+            "slices go from the feet to the head",
             camera);
         const char* look = "Look";
         std::string names = "auto";
@@ -35,20 +36,19 @@ public:
             names += ", " + name;
         add("--transfer", transfer_, "NAME|FILE.json",
             "Colours and opacity of volumes: " + names
-                + ", or a file (docs/rendering.md has the format). auto and the colour maps are as dense as shows the "
-                  "whole; bone and soft-tissue are for Hounsfield units, and auto is soft-tissue where values look "
-                  "like "
-                  "these; default auto",
+                + ", or a file (docs/rendering.md has the format). auto and the colour maps choose an opacity at which "
+                  "the whole can be seen; bone and soft-tissue are for Hounsfield units, and auto is soft-tissue if "
+                  "values look like these; default auto",
             look);
         add("--range", range_, "LO,HI",
             "Values of volumes that get the first and the last colour: of the data, or percentages of the voxels such "
             "as 1%,99.9%; default: from the end of the background to 99.8 % of what is above it",
             look);
         add("--isovalue", isovalue_, "V[,V...]",
-            "Show the surfaces where volumes have these values; without --transfer nothing else of them", look);
+            "Show the surfaces where volumes have these values; with --transfer also the volumes themselves", look);
         add("--clip", clip_, "X0,Y0,Z0,X1,Y1,Z1",
-            "Show of every file what is in this box, in the file's own coordinates: of a volume voxels, of a mesh as "
-            "its vertices are",
+            "Show only what is inside this box. It is in each file's own coordinates: voxels, or the unit of the "
+            "spacing, for a volume; those of the vertices for a mesh",
             look);
     }
 

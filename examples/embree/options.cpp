@@ -56,7 +56,7 @@ public:
         app_.allow_config_extras(CLI::config_extras_mode::error);
         app_.set_config("--config", "",
                         "Read options, and the scene, from a file: JSON as --save-options writes it, or TOML. The "
-                        "command line counts more")
+                        "command line overrides it")
             ->option_text("FILE");
         for (CLI::Option* option : app_.get_options()) {
             option->capture_default_str();
@@ -68,8 +68,8 @@ public:
             "  mpiexec -n 8 dfb_render synthetic --size 2048x2048 --frames 8 --stats stats.json\n"
             "  mpiexec -n 4 dfb_render bunny.ply neghip_64x64x64_uint8.raw --spp 4 --output both.png\n"
             "  mpiexec -n 4 dfb_render demo --frames 36 --output turn_%02d.png\n"
-            "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. Of an option that is given twice "
-            "the last counts.");
+            "Exit code: 0: done, 1: the run failed, 2: the command line is wrong. If an option is given twice, the "
+            "last one counts.");
     }
 
     ParsedOptions parse(int argc, const char* const* argv)
@@ -133,10 +133,10 @@ private:
                         "'synthetic' (one generated 64^3 volume per brick), 'demo' (a generated volume, mesh and "
                         "spheres together), or one or more files. Volumes: .nrrd, .nhdr, .mha, .mhd, a data set of an "
                         "HDF5 file, FILE.h5:/PATH, or name_XxYxZ_TYPE.raw with uint8, int8, uint16, int16, uint32, "
-                        "int32, float32 or float64, and 'be' behind it where it is big-endian; meshes: .ply, .obj, "
-                        ".stl, .gltf, .glb; atoms: .xyz. Behind a file's name may stand how it is shown, as in "
-                        "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1; there are color, opacity, scale, rotate, "
-                        "translate, and as the options of that name clip, transfer, range, isovalue")
+                        "int32, float32 or float64, followed by 'be' if big-endian; meshes: .ply, .obj, .stl, .gltf, "
+                        ".glb; atoms: .xyz. Settings for one file follow its name, as in "
+                        "a.ply:color=0.8,0.2,0.1:opacity=0.5:translate=0,0,1. They are color, opacity, scale, rotate, "
+                        "translate, and, as the options of the same name, clip, transfer, range and isovalue")
             ->option_text("SCENE...");
         app_.option_defaults()->take_last(); // of an option that is given twice the last counts
     }
@@ -163,48 +163,49 @@ private:
         number("--replicate", options_.replicate, 1, most, "K",
                "Ranks that hold each brick, with --mode mixed; default 2");
         words("--cut", options_.cut, {"auto", "volume", "content"},
-              "How space is cut into bricks: volume: all are equally large; content: all take about as long to render, "
-              "as far as a coarse look shows, so that some ranks read and hold more than others; auto: by content, but "
-              "for surfaces without --ao or --shadows, where it is no better, and for synthetic, which has a grid of "
-              "its own; default auto");
+              "How space is cut into bricks: volume: bricks of equal size; content: bricks that take about equally "
+              "long to render, by a coarse estimate, so that some ranks read and hold more than others; auto: content, "
+              "except for surfaces without --ao or --shadows, where it is no better, and for synthetic, which has a "
+              "grid of its own; default auto");
         words("--balance", options_.balance, {"cost", "round-robin"},
               "How the ranks that hold a brick share its tiles: by what they cost in the last frame, or in turn; "
               "default cost");
-        words("--blend", options_.blend, {"sort", "order", "nearest"},
-              "How the bricks of a pixel become one: sorted by depth; in the order of the bricks from the eye, without "
-              "sorting or depth; or the nearest alone, for opaque scenes; default sort");
+        words(
+            "--blend", options_.blend, {"sort", "order", "nearest"},
+            "How the bricks at a pixel are combined: sorted by depth; in the order of the bricks from the eye, without "
+            "sorting or depth; or the nearest alone, for opaque scenes; default sort");
         words("--distribution", options_.distribution, {"owned", "linear", "round-robin", "dynamic"},
               "Who renders which tile with --mode image: its owner, equal shares in order, one by one, or on demand; "
               "default owned");
         number("--interleave", options_.interleave, 1, 4096, "C",
-               "Cells of each brick, dealt out so that bricks lie in and behind each other; default 1");
+               "Cells that each brick consists of, dealt out so that bricks interleave; default 1");
         number("--deep", options_.deep, 0, 65535, "K",
                "Deep fragments: the most segments per pixel and brick. With fewer than --interleave the order may be "
-               "undefined at some pixels, which are counted; default: that many; 0 without: a single fragment");
+               "undefined at some pixels, which are counted; default: as --interleave, and without it 0: no deep "
+               "fragments");
         number("--ranks", options_.ranks, 1, 4096, "N",
                "Run N ranks as threads of one process; default: the ranks of MPI");
         number("--bricks", options_.bricks, 0, most, "N", "Bricks in all; default 0: one per rank");
         number("--threads", options_.threads, 0, 4096, "N",
-               "Threads per rank; default 0: the processors that it may run on, divided among the ranks that may, too");
+               "Threads per rank; default 0: the rank's share of the processors that it may run on");
         flag("--no-shared-memory", noSharedMemory_,
              "Send all messages through MPI, also those between ranks of one node");
         number("--peer-timeout", options_.peerTimeout, 0, most, "SECONDS",
                "Seconds without a sign of life after which a rank counts as lost, and the job is aborted; 0: never, as "
                "for a debugger; default 300");
         words("--compression", options_.compression, {"none", "snappy", "auto"},
-              "Of messages between ranks; auto: snappy, between nodes, in frames in which trying has shown that it is "
+              "Compression of messages; auto: snappy between nodes, in frames in which trials have shown that it is "
               "faster; default none");
         words("--wire", options_.wire, {"float32", "float16", "unorm16", "unorm8"},
-              "Format of the colour of tiles on their way; less exact ones are for colours from 0 to alpha, other "
-              "tiles stay float32, as do depth and what --aux writes; default float32");
+              "Format in which the colour of tiles is sent; the less exact ones are for colours from 0 to alpha; other "
+              "tiles are sent as float32, as are depth and what --aux writes; default float32");
         number("--error-budget", options_.errorBudget, 0, 1, "E",
-               "Take the cheapest of these formats that is sure to change colour and alpha of no pixel by more than "
-               "this, before it is converted for output; default 0: --wire says");
+               "Use the cheapest of these formats that is certain to change colour and alpha of no pixel by more than "
+               "this, before conversion to the output; default 0: use --wire");
         number("--min-transmittance", options_.minTransmittance, 0, 0.99, "T",
-               "Leave out what is behind bricks that let less than this part of the light through; default 0");
+               "Leave out what is behind bricks that let less than this fraction of the light through; default 0");
         flag("--verify", options_.verify,
-             "Check each finished tile, also its depth and what --aux writes, against an exact reference of what it "
-             "was made of; slow");
+             "Check each finished tile, also its depth and what --aux writes, against an exact reference; slow");
         words("--owner-map", options_.ownerMap, {"auto", "lattice", "linear", "hash"},
               "Which rank owns which tile; default auto: lattice on one node, near the pixels on several");
         number("--in-flight", options_.inFlight, 1, 64, "N",
@@ -215,17 +216,17 @@ private:
     void addPicture()
     {
         group_ = "Picture";
-        text("--size", size_, "WxH", "Of the image in pixels, each side 1 to 65536; default 1024x1024");
+        text("--size", size_, "WxH", "Size of the image in pixels, each side 1 to 65536; default 1024x1024");
         number("--frames", options_.frames, 1, most, "N", "Frames of one turn around the scene; default 1");
         number("--spp", options_.passes, 1, 65536, "N",
                "Samples per pixel, one pass each; default 1, in the pixel's centre");
         number("--adaptive", options_.adaptive, 0, 1, "ERR",
                "Render a tile until the standard error of its pixels is at most this, from 8 to --spp samples; default "
                "0: all have --spp");
-        number(
-            "--ao", options_.aoRays, 0, 4096, "N",
-            "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are no volumes, "
-            "without --path; else 0: none. Bricks then hold what is within --ao-distance of them as ghosts");
+        number("--ao", options_.aoRays, 0, 4096, "N",
+               "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are not "
+               "volumes, "
+               "without --path; otherwise 0: none. Bricks then also hold the geometry within --ao-distance of them");
         number("--ao-distance", options_.aoDistance, 1e-6, 10, "D",
                "How far these rays look and shadows are cast, in units of the scene's largest extent; default 0.1");
         flag("--shadows", options_.shadows, "Shadows of surfaces and spheres on each other, as far as --ao-distance");
@@ -238,12 +239,14 @@ private:
         number("--bezel", options_.bezel, 0, 10000, "N",
                "Pixels that are hidden between two displays of a wall; default 0");
         number("--seed", options_.seed, 0, 9007199254740992.0, "N",
-               "Of generated scenes and sample positions; default 1");
-        number("--opacity", options_.opacity, 0, 1, "A", "Of surfaces, isosurfaces and spheres, 0 to 1; default 1");
-        number("--early-termination", options_.earlyTermination, 0, 1, "T",
-               "End a ray within a brick when less than this part of the light gets through, 0 to 1. The image then "
-               "depends on the bricks, and no pixel is off by more than this part of the brightest colour; default 0: "
-               "when nothing does");
+               "Seed of generated scenes and sample positions; default 1");
+        number("--opacity", options_.opacity, 0, 1, "A",
+               "Opacity of surfaces, isosurfaces and spheres, 0 to 1; default 1");
+        number(
+            "--early-termination", options_.earlyTermination, 0, 1, "T",
+            "End a ray within a brick when less than this fraction of the light gets through, 0 to 1. The image then "
+            "depends on the bricks, and no pixel is off by more than this fraction of the brightest colour; default "
+            "0: when nothing gets through");
         text("--background", background_, "R,G,B",
              "Opaque colour behind the scene, linear, each 0 to 1; default: none, the image stays transparent, and a "
              ".png has alpha");
@@ -273,16 +276,16 @@ private:
         number("--dome-angle", options_.view.domeAngle, 1, 360, "DEG",
                "Degrees that dome covers, up to 360; default 180");
         number("--azimuth", options_.view.azimuth, -36000, 36000, "DEG",
-               "Of the camera around the axis --up, in degrees; default 30");
+               "Angle of the camera around the axis --up, in degrees; default 30");
         number("--elevation", options_.view.elevation, -90, 90, "DEG",
-               "Of the camera in degrees, -90 to 90; default 20");
+               "Elevation of the camera in degrees, -90 to 90; default 20");
         number("--fov", options_.view.fieldOfView, 1, 170, "DEG",
                "Vertical field of view in degrees, 1 to 170; default 35");
         number("--zoom", options_.view.zoom, 1e-3, 1e4, "Z",
                "How many times as large the scene is in the image; default 1");
         number("--camera-distance", options_.view.distance, 0, 1000, "D",
-               "From the target, in units of its largest extent; default: so far that all of it is in the image, from "
-               "every side");
+               "Distance from the target, in units of the largest extent of what there is to see; default: far enough "
+               "that all of it is in the image, from every side");
     }
 
     // ---- reading the values

@@ -43,7 +43,7 @@ public:
             "Its auxiliary channels: PREFIX.normal.pfm, .albedo.pfm, .position.pfm, and .primitive.png and "
             ".instance.png with a colour for each id; default none");
         add("--stats", files.stats, "FILE", {".json"},
-            "Where the time has gone, in ms, on each rank and the slowest: total = load + render + compositing (with "
+            "Where the time went, in ms, on each rank and the slowest: total = load + render + compositing (with "
             "waiting for slower ranks) + write; bytes read and sent, messages, tiles, samples, a hash of the image, "
             "the options; default none");
         add("--trace", files.trace, "FILE", {".json"},
