@@ -39,8 +39,8 @@ struct ToWall {
 //   wall.finish(report.frame);
 //   ... wall.image(display) on the rank that drives it
 //
-// Memory: on the ranks that drive displays two images of each, one that is shown and one that comes; on the way to them
-// at most `poolBytes` each.
+// Memory: a rank that drives displays has two images of each, the one that it shows and the one that arrives. At most
+// `poolBytes` are on the way to such a rank.
 class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside

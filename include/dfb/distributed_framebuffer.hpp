@@ -23,7 +23,7 @@
 DFB_NAMESPACE_BEGIN
 
 // One object per rank. Construction and destruction are collective over the communicator. One thread at a time may call
-// the constructor, begin(), end() and what is collective below. On a thread that may not call MPI (see Progress) all of
+// the constructor, begin(), end() and the collective members. On a thread that may not call MPI (see Progress) all of
 // these throw InvalidArgument, on this rank alone; a constructor that is given a communicator throws TransportError.
 template <class TileOp, class PixelOp, class Transport>
 class DistributedFrameBuffer {
@@ -153,9 +153,9 @@ public:
 
         // Returns the next range of jobs for this rank, out of [0, count) for all ranks together; each job goes to one
         // rank. An empty range: there are no more, or the frame has failed. `count` must be the same on all ranks and
-        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for one other
-        // rank, which hands out the jobs and was asked ahead, in the call before; at most FrameConfig::timeout, then
-        // the frame fails. Throws TransportError.
+        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the rank that
+        // hands out the jobs, mostly not for long, because the call before has asked already. After
+        // FrameConfig::timeout the frame fails. Throws TransportError.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. For measurements
@@ -344,8 +344,8 @@ public:
     // By config().image.ownerMap. A frame can have other owners: see Frame.
     int tileOwner(int tile) const noexcept { return engine().tileOwner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
-    // Of each rank, the lowest rank that shares memory with it: ranks with the same one are on one node. A transport
-    // that knows of no shared memory has one node.
+    // For each rank the lowest rank that shares memory with it: ranks with the same number here are on one node. With a
+    // transport that knows no shared memory all ranks are on one node.
     const std::vector<int>& nodeOf() const noexcept { return engine().nodeOf(); }
     Executor& executor() const noexcept { return *config().executor; }
 
@@ -411,8 +411,8 @@ public:
     using Reduce = dfb::Reduce;
 
     // Combines `values` element by element over all ranks, and returns the result on all. A sum that is too large wraps
-    // around. For figures of your own, or to agree on whether all ranks could load their data. Collective, outside
-    // frames. Waits for all ranks, without a time-out: if one does not call it, the others wait until that rank
+    // around. For figures of your own, or to find out on all ranks whether each could load its data. Collective,
+    // outside frames. Waits for all ranks, without a time-out: if one does not call it, the others wait until that rank
     // destroys its framebuffer or is lost. Throws InvalidArgument on every rank if the numbers of values differ or a
     // rank makes another collective call. Throws TransportError.
     std::vector<std::int64_t> allReduce(const std::vector<std::int64_t>& values, Reduce how)
@@ -420,7 +420,7 @@ public:
         return engine().allReduce(values, how);
     }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` stands in the error if ranks make different calls.
+    // Returns the bytes of each rank, by rank, on all ranks. `call` names this call in the error for different calls.
     // The sizes may differ and may be 0; each rank needs memory for the bytes of all, several times. Collective,
     // outside frames. Waits and throws as allReduce(); also throws std::bad_alloc on a rank that lacks memory.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")

@@ -82,7 +82,7 @@ struct ErrorInfo {
     // is lost. For wrong or missing inputs and messages: the rank that noticed, which need not be the one to blame.
     int rank = -1;
     // The rank that the input or message came from. If something did not come (TimedOut, MissingInput, Transport): the
-    // rank that is waited for; of an input of a tile, the one that announced it.
+    // rank that it should come from; for a missing input of a tile, the rank that announced it.
     int from = -1;
     std::int64_t frame = -1;
     std::int64_t tile = -1;

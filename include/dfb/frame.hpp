@@ -81,8 +81,8 @@ struct FrameBufferConfig {
     // messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message that
     // says so, then renders the tile. Ranks may give different times.
     std::chrono::milliseconds quiet{2000};
-    // Is told what this rank does for its frames, and when: see trace.hpp. Null: nobody is, which costs nothing. Ranks
-    // may give different ones.
+    // Records what this rank does for its frames, and when: see trace.hpp. Null: nothing is recorded, and it costs
+    // nothing. Ranks may give different ones.
     std::shared_ptr<TraceSink> trace{};
 };
 
@@ -114,11 +114,11 @@ struct FrameConfig {
     // False: inputs of generation 0 announce the others, as in the paper, and every tile needs one per pass. True: each
     // rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
-    // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(), or if
-    // setTile() waits for room and nothing of this rank is taken for this long. The error says what is missing and from
-    // whom. If the verdict does not come within twice the time either, end() throws TransportError. 0: no limit. An
-    // input that is never sent needs no time-out: the frame fails with ErrorKind::MissingInput some seconds after all
-    // ranks are in end().
+    // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
+    // if setTile() waits for room, and no receiver takes a message of this rank for this long. The error says what is
+    // missing and from whom. If there is still no verdict after twice the time, end() throws TransportError. 0: no
+    // limit. An input that is never sent needs no time-out: the frame fails with ErrorKind::MissingInput some seconds
+    // after all ranks are in end().
     std::chrono::milliseconds timeout{0};
     // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
     // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same
@@ -131,9 +131,9 @@ struct FrameConfig {
     TileOwners owners{};
     // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
     // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
-    // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile that misses an input
+    // operation throws, or inputs of a tile contradict each other, only that tile is lost. A tile with a missing input
     // is given up when nothing is under way any more, or after `timeout`. A message that cannot be read ends the frame
-    // at once, unless there is a time-out. If ranks disagree about these parameters, the frame fails all the same.
+    // at once, unless there is a time-out. If ranks disagree about these parameters, end() throws nevertheless.
     bool allowPartial = false;
 };
 
@@ -175,8 +175,8 @@ struct FrameSums {
     std::int64_t bytesSent = 0;
     std::int64_t messagesSent = 0;
     std::int64_t tilesTouched = 0; // tiles that had an input
-    // Input pixels with an infinite or NaN colour, or a NaN depth. Of inputs that are read in place only those that
-    // were read: none that an opaque input hides.
+    // Input pixels with an infinite or NaN colour, or a NaN depth. Pixels that are read in place count only if they
+    // were read: those behind an opaque input may not be.
     std::int64_t nonFinitePixels = 0;
     std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
@@ -204,7 +204,7 @@ struct FrameReport : FrameSums {
     Progress progress = Progress::Thread;
     int threads = 1;                            // this rank: workers of its executor
     std::int64_t tilesTotal = 0;                // in the image
-    WireFormat wireColor = WireFormat::Float32; // how this rank's inputs travelled, but for those out of range
+    WireFormat wireColor = WireFormat::Float32; // how this rank's inputs travelled, except those out of range
     bool compressed = false;                    // all: whether a codec was used, see CompressionMode
     // All: how far colour and alpha of a pixel may be off because of Precision and minTransmittance. Depth, positions
     // and ids are exact.

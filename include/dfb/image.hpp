@@ -223,7 +223,7 @@ public:
                 use(planes_[c].data(), pixelCount() * pixelBytes(c));
     }
 
-    // Gives its memory away; there is nothing in it then.
+    // Gives its memory away; the image is empty then.
     std::array<Buffer, detail::channelCount> release() noexcept { return std::move(planes_); }
 
     // Where pixel `first` of each plane is; null where there is none.

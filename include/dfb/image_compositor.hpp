@@ -61,7 +61,8 @@ struct InputImage {
     // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
     float farDepth = std::numeric_limits<float>::infinity();
     // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
-    // left, y from the first row in memory. {0, 0, 0, 0}: all of it. Another one without pixels: nothing to show.
+    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region without pixels: nothing
+    // to show.
     Region region{0, 0, 0, 0};
     // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
@@ -156,11 +157,11 @@ public:
 
     // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
     // cleared, and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of
-    // this rank alone, which is as good for all but speed. After a TransportError do not write to it until the
-    // compositor is gone. Any thread. Waits for nothing. Throws OutOfMemory.
+    // this rank alone: pixels in it are then copied. After a TransportError do not write to it until the compositor is
+    // destroyed. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` stands in the error if ranks make different calls.
+    // Returns the bytes of each rank, by rank, on all ranks. `call` names this call in the error for different calls.
     // The sizes may differ and may be 0. Collective, while no picture is open. Waits and throws as imageOnAllRanks().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {

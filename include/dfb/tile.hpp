@@ -233,17 +233,17 @@ struct TileView : TileHeader {
     const std::uint8_t* color8 = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
-    // Pixels of the image outside of it have nothing, and are not read: for a renderer that knows where its data
-    // project to. To begin with there is no such limit.
+    // Pixels of the image outside of this region are empty, and are not read: for a renderer that knows where its data
+    // project to. By default there is no such limit.
     Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
                  std::numeric_limits<int>::max()};
     Region validRegion() const noexcept { return intersection(region, valid); }
     // A promise: the pixels do not change until the frame's end() has returned. Then they need not be copied. They are
     // read in place if this rank owns the tile, or if the owner is on the same node and they are in memory of
-    // sharedMemory(). They are copied all the same if the operation has no readsInPlace or keeps state, if a channel
-    // beside colour and depth is sent, with a WireFormat that rounds, an ErrorBudget, minTransmittance above 0, or
-    // HalfLevel for an 8-bit image of ranks on several nodes. After a TransportError do not write to such memory until
-    // the framebuffer is gone. NetworkConfig::checksums finds promises that are not kept.
+    // sharedMemory(). They are nevertheless copied if the operation has no readsInPlace or keeps state, if a channel
+    // other than colour and depth is sent, or with a WireFormat that rounds, an ErrorBudget, minTransmittance above 0,
+    // or HalfLevel for an 8-bit image of ranks on several nodes. After a TransportError do not write to such memory
+    // until the framebuffer is destroyed. NetworkConfig::checksums finds broken promises.
     bool staysUntilEnd = false;
 
     detail::ConstPlanes planes() const noexcept

@@ -1,5 +1,5 @@
-// TraceSink: is told what a rank does for its frames, and when. TraceFile, in trace_file.hpp, is one that writes a
-// file.
+// TraceSink: gets events that say what a rank does for its frames, and when. TraceFile, in trace_file.hpp, is a sink
+// that writes a file.
 #pragma once
 
 #include <dfb/version.hpp>

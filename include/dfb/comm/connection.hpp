@@ -35,16 +35,16 @@ struct NetworkConfig {
     Progress progress = Progress::Auto; // which calls or thread move messages
     // True: each message carries a CRC-32C, for networks that are not trusted. Costs a pass over each message.
     bool checksums = false;
-    // True: ranks of one node hand messages over in memory that both see. False: all messages go through MPI.
+    // True: ranks of one node pass messages in shared memory. False: all messages go through MPI.
     bool sharedMemory = true;
-    // A rank counts as lost if nothing has been heard of it for this long while messages are expected. It may have
-    // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank neither looks for lost ranks
-    // nor is looked for. Otherwise 100 ms or more; framebuffers refuse less. It also limits how long a reduction waits
-    // after a message that could not be read; then 0 means no limit, unless the frame has a time-out.
+    // A rank counts as lost if no message has come from it for this long while messages are expected. It may have
+    // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank watches no other, and no
+    // other watches it. Otherwise 100 ms or more; framebuffers refuse less. It also limits how long a reduction waits
+    // after a message that could not be read; for this 0 means no limit, unless the frame has a time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
     // Called when a rank is lost, by a thread of the library, once on one or several of the other ranks. It must be
     // quick and must not throw. All ranks then get a TransportError with the lost rank in ErrorInfo::rank. Null: the
-    // job ends with MPI_Abort, and the error on standard error, as MPI does not go on without a rank.
+    // error is printed to standard error, and the job ends with MPI_Abort, because MPI does not go on without a rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
 };
 

@@ -305,9 +305,9 @@ private:
 };
 
 // Keeps the nearest input of each pixel, by (depth, source, part); for opaque geometry. A pixel is active if its depth
-// is below +infinity, also if it is black or transparent; without a depth it is empty, whatever its colour. The nearest
-// is laid over the background by its alpha; inputs behind it are not blended. Depth, position and ids are those of the
-// nearest. Accepts any tree.
+// is below +infinity, even if it is black or transparent; without a depth it is empty, whatever its colour. The nearest
+// input is laid over the background by its alpha; inputs behind it are not blended. Depth, position and ids are those
+// of the nearest input. Accepts any tree.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicDepthComposite : public detail::SortLast<BlendRule::Nearest, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: DepthComposite compares depths");

@@ -1,8 +1,8 @@
-// MixedParallelLoop (Listing 5 of the paper): of the ranks that hold a brick, one renders it into a tile: the
-// tile-brick owner. With one rank per brick this is data-parallel rendering; with all bricks on all ranks,
-// image-parallel rendering. OrderedLoop: the same for bricks in a known order, without sorting.
+// MixedParallelLoop (Listing 5 of the paper): several ranks may hold a brick, and in each tile one of them renders it.
+// With one rank per brick this is data-parallel rendering; with all bricks on all ranks, image-parallel rendering.
+// OrderedLoop: the same for bricks in a known order, without sorting.
 //
-// A tile-brick owner is any type with
+// A tile-brick owner picks the rank. It is any type with
 //   int operator()(const SharedBrick& brick, int tile, int pass);      returns the rank, one of brick.ranks
 // and, if it decides about all pairs of brick and tile together,
 //   void plan(const SharedWorld&, const std::vector<BrickInTile>&, const std::vector<int>& passes);
@@ -41,8 +41,8 @@ struct RoundRobinBricks {
     }
 };
 
-// Deals the passes of tiles so that all ranks have equally much to do. It goes by the cost of the same brick and tile
-// in the last frame; if that is not known, by the mean of the brick, or of all bricks. Call update() after each frame.
+// Deals the passes of tiles so that all ranks have equally much to do. It uses the cost of the same brick and tile in
+// the last frame; if that is not known, the mean cost of the brick, or of all bricks. Call update() after each frame.
 // The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
