@@ -1,6 +1,7 @@
-// A tile operation of your own, and no renderer: a field on three levels of refinement, as simulations with adaptive
-// meshes have it. Patches lie on any rank. A patch announces how many finer ones refine it, wherever those are: level l
-// is generation l of the tile's tree. The operation keeps the finest value of each pixel and drops the rest.
+// A tile operation of your own, without a renderer: a field on three levels of refinement, as in simulations with
+// adaptive meshes. A patch may be on any rank. It announces how many finer patches refine it, on whatever rank they
+// are: level l is generation l of the tile's tree. The operation keeps the finest value of each pixel, and drops the
+// rest.
 //   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
 
 #include <dfb/dfb.hpp>

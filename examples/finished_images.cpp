@@ -1,6 +1,6 @@
-// Finished images to one picture, as an image compositor does it. Each rank has rendered some of four balls into an
-// image of its own, as OpenGL gives it: 8 bits a channel, the lowest row first, depth from 0 to 1 with 1 where there is
-// nothing. In the picture the balls stick in each other: every pixel shows the nearest one.
+// Composites finished images into one picture. Each rank has rendered some of four balls into an image of its own, as
+// OpenGL gives it: 8 bits per channel, the lowest row first, depth from 0 to 1 with 1 where there is nothing. In the
+// picture the balls intersect: every pixel shows the nearest one.
 //
 //   mpirun -n 4 finished_images [picture.ppm]
 #include <dfb/dfb.hpp>

@@ -1,6 +1,6 @@
-// The whole scene on every rank: tiles are handed out on demand, as some take much longer than others. A pixel
-// operation of one's own darkens the corners of the finished tiles on their owners. The picture shows the Mandelbrot
-// set.
+// The whole scene on every rank: tiles are handed out on demand, because some take much longer than others. A pixel
+// operation runs on the owners of finished tiles, and darkens the corners of the image. The picture shows the
+// Mandelbrot set.
 //   mpirun -n 4 image_parallel    writes image_parallel.ppm
 
 #include <dfb/dfb.hpp>

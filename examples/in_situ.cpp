@@ -1,6 +1,6 @@
-// A simulation of its own that shows its fields while it runs: two substances that spread and react (Gray and Scott)
-// on a periodic grid. The grid is cut in slabs, whose number has nothing to do with that of the ranks: each rank holds
-// a run of them, or none. Every so many steps the slabs are rendered where they lie and become one picture.
+// A simulation that renders its fields while it runs: two substances that spread and react (Gray and Scott) on a
+// periodic grid. The grid is cut into slabs, whose number does not depend on the number of ranks: each rank holds some
+// consecutive slabs, or none. Every so many steps each rank renders its own slabs, and they become one picture.
 //   mpirun -n 4 in_situ        writes in_situ_0000.ppm and so on; in_situ --help has the options
 //   mpirun -n 4 in_situ --live        shows them in a browser, where they can be turned and the simulation be stopped
 #include "live/interrupt.hpp"

@@ -1,6 +1,6 @@
-// Noise that goes away: a floor under a round lamp and a ball in its way. Each sample picks a point of the lamp, so the
-// edge of the shadow is noisy. Frames accumulate until the error of each tile is small enough; tiles without noise are
-// done at once. The picture shows a soft shadow.
+// Progressive rendering: a floor, a round lamp above it, and a ball between them. Each sample picks a point of the
+// lamp, so the edge of the shadow is noisy. Frames accumulate until the error of each tile is small enough; tiles
+// without noise are done at once. The picture shows a soft shadow.
 //   mpirun -n 4 progressive    writes progressive.ppm and says how many samples were taken
 #include "ball.hpp"
 

@@ -1,5 +1,5 @@
 // A volume renderer for several ranks, in one file. The volume is cut into bricks, and each rank reads and renders its
-// own. A pixel's ray collects light in each brick that it meets; the library sorts what comes of it, and blends.
+// own. A pixel's ray collects light in each brick that it meets; the library sorts these colours by depth, and blends.
 //   mpirun -n 4 raycast [VOLUME [FROM [BRICKS]]]      writes raycast.ppm
 // VOLUME is a file such as head_256x256x128_uint8.raw: sizes and type of the voxels (uint8, uint16 or float32) are in
 // its name, x is fastest. Without one a knot is rendered. BRICKS (8) does not depend on the number of ranks. Equal
@@ -217,6 +217,9 @@ try {
     if (argc > 1 && argv[1][0] == '-') {
         if (fb.isDisplayRank())
             std::printf("usage: raycast [VOLUME [FROM [BRICKS]]]\n"
+                        "  VOLUME  name_XxYxZ_TYPE.raw, TYPE: uint8, uint16 or float32 (a knot)\n"
+                        "  FROM    values below are transparent; a part of the range, 0 to 1 (0.15)\n"
+                        "  BRICKS  number of bricks (8)\n"
                         "e.g.   mpirun -n 4 raycast head_256x256x128_uint8.raw 0.2\n");
         return 0;
     }

@@ -57,9 +57,9 @@ def render(comm, size, name):
 
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--threads", type=int, help="ranks are so many threads, and there is no MPI")
-parser.add_argument("--size", type=int, default=480, help="of the picture, in pixels")
-parser.add_argument("picture", nargs="?", default="volume.ppm")
+parser.add_argument("--threads", type=int, help="run this many ranks as threads, without MPI")
+parser.add_argument("--size", type=int, default=480, help="width and height of the picture in pixels (480)")
+parser.add_argument("picture", nargs="?", default="volume.ppm", help="file to write (volume.ppm)")
 arguments = parser.parse_args()
 if arguments.threads:
     dfb.run_ranks(arguments.threads, lambda comm: render(comm, arguments.size, arguments.picture))

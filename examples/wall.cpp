@@ -1,5 +1,6 @@
 // A display wall: two rows of two displays with bezels between them, driven by up to four ranks. Tiles go from their
-// owners straight to the displays. Each display writes what it shows; a ball that crosses a bezel goes on straight.
+// owners straight to the displays. Each display writes what it shows. The bezels hide pixels, so the outline of a ball
+// that crosses one is not bent.
 //   mpirun -n 4 wall    writes wall_0.ppm to wall_3.ppm
 #include "ball.hpp"
 
