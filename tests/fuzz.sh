@@ -7,10 +7,16 @@ set -u
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root" || exit 1
-sh cmake/install_packages.sh clang || exit 1
-
 seconds=${1:-60}
 [ $# -eq 0 ] || shift
+case $seconds in
+*[!0-9]* | 0) # for libFuzzer: without end
+    echo "usage: sh tests/fuzz.sh [SECONDS [TARGET...]]" >&2
+    exit 2
+    ;;
+esac
+sh cmake/install_packages.sh clang || exit 1
+
 jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 cmake --preset fuzz || exit 1
 # shellcheck disable=SC2046 # one word per target
@@ -20,6 +26,7 @@ programs=""
 for target; do
     programs="$programs test_fuzz_$target"
     mkdir -p "build/fuzz/corpus/$target" build/fuzz/crashes
+    rm -f "build/fuzz/$target.failed" # of a run that was interrupted
 done
 # shellcheck disable=SC2086 # one word per program
 cmake --build --preset fuzz --parallel "$jobs" --target $programs || exit 1
