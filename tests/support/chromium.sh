@@ -4,7 +4,7 @@
 # shellcheck shell=sh disable=SC2154
 
 modules=${DFB_LIVE_NODE_MODULES:-}
-[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-$HOME/.cache}/dfb-live
+[ -n "$modules" ] || modules=${XDG_CACHE_HOME:-${HOME:-$root/build}/.cache}/dfb-live
 lacking=
 for package in $packages; do
     [ -d "$modules/node_modules/${package%@*}" ] || lacking="$lacking $package"
