@@ -111,6 +111,15 @@ apt() {
 # shellcheck disable=SC2086 # one word per package
 if ! apt install --no-install-recommends $missing; then
     say "refreshing the package lists and trying once more"
-    apt update
-    apt install --no-install-recommends $missing
+    apt update || say "they cannot be refreshed now"
+    # A release may lack some. CMake says what it leaves out then.
+    known=
+    for package in $missing; do
+        if LC_ALL=C apt-cache policy "$package" | grep '^  Candidate: [^(]' >/dev/null; then
+            known="$known $package"
+        else
+            say "this system has no package $package"
+        fi
+    done
+    [ -z "$known" ] || apt install --no-install-recommends $known
 fi
