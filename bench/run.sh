@@ -29,7 +29,7 @@ while [ $# -gt 0 ]; do
     esac
     shift
 done
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh cmake/jobs.sh)
 commit=$(git rev-parse --short HEAD 2>/dev/null || echo unknown)
 results=bench/results
 bench=build/release/bench

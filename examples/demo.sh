@@ -45,7 +45,7 @@ done
 
 root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 build=$root/build/release
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh "$root/cmake/jobs.sh")
 
 sh "$root/cmake/install_packages.sh"
 say "building dfb_render in $build"

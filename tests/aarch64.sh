@@ -18,7 +18,7 @@ cd "$root"
 sh cmake/install_packages.sh aarch64 || exit 77
 [ $# -gt 0 ] || set -- -R '^(unit|stress|inproc)\.' \
     -E '^(inproc\.(corners|counters|edges|image_compositor|moving|faults|lost_peers|messaging|timeouts)|stress\.(scaling|skip))$'
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh cmake/jobs.sh)
 
 build=build/aarch64
 cmake --preset aarch64

@@ -17,7 +17,7 @@ case $seconds in
 esac
 sh cmake/install_packages.sh clang || exit 1
 
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh cmake/jobs.sh)
 cmake --preset fuzz || exit 1
 # shellcheck disable=SC2046 # one word per target
 [ $# -gt 0 ] || set -- $(cmake --build --preset fuzz --target help | sed -nE 's/^test_fuzz_([a-z_]+): phony$/\1/p')

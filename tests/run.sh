@@ -8,7 +8,7 @@ root=$(CDPATH='' cd -- "$(dirname -- "$0")/.." && pwd)
 cd "$root"
 sh cmake/install_packages.sh tests
 
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh cmake/jobs.sh)
 cmake --preset dev
 cmake --build --preset dev --parallel "$jobs"
 exec ctest --preset dev --parallel $((4 * jobs + 3)) "$@" # slots, see tests/CMakeLists.txt

@@ -17,7 +17,7 @@ if [ "${1:-}" = --brief ]; then
     brief=yes
     shift
 fi
-jobs=$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+jobs=$(sh cmake/jobs.sh)
 [ $# -gt 0 ] || set -- asan tsan clang
 
 # All test programs but that of guard.odr, which runs nothing and takes long to compile. A test whose program is missing

@@ -142,6 +142,6 @@ build_tree() {
     {
         in_root cmake -S /dfb -B /build -DCMAKE_BUILD_TYPE=Release -DMPI_CXX_COMPILER=mpicxx.openmpi -DDFB_WITH_TBB=OFF \
             -DDFB_WITH_SNAPPY=OFF -DDFB_BUILD_TESTS=OFF -DDFB_BUILD_BENCH=OFF &&
-            in_root cmake --build /build --parallel "$(getconf _NPROCESSORS_ONLN)" --target "$@"
+            in_root cmake --build /build --parallel "$(sh "$source/cmake/jobs.sh")" --target "$@"
     } >"$root/build.log" 2>&1 || give_up "it does not build: see $root/build.log"
 }

@@ -1,0 +1,10 @@
+#!/bin/sh
+# sh cmake/jobs.sh
+# Prints how many compilers to run at once: one for each processor that this process may use, if there is memory for
+# them, as a file of ours takes up to 1.5 GB.
+set -eu
+
+jobs=$(env -u OMP_NUM_THREADS nproc 2>/dev/null || getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
+free=$(sed -n 's/^MemAvailable: *\([0-9]*\) kB$/\1/p' /proc/meminfo 2>/dev/null || true)
+[ -z "$free" ] || [ "$jobs" -le $((free / 1500000)) ] || jobs=$((free / 1500000))
+echo $((jobs > 0 ? jobs : 1))
