@@ -55,6 +55,9 @@ isolate() {
         command -v "$command" >/dev/null 2>&1 || skip "there is no $command: it needs Debian or a system made of it"
     done
     unshare --mount --pid --fork true 2>/dev/null || skip "this machine lets nobody mount (a container?)"
+    mkdir -p "$(dirname "$root")"
+    exec 9>"$root.lock"
+    flock --nonblock 9 || give_up "another run works in $root"
     export DFB_ISOLATED=yes
     exec unshare --mount --pid --fork --kill-child --mount-proc sh "$0" "$@"
 }
