@@ -22,7 +22,8 @@ for command in apt-get dpkg; do
 done
 
 work=$(mktemp -d)
-trap 'rm -rf "$work" "$dir.new"' EXIT
+new=$dir.$$
+trap 'rm -rf "$work" "$new"' EXIT
 trap 'exit 1' HUP INT TERM
 
 (cd "$work" && apt-get -q download paraview-dev paraview >log 2>&1) ||
@@ -36,8 +37,8 @@ if [ -z "$header" ] || [ -z "$library" ]; then
     give_up "no IceT in these packages: $(cd "$work" && echo *.deb)"
 fi
 
-mkdir -p "$dir.new/include" "$dir.new/lib"
-cp "$(dirname "$header")/IceT.h" "$(find "$work/files" -name IceTConfig.h | head -n 1)" "$dir.new/include"
-cp -P "$library"* "$dir.new/lib"
-mv "$dir.new" "$dir"
+mkdir -p "$new/include" "$new/lib"
+cp "$(dirname "$header")/IceT.h" "$(find "$work/files" -name IceTConfig.h | head -n 1)" "$new/include"
+cp -P "$library"* "$new/lib"
+mv -T "$new" "$dir" || [ -e "$dir/include/IceT.h" ] # of another run
 echo "get_icet.sh: IceT is in $dir" >&2
