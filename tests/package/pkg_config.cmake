@@ -33,5 +33,6 @@ foreach(component MPI TBB SNAPPY TESTING)
     string(APPEND definitions " -DEXPECT_${component}=0")
   endif()
 endforeach()
-execute_process(COMMAND sh -xc "'${CXX}' -std=c++17 ${definitions} '${MAIN}' $(pkg-config --cflags --libs ${MODULE}) -o consumer && ./consumer"
+# What it says is for a shell to read: it escapes spaces in paths.
+execute_process(COMMAND sh -xc "eval \"'${CXX}' -std=c++17 ${definitions} '${MAIN}' $(pkg-config --cflags --libs ${MODULE}) -o consumer\" && ./consumer"
   WORKING_DIRECTORY ${BUILD} COMMAND_ERROR_IS_FATAL ANY)
