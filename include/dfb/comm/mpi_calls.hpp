@@ -2,7 +2,6 @@
 // The only header that includes mpi.h.
 #pragma once
 
-#include <dfb/compiled.hpp>
 #include <dfb/error.hpp>
 
 #include <mpi.h>

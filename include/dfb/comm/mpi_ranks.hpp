@@ -11,7 +11,6 @@
 #include <dfb/comm/mpi_calls.hpp>
 #include <dfb/comm/node_memory.hpp>
 #include <dfb/comm/packet.hpp>
-#include <dfb/compiled.hpp>
 #include <dfb/error.hpp>
 
 #include <algorithm>

@@ -67,7 +67,6 @@
 #include <memory>
 #include <mutex>
 #include <string>
-#include <type_traits>
 #include <utility>
 
 DFB_NAMESPACE_BEGIN

@@ -12,7 +12,6 @@
 #include <dfb/frame.hpp>
 
 #include <algorithm>
-#include <cstddef>
 #include <cstdint>
 #include <iterator>
 #include <mutex>
