@@ -381,20 +381,18 @@ private:
         pixels.region = region;
         pixels.color = floatsOf(planes.at[Color]);
         pixels.depth = floatsOf(planes.at[Depth]);
-        pixels.aux = {floatsOf(planes.at[Normal]), floatsOf(planes.at[Albedo]), floatsOf(planes.at[Position]),
-                      idsOf(planes.at[PrimitiveId]), idsOf(planes.at[InstanceId])};
+        const auto auxOf = [](const Planes& p) {
+            return AuxRow{floatsOf(p.at[Normal]), floatsOf(p.at[Albedo]), floatsOf(p.at[Position]),
+                          idsOf(p.at[PrimitiveId]), idsOf(p.at[InstanceId])};
+        };
+        pixels.aux = auxOf(planes);
         operations_.process(pixels);
         auto place = gather_.reserve(tile);
         table_.backgroundPixels(tile).newFrame(region.width(), region.height(), 0);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither);
         for (int y = 0; y < region.height(); ++y) {
-            const auto row = [&](std::size_t c) {
-                const std::size_t before = 4 * channelWords[c] * width * static_cast<std::size_t>(y);
-                return planes.at[c] ? planes.at[c] + before : nullptr;
-            };
-            out.setRow(y, floatsOf(row(Color)), floatsOf(row(Depth)),
-                       {floatsOf(row(Normal)), floatsOf(row(Albedo)), floatsOf(row(Position)), idsOf(row(PrimitiveId)),
-                        idsOf(row(InstanceId))});
+            const Planes row = planes.from(width * static_cast<std::size_t>(y));
+            out.setRow(y, floatsOf(row.at[Color]), floatsOf(row.at[Depth]), auxOf(row));
         }
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
