@@ -160,47 +160,41 @@ public:
     }
 
     // splitPlane() or joinPlane() for each plane of a body. The table stays as it is.
-    void split(const SparseShape& shape, const std::byte* in, std::byte* out) const;
-    void join(const SparseShape& shape, const std::byte* in, std::byte* out) const;
+    void split(const SparseShape& shape, const std::byte* in, std::byte* out) const
+    {
+        transform(shape, in, out, false);
+    }
+    void join(const SparseShape& shape, const std::byte* in, std::byte* out) const { transform(shape, in, out, true); }
 
 private:
-    // Colour has 4 words of 1, 2 or 4 bytes; other channels have 1 or 3 words of 4 bytes.
-    template <class Transform>
-    void transform(const SparseShape& shape, const std::byte* in, std::byte* out, const Transform& call) const
-    {
-        const std::size_t pixels = shape.stored();
-        const std::size_t end = forEachPlane(pixels, [&](std::size_t c, std::size_t at, std::size_t) {
-            constexpr std::integral_constant<std::size_t, 1> one;
-            constexpr std::integral_constant<std::size_t, 3> three;
-            constexpr std::integral_constant<std::size_t, 4> four;
-            if (channelWords[c] == one)
-                call(std::uint32_t{}, one, in + at, pixels, out + at);
-            else if (channelWords[c] == three)
-                call(std::uint32_t{}, three, in + at, pixels, out + at);
-            else if (wordBytes_[c] == 4)
-                call(std::uint32_t{}, four, in + at, pixels, out + at);
-            else if (wordBytes_[c] == 2)
-                call(std::uint16_t{}, four, in + at, pixels, out + at);
-            else
-                call(std::uint8_t{}, four, in + at, pixels, out + at);
-        });
-        std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
-    }
+    void transform(const SparseShape& shape, const std::byte* in, std::byte* out, bool joins) const;
 
     std::array<std::size_t, channelCount> wordBytes_{};
     std::size_t pixelBytes_ = 0;
 };
 
 #if DFB_HAS_BODIES
-DFB_COMPILED_ONCE void PlaneFormat::split(const SparseShape& shape, const std::byte* in, std::byte* out) const
+// Of pixels of so many words.
+template <class Word, std::size_t words>
+void transformPlane(const std::byte* in, std::size_t pixels, std::byte* out, bool joins)
 {
-    transform(shape, in, out,
-              [](auto word, auto words, auto... plane) { fastest<splitPlane<decltype(word), words>>(plane...); });
+    joins ? fastest<joinPlane<Word, words>>(in, pixels, out) : fastest<splitPlane<Word, words>>(in, pixels, out);
 }
-DFB_COMPILED_ONCE void PlaneFormat::join(const SparseShape& shape, const std::byte* in, std::byte* out) const
+
+DFB_COMPILED_ONCE void PlaneFormat::transform(const SparseShape& shape, const std::byte* in, std::byte* out,
+                                              bool joins) const
 {
-    transform(shape, in, out,
-              [](auto word, auto words, auto... plane) { fastest<joinPlane<decltype(word), words>>(plane...); });
+    const std::size_t pixels = shape.stored();
+    const std::size_t end = forEachPlane(pixels, [&](std::size_t c, std::size_t at, std::size_t) {
+        // Colour has 4 words of 1, 2 or 4 bytes; other channels have 1 or 3 words of 4 bytes.
+        const auto ofChannel = channelWords[c] == 1   ? transformPlane<std::uint32_t, 1>
+                               : channelWords[c] == 3 ? transformPlane<std::uint32_t, 3>
+                               : wordBytes_[c] == 4   ? transformPlane<std::uint32_t, 4>
+                               : wordBytes_[c] == 2   ? transformPlane<std::uint16_t, 4>
+                                                      : transformPlane<std::uint8_t, 4>;
+        ofChannel(in + at, pixels, out + at, joins);
+    });
+    std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
 }
 #endif
 
