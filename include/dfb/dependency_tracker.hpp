@@ -230,23 +230,17 @@ private:
     [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
                                        int otherRank)
     {
-        ErrorInfo info = detail::errorInfo(ErrorKind::DuplicateInput,
-                                           detail::printed("source %u (the id of a brick, or the place of an image in "
-                                                           "an order)",
-                                                           source));
-        info.from = std::max(rank, otherRank);
-        info.generation = generation;
-        info.source = source;
-        info.expected = 1;
-        info.got = 2;
+        const int lower = std::min(rank, otherRank), higher = std::max(rank, otherRank);
+        std::string text =
+            detail::printed("source %u (the id of a brick, or the place of an image in an order)", source);
         if (part > 0)
-            info.message += detail::printed(" part %d", part);
-        if (std::min(rank, otherRank) < 0 || rank == otherRank)
-            info.message += info.from < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", info.from);
+            text += detail::printed(" part %d", part);
+        if (lower < 0 || lower == higher)
+            text += higher < 0 ? " comes twice" : detail::printed(" comes twice from rank %d", higher);
         else
-            info.message += detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only",
-                                            std::min(rank, otherRank), std::max(rank, otherRank));
-        throw Error(std::move(info));
+            text +=
+                detail::printed(" comes from rank %d and from rank %d: it may be that of one rank only", lower, higher);
+        fail(ErrorKind::DuplicateInput, generation, source, higher, 1, 2, std::move(text));
     }
 
     [[noreturn]] static void fail(ErrorKind kind, int generationIndex, std::uint32_t source, int rank,
