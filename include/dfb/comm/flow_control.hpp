@@ -78,7 +78,7 @@ public:
             for (std::size_t left = out.queue.size(); left > 0; --left) {
                 Buffer message = out.queue.pop();
                 total += message.size();
-                if ((keepsAsked && total <= out.askedForAll) || matters_(message))
+                if ((keepsAsked && total <= out.request.all) || matters_(message))
                     out.queue.push(std::move(message));
                 else
                     underWay_ -= message.size();
@@ -107,7 +107,7 @@ public:
             underWay_ += message.size();
             if (!out.queue.empty() || out.sent + message.size() > out.granted) {
                 out.queue.push(std::move(message));
-                if (out.asked())
+                if (out.asks())
                     return;
                 request = requestOf(out);
             } else {
@@ -167,7 +167,7 @@ public:
             callbacks_.transmit(from, std::move(message));
             lock.lock();
         }
-        if (out.queue.empty() || out.asked())
+        if (out.queue.empty() || out.asks())
             return;
         const Request request = requestOf(out);
         lock.unlock();
@@ -236,10 +236,10 @@ public:
 private:
     struct Outgoing {
         std::uint64_t sent = 0, granted = 0, consumed = 0; // totals
-        std::uint64_t askedFor = 0, askedForAll = 0;       // Request::first, all
+        Request request;                                   // the last
         Fifo<Buffer> queue;
 
-        bool asked() const { return askedFor > granted; } // and has no answer yet
+        bool asks() const { return request.first > granted; } // and has no answer yet
     };
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
@@ -257,7 +257,8 @@ private:
         void reset(std::uint64_t allowance)
         {
             out.queue.clear();
-            out.sent = out.consumed = out.askedFor = out.askedForAll = 0;
+            out.sent = out.consumed = 0;
+            out.request = Request();
             in = Incoming();
             out.granted = in.granted = allowance;
         }
@@ -284,9 +285,7 @@ private:
                 request.first = total;
             request.all = total;
         }
-        out.askedFor = request.first;
-        out.askedForAll = request.all;
-        return request;
+        return out.request = request;
     }
 
     std::uint64_t extraOf(const Incoming& in, std::uint64_t granted) const
