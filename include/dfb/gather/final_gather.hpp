@@ -241,12 +241,8 @@ public:
             Buffer memory; // first, as it may throw
             if (!batch_ || isFull)
                 memory = pool_->acquire(std::max(batchBytes, prefix + plan.bytes()));
-            if (isFull) {
-                batch_->closed = true;
-                if (batch_->writers == 0)
-                    full = batch_;
-                batch_.reset();
-            }
+            if (isFull)
+                full = closeBatch();
             if (!batch_) {
                 batch_ = takeSpare();
                 batch_->message = std::move(memory);
@@ -289,12 +285,8 @@ public:
             std::byte* const tiles = storeAll(done.data(), header, sent_);
             std::copy(placed_.begin(), placed_.end(), reinterpret_cast<std::int32_t*>(tiles));
             flushed_ = true;
-            if (batch_) {
-                batch_->closed = true;
-                if (batch_->writers == 0) // else the last of these sends it
-                    last = batch_;
-                batch_.reset();
-            }
+            if (batch_)
+                last = closeBatch();
         }
         if (last)
             sendBatch(std::move(last));
@@ -559,6 +551,14 @@ private:
     {
         if (config_.onTile)
             config_.onTile(tile, layout_.region(tile), image_);
+    }
+
+    // Under mutex_. Returns it to be sent, or null if somebody still writes: the last of these sends it.
+    std::shared_ptr<Batch> closeBatch()
+    {
+        batch_->closed = true;
+        std::shared_ptr<Batch> closed = std::move(batch_);
+        return closed->writers == 0 ? std::move(closed) : nullptr;
     }
 
     // Under mutex_.
