@@ -273,14 +273,12 @@ private:
                 dropped_ = coming_.begin()->first;
         }
         Picture& picture = pictures->at(where.display);
-        std::byte* pixels = picture.image.bytes();
+        const std::size_t stride = static_cast<std::size_t>(layout_.displayWidth) * pixelBytes;
+        std::byte* to = picture.image.bytes() + static_cast<std::size_t>(part.y0) * stride
+                        + static_cast<std::size_t>(part.x0) * pixelBytes;
         const std::byte* in = message.data() + prefix;
-        for (int y = part.y0; y < part.y1; ++y, in += rowBytes)
-            std::memcpy(pixels
-                            + (static_cast<std::size_t>(y) * static_cast<std::size_t>(layout_.displayWidth)
-                               + static_cast<std::size_t>(part.x0))
-                                  * pixelBytes,
-                        in, rowBytes);
+        for (int y = part.y0; y < part.y1; ++y, in += rowBytes, to += stride)
+            std::memcpy(to, in, rowBytes);
         bool complete = false;
         {
             const std::lock_guard<std::mutex> lock(mutex_);
