@@ -63,13 +63,13 @@ public:
     {
         if (segment.rgba == std::array<float, 4>{})
             return;
-        const std::size_t pixel = pixelAt(x, y);
+        const std::size_t pixel = pixelAt(x - header_.region.x0, y - header_.region.y0);
         Segment* first = segments_.data() + pixel * static_cast<std::size_t>(maxSegments_);
         std::uint16_t& count = counts_[pixel];
         if (count == maxSegments_) {
             std::vector<Segment>& all = scratch_;
             all.assign(first, first + count);
-            insert(all, segment);
+            all.insert(std::upper_bound(all.begin(), all.end(), segment, nearer), segment);
             errors_[pixel] += mergeCheapest(all);
             errorBound_ = std::max(errorBound_, errors_[pixel]);
             std::copy(all.begin(), all.end(), first);
@@ -96,8 +96,7 @@ public:
                       "dfb: segments need a tile with depth and farChannel");
         for (int y = 0; y < header_.region.height(); ++y)
             for (int x = 0; x < header_.region.width(); ++x) {
-                const std::size_t pixel = static_cast<std::size_t>(y) * static_cast<std::size_t>(header_.region.width())
-                                          + static_cast<std::size_t>(x);
+                const std::size_t pixel = pixelAt(x, y);
                 if (layer >= counts_[pixel])
                     continue;
                 const Segment& s =
@@ -110,11 +109,6 @@ public:
 
 private:
     static bool nearer(const Segment& a, const Segment& b) { return a.depth < b.depth; }
-
-    static void insert(std::vector<Segment>& all, const Segment& segment)
-    {
-        all.insert(std::upper_bound(all.begin(), all.end(), segment, nearer), segment);
-    }
 
     // Merges two neighbours; returns by how much that may change the pixel.
     static double mergeCheapest(std::vector<Segment>& all)
@@ -142,11 +136,8 @@ private:
         return bestCost;
     }
 
-    std::size_t pixelAt(int x, int y) const
-    {
-        return static_cast<std::size_t>(y - header_.region.y0) * static_cast<std::size_t>(header_.region.width())
-               + static_cast<std::size_t>(x - header_.region.x0);
-    }
+    // Counted in the region.
+    std::size_t pixelAt(int x, int y) const { return static_cast<std::size_t>(y * header_.region.width() + x); }
 
     int maxSegments_;
     TileHeader header_;
