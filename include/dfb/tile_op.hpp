@@ -89,7 +89,8 @@ struct AuxRow {
 };
 
 // Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way. Only within
-// TileOp::finish(), on its thread. Nobody checks that rows, columns and counts are within the region.
+// TileOp::finish(), on its thread. Members that set pixels throw InvalidArgument, with nothing set, for pixels outside
+// the region.
 class FinishedTile {
 public:
     // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
@@ -187,6 +188,7 @@ public:
     // bytes. Depth becomes +infinity. Pixels that are known to be background already are not written.
     void fillPixels(int x, int y, int count, const std::byte* stored)
     {
+        require(x, y, count);
         if (background_)
             background_->add(x, y, count, [&](int from, int some) { writeBackground(from, y, some, stored); });
         else
@@ -198,7 +200,8 @@ public:
     const detail::Planes& planes() const noexcept { return to_; }
     std::size_t stride() const noexcept { return stride_; } // from a row to the next, in pixels
 
-    // Replaces value i in [0, 4 * width()) of row y by another 8-bit level, after setRow().
+    // Replaces value i in [0, 4 * width()) of row y by another 8-bit level, after setRow(). Nobody checks these
+    // numbers.
     void setLevel(int y, int i, std::uint8_t level)
     {
         const std::size_t pixel = static_cast<std::size_t>(y) * stride_;
@@ -218,8 +221,16 @@ private:
         return static_cast<std::size_t>(y) * stride_ + static_cast<std::size_t>(x);
     }
 
+    void require(int x, int y, int count) const
+    {
+        if (y < 0 || y >= height() || x < 0 || count < 0 || count > width() - x)
+            detail::failArgument("pixels %d to %d of row %d of a tile of %dx%d", x, x + count - 1, y, width(),
+                                 height());
+    }
+
     void overwrites(int x, int y, int count)
     {
+        require(x, y, count);
         writtenPixels_ += count;
         if (background_)
             background_->remove(x, y, count);

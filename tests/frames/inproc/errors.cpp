@@ -726,6 +726,67 @@ TEST_CASE("An exception in a tile operation fails the frame on every rank", "[er
 
 namespace {
 
+// Takes tiles at the border of the image for whole ones.
+class TooManyRows : public Blend {
+public:
+    void finish(dfb::FinishedTile& out)
+    {
+        Blend::finish(out);
+        const std::vector<double> row(4 * tileSize);
+        for (int y = out.height(); y < tileSize; ++y)
+            out.setRow(y, row.data(), nullptr);
+    }
+};
+
+} // namespace
+
+TEST_CASE("An operation that writes a row which its tile does not have fails the frame on every rank", "[errors]")
+{
+    Scene s = scene::makeScene(6);
+    s.bricks.front().bounds = {{0, 0, 0}, {97, 61, 1}}; // all tiles, also those of 13 rows
+    std::vector<std::string> texts(2);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<TooManyRows> fb(communicator, configOf(s));
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] { scene::renderLoop(fb, s, Loop::Declared); });
+    });
+    INFO(joined(texts));
+    CHECK(allSame(texts));
+    CHECK(has(texts[0], "FrameError: dfb: invalid argument"));
+    CHECK(has(texts[0], "row 13 of a tile of "));
+}
+
+TEST_CASE("Pixels outside a finished tile are refused, and nothing is written", "[errors]")
+{
+    std::vector<float> colors(4 * 8 * 8, 1.0f), depths(8 * 8, 1.0f);
+    dfb::detail::Planes planes;
+    planes.at[dfb::detail::Color] = reinterpret_cast<std::byte*>(&colors[4 * 8]); // one row in, as the next two
+    planes.at[dfb::detail::Depth] = reinterpret_cast<std::byte*>(&depths[8]);
+    dfb::FinishedTile tile({0, 0, 7, 5}, dfb::OutputFormat::RGBA32F, planes, 8);
+    const std::vector<double> doubles(4 * 8);
+    const std::vector<float> floats(4 * 8);
+    const auto* stored = reinterpret_cast<const std::byte*>(floats.data());
+    struct Pixels {
+        int x, y, count;
+    };
+    for (const Pixels p : {Pixels{0, -1, 7}, {0, 5, 7}, {-1, 0, 3}, {5, 0, 3}, {0, 0, -1}, {7, 0, 1}}) {
+        INFO(p.x << ' ' << p.y << ' ' << p.count);
+        if (p.y != 0)
+            CHECK_THROWS_AS(tile.setRow(p.y, doubles.data(), floats.data()), dfb::InvalidArgument);
+        CHECK_THROWS_AS(tile.setPixels(p.x, p.y, p.count, doubles.data(), floats.data()), dfb::InvalidArgument);
+        CHECK_THROWS_AS(tile.setPixels(p.x, p.y, p.count, floats.data()), dfb::InvalidArgument);
+        CHECK_THROWS_AS(tile.setStored(p.x, p.y, p.count, stored, floats.data()), dfb::InvalidArgument);
+        CHECK_THROWS_AS(tile.fillPixels(p.x, p.y, p.count, stored), dfb::InvalidArgument);
+    }
+    CHECK(tile.writtenPixels() == 0);
+    CHECK(std::count(colors.begin(), colors.end(), 1.0f) == 4 * 8 * 8);
+    CHECK(std::count(depths.begin(), depths.end(), 1.0f) == 8 * 8);
+    tile.setRow(4, doubles.data(), floats.data());
+    tile.fillPixels(7, 4, 0, stored);
+    CHECK(std::count(depths.begin(), depths.end(), 0.0f) == 7);
+}
+
+namespace {
+
 // A bad frame of a framebuffer with a FaultyPixelOp that throws on one rank.
 template <bool Pointwise>
 BadFrame brokenPixelOp(int culprit, const Scene& s)
