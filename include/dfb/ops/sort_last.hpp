@@ -277,8 +277,8 @@ public:
         const int generation = fragment.header().generation;
         const bool hides = opaqueHides(this->store_.info());
         // Where no input hides others, the dependency tracker reports this at the end; here the tile may be finished
-        // before.
-        if (hides && std::find(generations_.begin(), generations_.end(), generation) != generations_.end())
+        // before. Of generation 1 there can be several, all declared: then generation 0 never comes.
+        if (hides && generation != 1 && has(generation))
             detail::failArgument("inputs in order form a list: there cannot be two of generation %d", generation);
         generations_.push_back(generation);
         if (generation > opaque_)
@@ -293,12 +293,18 @@ public:
     // Whether all is there that can be seen, because of an opaque input.
     bool isComplete() const
     {
-        return opaque_ != none && std::count_if(generations_.begin(), generations_.end(), [this](int g) {
-                                      return g < opaque_;
-                                  }) == opaque_;
+        return opaque_ == 0
+               || (opaque_ != none && has(0) && std::count_if(generations_.begin(), generations_.end(), [this](int g) {
+                                                    return g < opaque_;
+                                                }) == opaque_);
     }
 
 private:
+    bool has(int generation) const
+    {
+        return std::find(generations_.begin(), generations_.end(), generation) != generations_.end();
+    }
+
     static constexpr int none = std::numeric_limits<int>::max();
     std::vector<int> generations_; // that have come
     int opaque_ = none;            // the first that is

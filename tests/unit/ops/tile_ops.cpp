@@ -603,18 +603,26 @@ TEST_CASE("OrderedBlend does not wait for what an opaque input hides, nor take i
 TEST_CASE("OrderedBlend does not take two inputs for the two that an opaque one waits for", "[ops]")
 {
     using Op = dfb::BasicOrderedBlend<8>;
-    TileInputs<8> in;
-    for (int i = 0; i < 3; ++i) {
-        auto& tile = in.add(0, static_cast<std::uint32_t>(i), 0);
-        tile.fill({0.25f, 0, 0, i == 2 ? 1.0f : 0.5f}, 1.0f);
-        tile.generation = std::max(i, 1); // the first was damaged
-        tile.children = i < 2;
+    for (const bool isFirst : {true, false}) { // that was damaged, or the second
+        TileInputs<8> in;
+        for (int i = 0; i < 4; ++i) {
+            auto& tile = in.add(0, static_cast<std::uint32_t>(i), 0);
+            tile.fill({0.25f, 0, 0, i == 3 ? 1.0f : 0.5f}, 1.0f);
+            tile.generation = i == (isFirst ? 0 : 1) ? i + 1 : i;
+            tile.children = i < 3;
+        }
+        auto order = in.order();
+        do {
+            Op op;
+            const auto run = [&] { dfb::testing::runTileOp(op, in, order, dfb::OutputFormat::RGBA32F, false); };
+            if (isFirst) { // or they were declared; if not, the dependency tracker finds it
+                run();
+                CHECK_FALSE(op.isComplete());
+            } else {
+                CHECK_THROWS_AS(run(), dfb::InvalidArgument);
+            }
+        } while (std::next_permutation(order.begin(), order.end()));
     }
-    auto order = in.order();
-    do
-        CHECK_THROWS_AS(dfb::testing::runTileOp<Op>(in, order, dfb::OutputFormat::RGBA32F, false),
-                        dfb::InvalidArgument);
-    while (std::next_permutation(order.begin(), order.end()));
 }
 
 TEST_CASE("OrderedBlend blends the parts of a source in one generation by their number", "[ops]")
@@ -626,12 +634,13 @@ TEST_CASE("OrderedBlend blends the parts of a source in one generation by their 
         tile.fill({part == 0 ? 0.5f : 0.0f, part == 1 ? 0.5f : 0.0f, 0, 0.5f}, 1.0f);
         tile.generation = 1;
     }
-    for (const std::vector<std::size_t>& order : {std::vector<std::size_t>{0, 1}, {1, 0}}) {
-        const TileOutput out =
-            dfb::testing::runTileOp<dfb::BasicOrderedBlend<8>>(in, order, dfb::OutputFormat::RGBA32F);
-        CHECK(out.value(0) == 0.5f);
-        CHECK(out.value(1) == 0.25f);
-    }
+    for (const bool withDepth : {true, false}) // without, an opaque input could hide others
+        for (const std::vector<std::size_t>& order : {std::vector<std::size_t>{0, 1}, {1, 0}}) {
+            const TileOutput out =
+                dfb::testing::runTileOp<dfb::BasicOrderedBlend<8>>(in, order, dfb::OutputFormat::RGBA32F, withDepth);
+            CHECK(out.value(0) == 0.5f);
+            CHECK(out.value(1) == 0.25f);
+        }
 }
 
 TEST_CASE("What a single layer covers comes out the same whether it is taken as it is or composited", "[ops]")
