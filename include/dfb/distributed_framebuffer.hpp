@@ -105,8 +105,8 @@ public:
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         // Tells `rank` that inputs of this generation and higher ones cannot be seen. The owner drops those that come
-        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument unless the operation has opaqueHides()
-        // for this frame.
+        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument for a tile, a generation or a rank that
+        // there is not, and unless the operation has opaqueHides() for this frame.
         void hide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
@@ -165,6 +165,7 @@ public:
 
         // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
         // units of colour; see FrameReport::mergeErrorBound. Before this rank's end(). Any thread. Waits for nothing.
+        // Throws InvalidArgument for a tile outside the image.
         void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
         // Whether the frame has failed on some rank, as far as this rank knows. Then rendering on is of no use. Any
@@ -198,7 +199,8 @@ public:
         void forEachTile(std::int64_t count, const Job& job)
         {
             guard([&] {
-                fb_->executor().parallelFor(static_cast<std::size_t>(count), [&](std::size_t i) {
+                const auto jobs = static_cast<std::size_t>(std::max<std::int64_t>(count, 0));
+                fb_->executor().parallelFor(jobs, [&](std::size_t i) {
                     if (failed())
                         return;
                     // Each thread keeps a tile for its next job. A job takes it out of there, because the thread may be

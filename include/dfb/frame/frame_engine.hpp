@@ -172,6 +172,8 @@ public:
     {
         if (word.tile < 0 || word.tile >= layout().tileCount() || word.generation < 1)
             failArgument("hide() of generation %d of tile %d", word.generation, word.tile);
+        if (other < 0 || other >= size())
+            failArgument("hide() for rank %d of %d", other, size());
         if (!pipeline_->opaqueHides(word.tile))
             failArgument("hide() with a tile operation or a frame to which everything counts");
         if (other == rank())
@@ -188,7 +190,12 @@ public:
     TileSamples samples(int tile) const override { return pipeline_->table().samples(tile); }
 
     void addFigure(std::uint64_t key, double value) override { figures_.add(key, value); }
-    void noteMergeError(int tile, double bound) override { figures_.addMergeError(tile, bound / samples(tile).count); }
+    void noteMergeError(int tile, double bound) override
+    {
+        if (tile < 0 || tile >= layout().tileCount())
+            failArgument("noteMergeError() for tile %d of an image of %d tiles", tile, layout().tileCount());
+        figures_.addMergeError(tile, bound / samples(tile).count);
+    }
 
     JobRange nextJobs(std::int64_t count) override { return jobs_->next(count, params_.timeout); }
 

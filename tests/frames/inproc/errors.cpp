@@ -331,6 +331,32 @@ TEST_CASE("A tile that cannot be right is refused at once, and nothing is sent",
     CHECK(wrong == 0);
 }
 
+TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of it", "[errors]")
+{
+    std::vector<std::string> texts;
+    std::vector<double> bounds(2, -1);
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::BasicOrderedBlend<16>> fb(communicator, dfb::FrameBufferConfig(20, 20));
+        auto frame = fb.begin();
+        if (fb.rank() == 1) {
+            for (const int tile : {-1, 4})
+                texts.push_back(outcomeOf([&] { frame.noteMergeError(tile, 0.5); }));
+            for (const int rank : {-1, 2})
+                texts.push_back(outcomeOf([&] { frame.hide(0, 1, rank); }));
+        }
+        frame.forEachTile(-1, [](std::int64_t, auto&) { throw std::runtime_error("a job of less than none"); });
+        frame.forEachTile(frame.ownedTiles(), [&](auto& tile) { frame.setTile(tile); });
+        bounds[static_cast<std::size_t>(fb.rank())] = frame.end().mergeErrorBound;
+    });
+    CHECK(bounds == std::vector<double>(2, 0));
+    INFO(joined(texts));
+    REQUIRE(texts.size() == 4);
+    for (const std::string& text : texts)
+        CHECK(has(text, "InvalidArgument"));
+    CHECK(has(texts[1], "tile 4 of an image of 4 tiles"));
+    CHECK(has(texts[3], "rank 2 of 2"));
+}
+
 TEST_CASE("Frame parameters that cannot be are refused", "[errors]")
 {
     std::vector<std::string> texts;
