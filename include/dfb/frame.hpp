@@ -77,7 +77,7 @@ struct FrameBufferConfig {
     // frame fail. For tiles of ranks on the display rank's node all calls may come at the end.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
-    // intervals. If none is, the frame fails with ErrorKind::MissingInput. 1 ms or more. A short time costs a few
+    // intervals. If none is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a few
     // messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message that
     // says so, then renders the tile. Ranks may give different times.
     std::chrono::milliseconds quiet{2000};
@@ -117,8 +117,8 @@ struct FrameConfig {
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
     // if setTile() waits for room, and no receiver takes a message of this rank for this long. The error says what is
     // missing and from whom. If there is still no verdict after twice the time, end() throws TransportError. 0: no
-    // limit. An input that is never sent needs no time-out: the frame fails with ErrorKind::MissingInput some seconds
-    // after all ranks are in end().
+    // limit. At most 24 days. An input that is never sent needs no time-out: the frame fails with
+    // ErrorKind::MissingInput some seconds after all ranks are in end().
     std::chrono::milliseconds timeout{0};
     // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
     // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same

@@ -39,8 +39,8 @@ struct NetworkConfig {
     bool sharedMemory = true;
     // A rank counts as lost if no message has come from it for this long while messages are expected. It may have
     // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank watches no other, and no
-    // other watches it. Otherwise 100 ms or more; framebuffers refuse less. It also limits how long a reduction waits
-    // after a message that could not be read; for this 0 means no limit, unless the frame has a time-out.
+    // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse others. It also limits how long a reduction
+    // waits after a message that could not be read; for this 0 means no limit, unless the frame has a time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
     // Called when a rank is lost, by a thread of the library, once on one or several of the other ranks. It must be
     // quick and must not throw. All ranks then get a TransportError with the lost rank in ErrorInfo::rank. Null: the
@@ -475,7 +475,8 @@ private:
 
     std::chrono::milliseconds peerTimeout() const
     {
-        const bool isOn = hasOwnThread() && config_.peerTimeout >= std::chrono::milliseconds(100);
+        const bool isOn = hasOwnThread() && config_.peerTimeout >= std::chrono::milliseconds(100)
+                          && config_.peerTimeout <= detail::longestTimeout;
         return isOn ? config_.peerTimeout : std::chrono::milliseconds(0);
     }
 

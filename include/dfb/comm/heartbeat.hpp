@@ -7,6 +7,8 @@
 #include <dfb/version.hpp>
 
 #include <chrono>
+#include <cstdint>
+#include <limits>
 #include <utility>
 #include <vector>
 
@@ -17,6 +19,9 @@ DFB_NAMESPACE_BEGIN
 inline constexpr std::chrono::milliseconds defaultPeerTimeout{300000};
 
 namespace detail {
+
+// 24 days. Clocks count nanoseconds, so that times of centuries overflow.
+inline constexpr std::chrono::milliseconds longestTimeout{std::numeric_limits<std::int32_t>::max()};
 
 class Heartbeat {
 public:

@@ -222,10 +222,11 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
         failArgument("the image is to have auxiliary channels (mask %d) that the inputs of this tile operation do not "
                      "have",
                      c.image.aux);
-    if (const long long ms = peerTimeout.count(); ms != 0 && ms < 100)
-        failArgument("a time-out for peers of %lld ms: 0, or 100 and more", ms);
-    if (const long long ms = c.quiet.count(); ms < 1)
-        failArgument("`quiet` is %lld ms: it must be 1 or more", ms);
+    constexpr long long longest = longestTimeout.count();
+    if (const long long ms = peerTimeout.count(); ms != 0 && (ms < 100 || ms > longest))
+        failArgument("a time-out for peers of %lld ms: 0, or 100 to %lld", ms, longest);
+    if (const long long ms = c.quiet.count(); ms < 1 || ms > longest)
+        failArgument("`quiet` is %lld ms: it must be 1 to %lld", ms, longest);
     const Precision& w = c.precision;
     if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
         failArgument("half a level, and another precision");

@@ -61,7 +61,7 @@ public:
         const Connection::Expecting expecting(mailbox_->connection());
         std::optional<std::chrono::steady_clock::time_point> deadline;
         if (timeout.count() > 0)
-            deadline = std::chrono::steady_clock::now() + timeout;
+            deadline = std::chrono::steady_clock::now() + std::min(timeout, longestTimeout);
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);

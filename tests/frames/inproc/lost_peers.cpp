@@ -427,21 +427,23 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
 
 TEST_CASE("A time-out for peers that cannot be is refused on all ranks", "[lost_peers]")
 {
-    for (const int wrong : {-1, 1, 99}) {
+    for (const milliseconds wrong : {milliseconds(-1), milliseconds(1), milliseconds(99), milliseconds::max()}) {
         std::vector<std::string> texts(2);
         const auto holds = std::make_shared<Holds>(2);
         runOn(
             std::make_shared<Board>(), 2,
             [&](const BoardTransport::Communicator& communicator) {
                 const int rank = communicator.inner.rank();
+                dfb::NetworkConfig options;
+                options.peerTimeout = rank == 1 ? wrong : milliseconds(0);
                 texts[static_cast<std::size_t>(rank)] = outcomeOf([&] {
-                    FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(rank == 1 ? wrong : 0));
+                    FrameBuffer fb({communicator, holds}, smallConfig(), options);
                 });
             },
             seed);
         INFO(joined(texts));
         for (const std::string& text : texts)
-            CHECK((has(text, "InvalidArgument") && has(text, std::to_string(wrong) + " ms")));
+            CHECK((has(text, "InvalidArgument") && has(text, std::to_string(wrong.count()) + " ms")));
     }
 }
 

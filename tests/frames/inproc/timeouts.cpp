@@ -146,9 +146,9 @@ dfb::FrameConfig timed(bool declared, int timeoutMs = limitMs)
 
 } // namespace
 
-TEST_CASE("A negative time-out is refused", "[timeouts]")
+TEST_CASE("A negative time-out is refused, as are times that no clock has", "[timeouts]")
 {
-    std::string text, after;
+    std::string text, after, quiet;
     runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
         FrameBuffer fb(communicator, smallConfig());
         text = outcomeOf([&] { (void)fb.begin(timed(true, -1)); });
@@ -158,8 +158,14 @@ TEST_CASE("A negative time-out is refused", "[timeouts]")
             frame.end();
         });
     });
+    runOn(std::make_shared<Board>(), 1, [&](const auto& communicator) {
+        auto config = smallConfig();
+        config.quiet = std::chrono::milliseconds::max();
+        quiet = outcomeOf([&] { FrameBuffer(communicator, config); });
+    });
     CHECK((has(text, "InvalidArgument") && has(text, "-1 ms")));
     CHECK(after == "fine");
+    CHECK((has(quiet, "InvalidArgument") && has(quiet, "`quiet` is")));
 }
 
 TEST_CASE("Different time-outs are a disagreement", "[timeouts]")

@@ -5,6 +5,7 @@
 #include "random_scene.hpp"
 
 #include <atomic>
+#include <chrono>
 #include <cstdint>
 #include <cstring>
 #include <functional>
@@ -196,6 +197,24 @@ TEST_CASE("A part of a display that is lost is named with its display, one that 
     CHECK(twice.texts == fine);
     CHECK(twice.after == fine);
     CHECK(twice.wrong == 0);
+}
+
+TEST_CASE("The longest of all times is none that a wall's end of frame exceeds", "[wall]")
+{
+    std::vector<std::string> texts(2);
+    board::runOn(std::make_shared<Board>(), 2, [&](const BoardTransport::Communicator& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        // Its work is done in finish(): so that has to wait.
+        dfb::DisplayWall wall(connection, {2, 1, 64, 64, 0, 0, {0, 1}}, dfb::OutputFormat::RGBA8,
+                              std::make_shared<dfb::CallerExecutor>());
+        FrameBuffer fb(connection, wall.frameBufferConfig(), {&wall});
+        const auto report =
+            dfb::DataParallelLoop(fb, dfb::World()).render(scene::FlatCamera(), [](const dfb::Brick&, auto&) {});
+        texts[static_cast<std::size_t>(fb.rank())] =
+            outcomeOf([&] { wall.finish(report.frame, std::chrono::milliseconds::max()); });
+    });
+    INFO(joined(texts));
+    CHECK(texts == fine);
 }
 
 } // namespace wall_safety_cases
