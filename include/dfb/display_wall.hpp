@@ -45,8 +45,8 @@ class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside
     // those of the framebuffers. `poolBytes`: as MessageConfig::poolBytes. Collective, in the same order as the
-    // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong
-    // or differs between ranks, or if a rank has no memory for it.
+    // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is
+    // wrong, if that, `format` or `poolBytes` differ between ranks, or if a rank has no memory for it.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 

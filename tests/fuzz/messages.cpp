@@ -196,6 +196,7 @@ std::string wallText(bool checksums)
     settings.add("the size of its bezels", "0x0");
     settings.add("its format", "RGBA8");
     settings.add("the list of its displays' ranks", "{0, 1}");
+    settings.add("its poolBytes", std::size_t{64} << 20); // the default
     settings.add("checksums", checksums);
     return settings.text();
 }

@@ -162,6 +162,7 @@ private:
         for (const int rank : layout_.ranks)
             ranks += printed(ranks.empty() ? "%d" : ", %d", rank);
         settings.add("the list of its displays' ranks", '{' + ranks + '}');
+        settings.add("its poolBytes", mailbox_->flow().poolBytes());
         settings.add("checksums", mailbox_->connection().config().checksums);
         return settings.text();
     }

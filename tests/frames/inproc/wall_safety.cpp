@@ -217,4 +217,20 @@ TEST_CASE("The longest of all times is none that a wall's end of frame exceeds",
     CHECK(texts == fine);
 }
 
+TEST_CASE("Ranks with different pools make no wall", "[wall]")
+{
+    std::vector<std::string> texts(2);
+    board::runOn(std::make_shared<Board>(), 2, [&](const BoardTransport::Communicator& communicator) {
+        const auto connection = dfb::connect<BoardTransport>(communicator);
+        const auto rank = static_cast<std::size_t>(connection->rank());
+        texts[rank] = outcomeOf([&] {
+            dfb::DisplayWall(connection, {2, 1, 64, 64, 0, 0, {0, 1}}, dfb::OutputFormat::RGBA8, nullptr,
+                             (std::size_t{64} << 20) << rank);
+        });
+    });
+    INFO(joined(texts));
+    for (const std::string& text : texts)
+        CHECK((has(text, "InvalidArgument") && has(text, "poolBytes")));
+}
+
 } // namespace wall_safety_cases
