@@ -108,9 +108,14 @@ public:
     // Begins to count credit anew; see FlowControl. No message with credit may be in a task.
     void newEpoch(std::int64_t number)
     {
-        epoch_ = number;
         sentOn_ = takenOn_ = 0;
         flow_.newEpoch();
+        enterEpoch(number);
+    }
+    // Begins an epoch without that. Gives up if a neighbour in the tree of reductions has left before it.
+    void enterEpoch(std::int64_t number)
+    {
+        epoch_ = number;
         checkLeft();
     }
     FlowControl& flow() noexcept { return flow_; }

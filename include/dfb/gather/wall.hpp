@@ -62,6 +62,7 @@ public:
         std::optional<std::chrono::steady_clock::time_point> deadline;
         if (timeout.count() > 0)
             deadline = std::chrono::steady_clock::now() + std::min(timeout, longestTimeout);
+        mailbox_->enterEpoch(frame); // as who has left sends no word of what it has sent
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);
