@@ -227,6 +227,8 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
         failArgument("a time-out for peers of %lld ms: 0, or 100 to %lld", ms, longest);
     if (const long long ms = c.quiet.count(); ms < 1 || ms > longest)
         failArgument("`quiet` is %lld ms: it must be 1 to %lld", ms, longest);
+    if (c.messages.codec && c.messages.codec->id() == 0)
+        failArgument("messages.codec has the id 0, which in a message means none");
     const Precision& w = c.precision;
     if (w.isHalfLevel && (w.budget > 0 || w.color != WireFormat::Float32))
         failArgument("half a level, and another precision");

@@ -376,6 +376,18 @@ TEST_CASE("Frame parameters that cannot be are refused", "[errors]")
     }
 }
 
+namespace {
+
+// A codec whose id means that there is none.
+struct NamelessCodec : dfb::Codec {
+    std::uint8_t id() const noexcept override { return 0; }
+    std::size_t bound(std::size_t byteCount) const override { return byteCount; }
+    std::size_t compress(const std::byte*, std::size_t byteCount, std::byte*) const override { return byteCount; }
+    bool decompress(const std::byte*, std::size_t, std::byte*, std::size_t) const override { return false; }
+};
+
+} // namespace
+
 TEST_CASE("A wrong or differing configuration is refused on every rank", "[errors]")
 {
     const auto refused = [](const std::function<void(int, dfb::FrameBufferConfig&)>& change) {
@@ -396,6 +408,10 @@ TEST_CASE("A wrong or differing configuration is refused on every rank", "[error
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) {
         if (rank == 1)
             c.image.ownerMap = [](int, const dfb::TileLayout&, int ranks) { return ranks; };
+    }));
+    CHECK(refused([](int rank, dfb::FrameBufferConfig& c) {
+        if (rank == 1)
+            c.messages.codec = std::make_shared<NamelessCodec>();
     }));
     // Different on one.
     CHECK(refused([](int rank, dfb::FrameBufferConfig& c) { c.image.width += rank == 1; }));
