@@ -144,6 +144,13 @@ struct TilesAsTheyCome {
         result.expect(text.find("FrameError") != std::string::npos
                           && text.find("a window that throws") != std::string::npos,
                       "a window that throws: " + text);
+        scene::Scene partial = s;
+        partial.allowPartial = true;
+        const auto report = scene::renderLoop(fb, partial, scene::Loop::Declared);
+        result.expect(report.failure && report.failure->message == "a window that throws" && report.failure->tile >= 0
+                          && report.tilesIncomplete == 0,
+                      "a partial frame of a window that throws: "
+                          + (report.failure ? report.failure->describe() : std::string("no failure")));
         throws = false;
         scene::renderLoop(fb, s, scene::Loop::Declared);
         return result;

@@ -122,7 +122,8 @@ bool gather(dfb::OutputFormat format, dfb::ChannelMask channels, std::uint8_t fl
     dfb::FrameBufferConfig config;
     config.image.format = format;
     config.messages.codec = flags & HasCodec ? codec() : nullptr;
-    d::FinalGather display(pool, layout(), config, channels, 0, 0, 2, ownerOf, [](dfb::Buffer&&, std::size_t) {});
+    const auto send = [](dfb::Buffer&&, std::size_t) {};
+    d::FinalGather display(pool, layout(), config, channels, 0, 0, 2, ownerOf, send, nullptr);
     if (flags & Shared) // other ranks put tiles into it
         display.shareImage([](const std::byte*) { return 0; });
     display.newFrame(1, false, {});

@@ -520,10 +520,11 @@ std::pair<std::string, std::string> finished(Way way)
     std::vector<std::string> bodies;
     const dfb::TileLayout layout(width, height, side);
     const dfb::ChannelMask channels = config.image.depth ? dfb::depthChannel : 0;
-    d::FinalGather gather(pool, layout, config, channels, 0, 1, 2, ownerOf, [&](dfb::Buffer&& message, std::size_t) {
+    const auto send = [&](dfb::Buffer&& message, std::size_t) {
         const std::size_t prefix = sizeof(d::MessageHeader);
         bodies.push_back(fuzz::textOf(message.data() + prefix, message.size() - prefix));
-    });
+    };
+    d::FinalGather gather(pool, layout, config, channels, 0, 1, 2, ownerOf, send, nullptr);
     gather.newFrame(1, config.messages.codec != nullptr, {});
     for (const int tile : {1, 3, 5}) {
         auto place = gather.reserve(tile);

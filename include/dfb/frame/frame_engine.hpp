@@ -747,8 +747,13 @@ private:
                 compression_.sent(config_.image.displayRank, raw, message.size());
             mailbox_->send(config_.image.displayRank, std::move(message));
         };
+        const auto fail = [this](const std::exception_ptr& reason, int tile) {
+            ErrorInfo where;
+            where.tile = tile;
+            outcome_->fail(reason, where);
+        };
         pipeline_ = std::make_unique<TilePipeline>(pool_, config_, operations_, rank(), size(), hasFarRanks,
-                                                   mailbox_->address(), sendToDisplay);
+                                                   mailbox_->address(), sendToDisplay, fail);
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
         // The rank after the display rank hands out jobs, as that one has enough to do.

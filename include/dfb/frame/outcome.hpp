@@ -335,7 +335,7 @@ private:
     {
         const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
         if (!hasTimeout()) // a message that could not be read does not come again
-            mailbox_.wait([&] { return areThere() || frame_.isDamaged(); });
+            mailbox_.wait([&] { return areThere() || frame_.isDamaged() || tiles_.gather().hasLost(); });
         mailbox_.wait(areThere, Clock::now() + (hasTimeout() ? terms_.timeout() : std::chrono::seconds(2)));
     }
 

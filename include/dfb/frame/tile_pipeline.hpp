@@ -32,14 +32,15 @@ public:
     // `config` and `operations` must live as long as this. `hasFarRanks`: there are ranks that share no memory with
     // this one. Throws InvalidArgument for a configuration that cannot be.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
-                 int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay)
+                 int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay,
+                 FinalGather::Fail fail)
         : pool_(std::move(pool)), config_(config), address_(address), operations_(operations),
           budget_(budgetOf(config, hasFarRanks)),
           table_(TileLayout(config.image.width, config.image.height, traits().tileWidth, traits().tileHeight),
                  config.image.ownerMap ? config.image.ownerMap : latticeOwner, rank, rankCount, operations),
           gather_(
               pool_, table_.layout(), config, imageChannels(config), address, rank, rankCount,
-              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay)),
+              [this](int tile) { return table_.owner(tile); }, std::move(sendToDisplay), std::move(fail)),
           coder_(config.precision, traits().activeByDepth, traits().readsInPlace && !isLossy())
     {
     }

@@ -16,6 +16,7 @@
 #include <chrono>
 #include <cstddef>
 #include <cstdint>
+#include <exception>
 #include <functional>
 #include <memory>
 #include <mutex>
@@ -33,6 +34,8 @@ public:
     // To the display rank. `raw`: the bytes that it had before a codec was to make it smaller; else 0.
     using Send = std::function<void(Buffer&&, std::size_t raw)>;
     using OwnerOf = std::function<int(int tile)>;
+    // Is told what the codec or the program's onTile has thrown; of onTile with the tile, else -1.
+    using Fail = std::function<void(const std::exception_ptr&, int tile)>;
 
     // Where a finished tile goes.
     struct Place : FinishedPlanes {
@@ -44,12 +47,13 @@ public:
 
     // `config` must live as long as this. `channels`: of the image, beside the colour; `address`: of the framebuffer.
     // `ownerOf(tile)`: the rank that has it when it is finished. `send`: to the display rank, batches and the count of
-    // tiles.
+    // tiles. `fail`: fails the frame; no tile is lost with it.
     FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, const FrameBufferConfig& config,
-                ChannelMask channels, std::uint32_t address, int rank, int rankCount, OwnerOf ownerOf, Send send)
+                ChannelMask channels, std::uint32_t address, int rank, int rankCount, OwnerOf ownerOf, Send send,
+                Fail fail)
         : pool_(std::move(pool)), layout_(layout), config_(config), channels_(channels), address_(address), rank_(rank),
-          ownerOf_(std::move(ownerOf)), send_(std::move(send)), record_(config.image.format, channels),
-          tilesOf_(static_cast<std::size_t>(rankCount))
+          ownerOf_(std::move(ownerOf)), send_(std::move(send)), fail_(std::move(fail)),
+          record_(config.image.format, channels), tilesOf_(static_cast<std::size_t>(rankCount))
     {
         findSenders();
         if (displays()) {
@@ -94,6 +98,7 @@ public:
         placed_.clear();
         placedPixels_ = 0;
         ranksComplete_ = 0;
+        hasLost_ = false;
         incomplete_.clear();
         for (TilesOf& its : tilesOf_) {
             its.received = {};
@@ -298,16 +303,23 @@ public:
         return kind == MessageKind::FinishedTiles || kind == MessageKind::TilesDone;
     }
 
-    // The display rank's side of one of these. Throws Error (MalformedMessage).
+    // The display rank's side of one of these. Throws Error (MalformedMessage), OutOfMemory, and what the codec throws.
     void receive(int source, const MessageHeader& header, Buffer&& message)
     {
         if (!displays())
             failMalformed("a finished tile was sent to a rank that displays nothing");
-        if (header.kind == MessageKind::FinishedTiles)
-            receiveTiles(source, std::move(message));
-        else
-            receiveDone(source, message);
+        try {
+            if (header.kind == MessageKind::FinishedTiles)
+                receiveTiles(source, std::move(message));
+            else
+                receiveDone(source, message);
+        } catch (...) {
+            hasLost_ = true;
+            throw;
+        }
     }
+    // Some of these have come but could not be taken in: they do not come again.
+    bool hasLost() const noexcept { return hasLost_; }
 
     // All tiles of the other ranks are in the image.
     bool complete() const { return !displays() || ranksComplete_ == senderCount_; }
@@ -549,8 +561,13 @@ private:
 
     void tellTile(int tile) const
     {
-        if (config_.onTile)
+        if (!config_.onTile)
+            return;
+        try {
             config_.onTile(tile, layout_.region(tile), image_);
+        } catch (...) {
+            fail_(std::current_exception(), tile); // others of the same message are still to be counted
+        }
     }
 
     // Under mutex_. Returns it to be sent, or null if somebody still writes: the last of these sends it.
@@ -594,6 +611,8 @@ private:
                     h.codec = config_.messages.codec->id();
                 }
             } catch (const OutOfMemory&) { // as it is, then: it has been counted
+            } catch (...) {                // this too
+                fail_(std::current_exception(), -1);
             }
         }
         storeAll(message.data(), MessageHeader::of(MessageKind::FinishedTiles, address_, frame_), h);
@@ -608,6 +627,7 @@ private:
     int rank_;
     OwnerOf ownerOf_;
     Send send_;
+    Fail fail_;
     const FinishedRecord record_;
     std::int64_t frame_ = 0, imageFrame_ = -1, imageEpoch_ = 1;
     bool compresses_ = false;
@@ -630,6 +650,7 @@ private:
     std::vector<TilesOf> tilesOf_;              // per rank; on the display rank under mutex_
     int senderCount_ = 0;
     std::atomic<int> ranksComplete_{0}; // of those that send
+    std::atomic<bool> hasLost_{false};
 };
 
 } // namespace detail
