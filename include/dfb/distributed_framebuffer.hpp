@@ -155,7 +155,7 @@ public:
         // rank. An empty range: there are no more, or the frame has failed. `count` must be the same on all ranks and
         // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the rank that
         // hands out the jobs, mostly not for long, because the call before has asked already. After
-        // FrameConfig::timeout the frame fails. Throws TransportError.
+        // FrameConfig::timeout the frame fails. Throws TransportError, and InvalidArgument for a count below 0.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
         // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. For measurements

@@ -197,7 +197,12 @@ public:
         figures_.addMergeError(tile, bound / samples(tile).count);
     }
 
-    JobRange nextJobs(std::int64_t count) override { return jobs_->next(count, params_.timeout); }
+    JobRange nextJobs(std::int64_t count) override
+    {
+        if (count < 0)
+            failArgument("nextJobs() of %lld jobs", static_cast<long long>(count));
+        return jobs_->next(count, params_.timeout);
+    }
 
     void waitForRoom()
     {

@@ -343,6 +343,7 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
                 texts.push_back(outcomeOf([&] { frame.noteMergeError(tile, 0.5); }));
             for (const int rank : {-1, 2})
                 texts.push_back(outcomeOf([&] { frame.hide(0, 1, rank); }));
+            texts.push_back(outcomeOf([&] { frame.nextJobs(-1); }));
         }
         frame.forEachTile(-1, [](std::int64_t, auto&) { throw std::runtime_error("a job of less than none"); });
         frame.forEachTile(frame.ownedTiles(), [&](auto& tile) { frame.setTile(tile); });
@@ -350,7 +351,7 @@ TEST_CASE("A tile or a rank that there is not is refused, and nothing comes of i
     });
     CHECK(bounds == std::vector<double>(2, 0));
     INFO(joined(texts));
-    REQUIRE(texts.size() == 4);
+    REQUIRE(texts.size() == 5);
     for (const std::string& text : texts)
         CHECK(has(text, "InvalidArgument"));
     CHECK(has(texts[1], "tile 4 of an image of 4 tiles"));
