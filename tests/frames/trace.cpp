@@ -230,16 +230,18 @@ struct ClocksApart {
              {std::chrono::nanoseconds(1'234'567'891), -std::chrono::nanoseconds(77'000'000'003)}) {
             Traced<Transport> traced(communicator, ahead);
             const scene::Scene s = scene::makeScene(5, 3);
+            const auto begin = std::chrono::steady_clock::now();
             auto frame = traced.fb->begin(paramsOf(s));
             sendAll(*traced.fb, frame, s, false);
             sendAll(*traced.fb, frame, s, true);
             frame.end();
+            const auto took = std::chrono::steady_clock::now() - begin; // long on a busy machine, as messages are then
             const std::vector<Records> ranks = traced.all();
             const auto clocks = dfb::detail::TraceWriter(ranks).clocks();
             for (std::size_t r = 0; r < ranks.size(); ++r) {
                 const std::chrono::nanoseconds off = clocks[r].ahead - ahead * static_cast<int>(r);
                 result.expect(std::chrono::abs(off) <= clocks[r].error, "further off than said");
-                result.expect(clocks[r].error < std::chrono::milliseconds(500), "not known well");
+                result.expect(clocks[r].error < took + std::chrono::milliseconds(500), "not known well");
             }
             for (const auto& [key, journey] : journeysOf(ranks))
                 if (journey.first && journey.second) {
