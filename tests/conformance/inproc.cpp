@@ -54,7 +54,7 @@ ConformanceOptions quick(std::uint64_t seed = 1)
     options.seed = seed;
     options.largestMessage = std::size_t{1} << 20;
     options.smallMessages = 3000;
-    options.timeLimit = std::chrono::milliseconds(20000);
+    options.timeLimit = std::chrono::seconds(60);
     return options;
 }
 
@@ -62,7 +62,7 @@ ConformanceOptions quick(std::uint64_t seed = 1)
 ConformanceOptions impatient()
 {
     ConformanceOptions options = quick();
-    options.timeLimit = std::chrono::milliseconds(500);
+    options.timeLimit = std::chrono::milliseconds(2000); // for all but what is lost, on a busy machine
     options.modes = {Progress::Caller};
     return options;
 }
@@ -126,7 +126,7 @@ TEST_CASE("A lost message is found, and named")
     const std::string text = checkFaulty(3, faults, impatient());
     INFO(text);
     CHECK(failedOnAll(text, 3));
-    CHECK(contains(text, "no message from rank 0 within 500 ms: got "));
+    CHECK(contains(text, "no message from rank 0 within 2 s: got "));
     CHECK(contains(text, " of " + std::to_string(size) + " bytes is missing"));
 }
 
