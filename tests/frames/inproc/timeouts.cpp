@@ -242,28 +242,29 @@ TEST_CASE("An announced input that is never sent is named on every rank", "[time
         return endings;
     };
     double soonest = 2 * limitMs + marginMs;
-    eachAtOnce(std::vector<Case>{{2, false}, {2, true}, {4, false}, {4, true}}, runCase,
-               [&](const Case& c, const std::vector<Ending>& endings) {
-                   INFO(c.ranks << " ranks" << joined(textsOf(endings)));
-                   CHECK(allSame(textsOf(endings)));
-                   for (const Ending& e : endings) {
-                       REQUIRE(e.error);
-                       CHECK(e.isFrameError);
-                       CHECK(e.error->kind == dfb::ErrorKind::TimedOut);
-                       CHECK(e.error->rank == 1);
-                       CHECK(e.error->frame == 1);
-                       CHECK(e.error->tile == 5);
-                       CHECK(e.error->pass == 0);
-                       CHECK(e.error->generation == 1);
-                       CHECK(e.error->expected == 3);
-                       CHECK(e.error->got == 2);
-                       CHECK(has(e.text, "tile 5: generation 1 has 2 of 3 inputs"));
-                       CHECK(e.ms < 2 * limitMs + marginMs);
-                       soonest = std::min(soonest, e.ms);
-                   }
-                   // Who ends the frame first waits for the time-out, not less.
-                   CHECK(std::any_of(endings.begin(), endings.end(), [](const Ending& e) { return e.ms >= limitMs; }));
-               });
+    const std::vector<Case> cases{{2, false}, {2, true}, {4, false}, {4, true}};
+    for (int attempt = 0; attempt < 3 && soonest >= 2 * limitMs; ++attempt)
+        eachAtOnce(cases, runCase, [&](const Case& c, const std::vector<Ending>& endings) {
+            INFO(c.ranks << " ranks" << joined(textsOf(endings)));
+            CHECK(allSame(textsOf(endings)));
+            for (const Ending& e : endings) {
+                REQUIRE(e.error);
+                CHECK(e.isFrameError);
+                CHECK(e.error->kind == dfb::ErrorKind::TimedOut);
+                CHECK(e.error->rank == 1);
+                CHECK(e.error->frame == 1);
+                CHECK(e.error->tile == 5);
+                CHECK(e.error->pass == 0);
+                CHECK(e.error->generation == 1);
+                CHECK(e.error->expected == 3);
+                CHECK(e.error->got == 2);
+                CHECK(has(e.text, "tile 5: generation 1 has 2 of 3 inputs"));
+                CHECK(e.ms < 2 * limitMs + marginMs);
+                soonest = std::min(soonest, e.ms);
+            }
+            // Who ends the frame first waits for the time-out, not less.
+            CHECK(std::any_of(endings.begin(), endings.end(), [](const Ending& e) { return e.ms >= limitMs; }));
+        });
     CHECK(soonest < 2 * limitMs); // the machine is not always late
 }
 
@@ -669,26 +670,23 @@ TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()",
     };
     using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport>;
     std::vector<std::string> texts(2);
-    runOn(
-        board, 2,
-        [&](const auto& communicator) {
-            auto config = configOf(scene::makeScene(0, 1, 640, 640));
-            config.messages.poolBytes = 0; // 1 MiB
-            Large fb(communicator, config);
-            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-                auto frame = fb.begin(timed(false));
-                const auto tile = std::make_unique<Large::Tile>();
-                for (int index = 0; index < fb.layout().tileCount(); ++index) {
-                    frame.start(*tile, index);
-                    for (int i = 0; i < 4 * 64 * 64; ++i)
-                        tile->color[i] = static_cast<float>(i % 7 + 1);
-                    tile->generation = 1;
-                    frame.setTile(*tile);
-                }
-                frame.end();
-            });
-        },
-        std::nullopt, std::chrono::seconds(4));
+    runOn(board, 2, [&](const auto& communicator) {
+        auto config = configOf(scene::makeScene(0, 1, 640, 640));
+        config.messages.poolBytes = 0; // 1 MiB
+        Large fb(communicator, config);
+        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+            auto frame = fb.begin(timed(false));
+            const auto tile = std::make_unique<Large::Tile>();
+            for (int index = 0; index < fb.layout().tileCount(); ++index) {
+                frame.start(*tile, index);
+                for (int i = 0; i < 4 * 64 * 64; ++i)
+                    tile->color[i] = static_cast<float>(i % 7 + 1);
+                tile->generation = 1;
+                frame.setTile(*tile);
+            }
+            frame.end();
+        });
+    });
     INFO(joined(texts));
     for (const std::string& text : texts)
         CHECK((has(text, "timed out") || (has(text, "TransportError") && !has(text, "time limit"))));
