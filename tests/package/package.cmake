@@ -48,7 +48,7 @@ function(dfb_add_package_test name)
     -DARGUMENTS=${arguments}
     -DFAILS=${A_FAILS}
     -P ${CMAKE_CURRENT_SOURCE_DIR}/package/build_and_run.cmake)
-  set_tests_properties(package.${name} PROPERTIES LABELS package TIMEOUT 180)
+  set_tests_properties(package.${name} PROPERTIES LABELS package TIMEOUT 900)
   if(A_HOW STREQUAL "find_package")
     set_tests_properties(package.${name} PROPERTIES FIXTURES_REQUIRED dfb_${A_STAGE})
   endif()
