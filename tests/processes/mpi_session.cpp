@@ -159,7 +159,7 @@ void leaveWithException(int& argc, char**& argv)
     dfb::MpiSession mpi(argc, argv);
     if (mpi.rank() == 1 % mpi.size())
         throw std::runtime_error("rank 1 leaves");
-    std::this_thread::sleep_for(std::chrono::seconds(15));
+    std::this_thread::sleep_for(std::chrono::seconds(60));
     std::fprintf(stderr, "mpi_session: the job goes on without rank 1\n");
 }
 
