@@ -225,8 +225,8 @@ private:
                "0: all have --spp");
         number("--ao", options_.aoRays, 0, 4096, "N",
                "Ambient occlusion of surfaces and spheres, with N rays per hit; default 16 for files that are not "
-               "volumes, "
-               "without --path; otherwise 0: none. Bricks then also hold the geometry within --ao-distance of them");
+               "volumes, without --path; otherwise 0: none. Bricks then also hold the geometry within --ao-distance of "
+               "them");
         number("--ao-distance", options_.aoDistance, 1e-6, 10, "D",
                "How far these rays look and shadows are cast, in units of the scene's largest extent; default 0.1");
         flag("--shadows", options_.shadows, "Shadows of surfaces and spheres on each other, as far as --ao-distance");
