@@ -10,6 +10,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cctype>
 #include <cerrno>
 #include <chrono>
 #include <condition_variable>
@@ -62,6 +63,7 @@ private:
         bool begin()
         {
             left_ = mostRequestBytes;
+            line_.clear();
             writeUntil_ = {};
             readUntil_ = Clock::now() + mostIdleTime;
             const bool isThere = at_ < end_ || waitFor(POLLIN, readUntil_);
@@ -89,7 +91,9 @@ private:
             left_ -= count;
             std::copy_n(buffer_.data() + at_, count, to);
             at_ += count;
-            return static_cast<ssize_t>(count);
+            return std::any_of(to, to + count, [this](char c) { return asksForRanges(c); })
+                       ? -1
+                       : static_cast<ssize_t>(count);
         }
 
         ssize_t write(const char* from, std::size_t size) override
@@ -120,6 +124,17 @@ private:
         socket_t socket() const override { return socket_; }
 
     private:
+        // Whether `next` ends the name of a header for parts of an answer. Our page does not send it. cpp-httplib reads
+        // a list of ranges by recursion, 500 bytes of stack a character, and copies the answer for each of them.
+        bool asksForRanges(char next)
+        {
+            if (next == '\n')
+                line_.clear();
+            else if (line_.size() < 7)
+                line_ += static_cast<char>(std::tolower(static_cast<unsigned char>(next)));
+            return line_ == "range:";
+        }
+
         bool waitFor(short event, Clock::time_point until) const
         {
             for (;;) {
@@ -136,6 +151,7 @@ private:
         socket_t socket_;
         std::array<char, 4096> buffer_{};
         std::size_t at_ = 0, end_ = 0, left_ = 0;
+        std::string line_; // its first characters
         Clock::time_point readUntil_, writeUntil_;
     };
 

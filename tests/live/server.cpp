@@ -390,6 +390,12 @@ TEST_CASE("requests and bodies have limits")
     CHECK(f.get(f.path("/stats")) == 200);
     CHECK(f.view.wishes().number == 0);
     CHECK(peakMemoryKb() - before < 64 << 10);
+    f.show();
+    for (const char* header : {"Range: bytes=0-", "RANGE:bytes=0-1,0-1"}) { // they would take much stack and memory
+        const Socket socket(f.port);
+        REQUIRE(socket.send("GET " + f.path("/picture.png") + " HTTP/1.1\r\n" + header + "\r\n\r\n"));
+        CHECK(socket.receiveAll().rfind("HTTP/1.1 400", 0) == 0);
+    }
 }
 
 TEST_CASE("ten thousand random requests")
