@@ -109,9 +109,9 @@ public:
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
     // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
-    // rank's place in the order, 0 in front, a different one on each rank. `frame` must have one pass and no samples.
-    // If config.executor was not given and this rank's share is one processor, the calling thread does all the work.
-    // Collective. Waits as end(). Throws what start() and end() throw.
+    // rank's place in the order, 0 in front, a different one on each rank; else it is ignored. `frame` must have one
+    // pass and no samples. If config.executor was not given and this rank's share is one processor, the calling thread
+    // does all the work. Collective. Waits as end(). Throws what start() and end() throw.
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
     // Does so for the other ways to blend, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})

@@ -224,8 +224,8 @@ class ImageCompositor(_Collective):
                         of uint8 count as level / 255, rounded to float32
         depth           (height, width) of float32, which grows away from the eye; needed unless blend="order". Copied if its
                         rows lie differently from those of rgba, else read in place
-        order           with blend="order": this rank's place, 0 in front, a different one on each rank; not needed
-                        without rgba
+        order           this rank's place, 0 in front, a different one on each rank: needed with blend="order" and
+                        rgba, else ignored
         bottom_up       the first row is the lowest, as OpenGL has it
         origin          (x, y): where the first pixel is in the picture, if rgba is a part of it; y counts from the first row
         far_depth       a pixel at this depth or beyond is empty; 1 in OpenGL. None: infinity
