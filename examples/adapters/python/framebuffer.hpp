@@ -22,6 +22,13 @@
 #include <variant>
 #include <vector>
 
+// The operations. Ranks with different ones get an error that shows these names.
+namespace blend {
+class alpha : public dfb::AlphaBlend {};
+class nearest : public dfb::DepthComposite {};
+class function : public dfb_python::NumpyOperation {};
+} // namespace blend
+
 namespace dfb_python {
 
 using AnyCamera = std::variant<dfb::PerspectiveCamera, dfb::MatrixCamera>;
@@ -84,7 +91,7 @@ public:
 private:
     static typename Inner::TileFrameData own([[maybe_unused]] const NumpyOperation::FrameData& data)
     {
-        if constexpr (std::is_same_v<TileOp, NumpyOperation>)
+        if constexpr (std::is_same_v<TileOp, blend::function>)
             return data;
         else
             return {};
@@ -121,11 +128,11 @@ struct FrameBufferSettings : Settings {
     std::unique_ptr<AnyFrameBuffer> make(std::shared_ptr<dfb::Connection>&& connection) const
     {
         switch (blend) {
-        case Blend::Nearest: return std::make_unique<FrameBufferOf<dfb::DepthComposite>>(std::move(connection), config);
-        case Blend::Function: return std::make_unique<FrameBufferOf<NumpyOperation>>(std::move(connection), config);
+        case Blend::Nearest: return std::make_unique<FrameBufferOf<blend::nearest>>(std::move(connection), config);
+        case Blend::Function: return std::make_unique<FrameBufferOf<blend::function>>(std::move(connection), config);
         case Blend::Alpha: break;
         }
-        return std::make_unique<FrameBufferOf<dfb::AlphaBlend>>(std::move(connection), config);
+        return std::make_unique<FrameBufferOf<blend::alpha>>(std::move(connection), config);
     }
 };
 
