@@ -191,6 +191,9 @@ class Errors(unittest.TestCase):
         errors = errors_of(framebuffer, lambda thing, rank: thing.fail("no data") if rank == 2
                            else thing.render([brick(rank)], CAMERA, fill))
         self.assertEqual({(e.message, e.rank) for e in errors}, {("no data", 2)})
+        errors = errors_of(compositor, lambda thing, rank: thing.fail(OSError("no \udcff")) if rank == 2
+                           else thing.composite(rgba, depth))
+        self.assertEqual({(e.message, e.rank) for e in errors}, {("OSError: no \\udcff", 2)})
 
     def test_constructors(self):
         for arguments, text in ((dict(width=0), "0x93"), (dict(width="wide"), "width is 'wide': it must be an int"),

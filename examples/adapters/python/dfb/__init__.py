@@ -156,7 +156,8 @@ class _Collective:
         """
         if isinstance(why, BaseException):
             why = f"{type(why).__name__}: {why}"
-        self._impl.fail(str(why))
+        # The name of a file may have characters that no encoding has.
+        self._impl.fail(str(why).encode(errors="backslashreplace").decode())
 
     def resize(self, width, height):
         """Change the size of the picture. image is None then.
