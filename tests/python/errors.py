@@ -311,6 +311,7 @@ class Errors(unittest.TestCase):
 
             fb.render([brick(0)], CAMERA, draw)
             self.assertEqual(set(inside), {"dfb: invalid argument: another call of this object has not returned yet"})
+            self.assertIn(fb._number, dfb._open)  # it is still to be ended
 
     def test_waiting_releases_the_gil(self):
         """A rank waits in composite() for one that waits for a third thread of Python."""

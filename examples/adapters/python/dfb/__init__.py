@@ -173,8 +173,8 @@ class _Collective:
         `with` does so too; if an exception leaves its block, no other rank is waited for, and those that wait for this
         one get an Error of the kind "Transport".
         """
-        _open.pop(self._number, None)
         self._impl.close()
+        _open.pop(self._number, None)
 
     def __enter__(self):
         return self
@@ -183,8 +183,8 @@ class _Collective:
         if kind is None:
             self.close()
         else:
-            _open.pop(self._number, None)
             self._impl.leave()
+            _open.pop(self._number, None)
 
     def __del__(self):
         if self.__dict__.get("_number") in _open:
