@@ -15,21 +15,23 @@
 #include <chrono>
 #include <condition_variable>
 #include <cstddef>
+#include <functional>
 #include <mutex>
 #include <set>
 #include <string>
+#include <utility>
 
 namespace example {
 
 class BoundedServer : public httplib::Server {
 public:
     static constexpr std::size_t mostRequestBytes = 24 << 10; // with its headers
-    static constexpr std::size_t mostConnections = 48;        // served at once; others wait
+    static constexpr std::size_t mostConnections = 48;        // served at once; others wait in the system
     static constexpr std::chrono::seconds mostRequestTime{5}, mostAnswerTime{5}, mostIdleTime{2};
 
     BoundedServer()
     {
-        new_task_queue = [] { return new httplib::ThreadPool(mostConnections); };
+        new_task_queue = [] { return new Workers(mostConnections); };
         set_keep_alive_max_count(1000000);
         set_tcp_nodelay(true);
         // Not SO_REUSEPORT, as is the default: with it a second job would share the port of the first.
@@ -53,6 +55,30 @@ public:
 
 private:
     using Clock = std::chrono::steady_clock;
+
+    // A thread for each connection. While all are busy no connection is accepted: the job would run out of files.
+    class Workers : public httplib::ThreadPool {
+    public:
+        using ThreadPool::ThreadPool;
+
+        void enqueue(std::function<void()> work) override
+        {
+            std::unique_lock<std::mutex> lock(mutex_);
+            ended_.wait(lock, [&] { return open_ < mostConnections; });
+            ++open_;
+            ThreadPool::enqueue([this, work = std::move(work)] {
+                work();
+                const std::lock_guard<std::mutex> guard(mutex_);
+                --open_;
+                ended_.notify_one();
+            });
+        }
+
+    private:
+        std::mutex mutex_;
+        std::condition_variable ended_;
+        std::size_t open_ = 0;
+    };
 
     // A request and its answer.
     class Exchange : public httplib::Stream {

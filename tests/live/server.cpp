@@ -15,11 +15,14 @@
 #include <sys/socket.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>
+#include <filesystem>
+#include <iterator>
 #include <memory>
 #include <random>
 #include <stdexcept>
@@ -395,6 +398,38 @@ TEST_CASE("requests and bodies have limits")
         const Socket socket(f.port);
         REQUIRE(socket.send("GET " + f.path("/picture.png") + " HTTP/1.1\r\n" + header + "\r\n\r\n"));
         CHECK(socket.receiveAll().rfind("HTTP/1.1 400", 0) == 0);
+    }
+}
+
+TEST_CASE("connections that wait take no files of the job")
+{
+    const auto openFiles = [] {
+        const std::filesystem::directory_iterator files("/proc/self/fd");
+        return std::distance(begin(files), end(files));
+    };
+    Fixture f;
+    const auto before = openFiles();
+    std::vector<std::unique_ptr<Socket>> viewers;
+    const auto come = [&] {
+        viewers.push_back(std::make_unique<Socket>(f.port));
+        REQUIRE(viewers.back()->isOpen());
+        REQUIRE(viewers.back()->send("GET " + f.path("/frame") + " HTTP/1.1\r\nConnection: close\r\n\r\n")); // none yet
+    };
+    for (int served = 1; served <= 48; ++served) {
+        come();
+        while (openFiles() - before < 2 * served)
+            std::this_thread::yield();
+    }
+    for (int i = 0; i < 4; ++i)
+        come();
+    auto most = before;
+    for (const auto until = Clock::now() + milliseconds(200); Clock::now() < until;)
+        most = std::max(most, openFiles());
+    CHECK(most - before <= 2 * 48 + 4 + 1); // both ends of those; theirs of the others; one that is accepted next
+    f.show();
+    for (const auto& viewer : viewers) {
+        pollfd answer{viewer->fd(), POLLIN, 0};
+        CHECK(::poll(&answer, 1, 20000) == 1);
     }
 }
 
