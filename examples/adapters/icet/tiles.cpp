@@ -124,12 +124,7 @@ extern "C" void icetBoundingBoxd(IceTDouble x0, IceTDouble x1, IceTDouble y0, Ic
 
 extern "C" void icetBoundingBoxf(IceTFloat x0, IceTFloat x1, IceTFloat y0, IceTFloat y1, IceTFloat z0, IceTFloat z1)
 {
-    inContext("icetBoundingBoxf", [&](IceTContextStruct& context) {
-        const double x[] = {x0, x1}, y[] = {y0, y1}, z[] = {z0, z1};
-        context.settings.vertices.clear();
-        for (int i = 0; i < 8; ++i)
-            context.settings.vertices.push_back({x[i / 4], y[i / 2 % 2], z[i % 2]});
-    });
+    icetBoundingBoxd(x0, x1, y0, y1, z0, z1);
 }
 
 } // namespace dfb_icet
