@@ -134,8 +134,8 @@ private:
 // the world.
 class ThinLensCamera {
 public:
-    // Looks along `view`, of any length. Throws InvalidArgument if `view` is 0, `up` is 0 or along it, `fovY` is not in
-    // (0, 180), the radius is below 0, or the distance is not above 0.
+    // Looks along `view`, of any length. The distance may be infinite. Throws InvalidArgument if `view` is 0, `up` is 0
+    // or along it, `fovY` is not in (0, 180), the radius is below 0, or the distance is not above 0.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
         : pose_(detail::poseOf(eye, view, up, fovY)), radius_(static_cast<double>(apertureRadius)),
@@ -147,10 +147,10 @@ public:
 
     Ray ray(double x, double y, int width, int height, const LensSample& sample) const
     {
-        const Vec3d sharp = focus_ * pose_.through(x, y, width, height);
         const double r = radius_ * std::sqrt(sample.lensU), angle = 2 * detail::pi * sample.lensV;
         const Vec3d onLens = r * std::cos(angle) * pose_.right + r * std::sin(angle) * pose_.up;
-        return {toFloat(pose_.eye + onLens), toFloat(normalize(sharp - onLens))};
+        const Vec3d direction = pose_.through(x, y, width, height) - (1 / focus_) * onLens;
+        return {toFloat(pose_.eye + onLens), toFloat(normalize(direction))};
     }
 
     Footprint project(const Box3& bounds, int width, int height) const
@@ -167,8 +167,9 @@ private:
 // `separation` apart. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
-    // Looks along `view`, of any length; `fovY` is that of each half. Throws InvalidArgument if `view` is 0, `up` is 0
-    // or along it, `fovY` is not in (0, 180), `separation` is below 0, or `convergence` is not above 0.
+    // Looks along `view`, of any length; `fovY` is that of each half. `convergence` may be infinite: the eyes then look
+    // in parallel. Throws InvalidArgument if `view` is 0, `up` is 0 or along it, `fovY` is not in (0, 180),
+    // `separation` is below 0, or `convergence` is not above 0.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
         : pose_(detail::poseOf(eye, view, up, fovY)), separation_(static_cast<double>(separation)),
           convergence_(static_cast<double>(convergence))
@@ -183,8 +184,8 @@ public:
         const double scale = 2 * pose_.tangent / height, offset = right ? 0.5 * separation_ : -0.5 * separation_;
         const double u = (x - (right ? 0.75 : 0.25) * width) * scale, v = (0.5 * height - y) * scale;
         const Vec3d aside = offset * pose_.right;
-        const Vec3d to = convergence_ * (pose_.forward + u * pose_.right + v * pose_.up);
-        return {toFloat(pose_.eye + aside), toFloat(normalize(to - aside))};
+        const Vec3d to = pose_.forward + u * pose_.right + v * pose_.up;
+        return {toFloat(pose_.eye + aside), toFloat(normalize(to - (1 / convergence_) * aside))};
     }
 
     // One per eye, each in its half.

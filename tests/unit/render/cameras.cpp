@@ -240,6 +240,23 @@ TEST_CASE("Without a lens, between the eyes and at rest cameras are the pinhole"
     CHECK(dome.ray(14.9, 45, 120, 90).direction.x == 0.0f);
 }
 
+TEST_CASE("A lens may be focused at infinity, and two eyes may look in parallel", "[cameras]")
+{
+    const float infinity = std::numeric_limits<float>::infinity();
+    const auto pinhole = dfb::PerspectiveCamera::along(eye, view, up, 45);
+    const dfb::ThinLensCamera lens(eye, view, up, 45, 0.2f, infinity);
+    const dfb::StereoCamera eyes(eye, view, up, 45, 0.5f, infinity);
+    const auto apart = [](const dfb::Vec3& a, const dfb::Vec3& b) { return dot(a - b, a - b); };
+    for (int i = 0; i < 50; ++i) {
+        const double x = 1.2 * i, y = 90 - 1.7 * i;
+        CHECK(apart(lens.ray(x, y, 120, 90, {0.9, 0.02 * i, 0}).direction, pinhole.direction(x, y, 120, 90)) < 1e-12f);
+        CHECK(apart(eyes.ray(x, y, 120, 90).direction, eyes.ray(x + 60, y, 120, 90).direction) < 1e-12f);
+    }
+    const Count ofLens = check(lens, 14), ofEyes = check(eyes, 15);
+    CHECK(ofLens.missed + ofEyes.missed == 0);
+    CHECK(std::min(ofLens.hits, ofEyes.hits) > 500);
+}
+
 TEST_CASE("The rays of a dome have one eye", "[cameras]")
 {
     const dfb::DomeCamera dome(eye, view, up, 300);
