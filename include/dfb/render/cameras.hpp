@@ -135,13 +135,14 @@ private:
 class ThinLensCamera {
 public:
     // Looks along `view`, of any length. The distance may be infinite. Throws InvalidArgument if `view` is 0, `up` is 0
-    // or along it, `fovY` is not in (0, 180), the radius is below 0, or the distance is not above 0.
+    // or along it, `fovY` is not in (0, 180), the radius is below 0, the distance is not above 0, or another number is
+    // not finite.
     ThinLensCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float apertureRadius,
                    float focusDistance)
         : pose_(detail::poseOf(eye, view, up, fovY)), radius_(static_cast<double>(apertureRadius)),
           focus_(static_cast<double>(focusDistance))
     {
-        if (!(radius_ >= 0) || !(focus_ > 0))
+        if (!(radius_ >= 0) || !std::isfinite(radius_) || !(focus_ > 0))
             detail::failArgument("a lens has a radius of 0 or more and is focused at a distance above 0");
     }
 
@@ -169,12 +170,12 @@ class StereoCamera {
 public:
     // Looks along `view`, of any length; `fovY` is that of each half. `convergence` may be infinite: the eyes then look
     // in parallel. Throws InvalidArgument if `view` is 0, `up` is 0 or along it, `fovY` is not in (0, 180),
-    // `separation` is below 0, or `convergence` is not above 0.
+    // `separation` is below 0, `convergence` is not above 0, or another number is not finite.
     StereoCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, float separation, float convergence)
         : pose_(detail::poseOf(eye, view, up, fovY)), separation_(static_cast<double>(separation)),
           convergence_(static_cast<double>(convergence))
     {
-        if (!(separation_ >= 0) || !(convergence_ > 0))
+        if (!(separation_ >= 0) || !std::isfinite(separation_) || !(convergence_ > 0))
             detail::failArgument("eyes are 0 or more apart and converge at a distance above 0");
     }
 
@@ -213,7 +214,8 @@ private:
 // `angle` / 2 off it; nothing is seen outside.
 class DomeCamera {
 public:
-    // Throws InvalidArgument for an angle that is not in (0, 360] degrees, or if `view` is 0 or `up` is along it.
+    // Throws InvalidArgument for an angle that is not in (0, 360] degrees, if `view` is 0 or `up` is 0 or along it, or
+    // if a number is not finite.
     DomeCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float angle = 180)
         : pose_(detail::poseOf(eye, view, up)), border_(0.5 * static_cast<double>(angle) * detail::pi / 180)
     {
@@ -272,13 +274,15 @@ private:
 class OrbitBlurCamera {
 public:
     // At time 0 it looks from `eye` along `view`; the axis goes through `center`. Throws InvalidArgument if `view` is
-    // 0, `up` is 0 or along it, `fovY` is not in (0, 180), the axis has length 0, or `degrees` is not within +-360.
+    // 0, `up` is 0 or along it, `fovY` is not in (0, 180), the axis has length 0, `degrees` is not within +-360, or a
+    // number is not finite.
     OrbitBlurCamera(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY, const Vec3& center, const Vec3& axis,
                     float degrees)
         : pose_(detail::poseOf(eye, view, up, fovY)), center_(toDouble(center)), axis_(toDouble(axis)),
           angle_(static_cast<double>(degrees) * detail::pi / 180)
     {
-        if (!(detail::length(axis_) > 0) || !(std::fabs(angle_) <= 2 * detail::pi))
+        const double length = detail::length(axis_);
+        if (!(length > 0) || !std::isfinite(length + detail::length(center_)) || !(std::fabs(angle_) <= 2 * detail::pi))
             detail::failArgument("the camera turns around an axis, by a full turn at most");
         axis_ = normalize(axis_);
     }

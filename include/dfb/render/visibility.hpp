@@ -160,16 +160,16 @@ struct Pose {
     }
 };
 
-// Throws InvalidArgument if the view or `up` are none.
+// Throws InvalidArgument if the view or `up` are none, or a number is not finite.
 inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 {
-    const Vec3d v = toDouble(view), side = cross(v, toDouble(up));
-    if (!(dot(v, v) > 0) || !(dot(side, side) > 0))
+    const Vec3d e = toDouble(eye), v = toDouble(view), side = cross(v, toDouble(up));
+    if (!(dot(v, v) > 0) || !(dot(side, side) > 0) || !std::isfinite(dot(e, e) + dot(v, v) + dot(side, side)))
         failArgument(
             "the camera looks nowhere: its view has no length, `up` has none or is along the view, or a number "
             "is not finite");
     Pose pose;
-    pose.eye = toDouble(eye);
+    pose.eye = e;
     pose.forward = normalize(v);
     pose.right = normalize(side);
     pose.up = cross(pose.right, pose.forward);

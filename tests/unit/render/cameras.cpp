@@ -341,4 +341,25 @@ TEST_CASE("Cameras that are none are refused", "[cameras]")
     CHECK_THROWS_AS(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, {0, 1, 0}, 361), InvalidArgument);
 }
 
+TEST_CASE("Cameras of numbers that are not finite are refused", "[cameras]")
+{
+    using dfb::InvalidArgument;
+    using Limits = std::numeric_limits<float>;
+    for (const float bad : {Limits::quiet_NaN(), Limits::infinity()}) {
+        const dfb::Vec3 off{0, bad, 0};
+        CHECK_THROWS_AS(dfb::PerspectiveCamera(off, {0, 0, 0}, up, 45), InvalidArgument);
+        CHECK_THROWS_AS(dfb::PerspectiveCamera::along(off, view, up, 45), InvalidArgument);
+        CHECK_THROWS_AS(dfb::PerspectiveCamera::along(eye, {0, 0, bad}, {1, 1, 1}, 45), InvalidArgument);
+        CHECK_THROWS_AS(dfb::PerspectiveCamera::along(eye, view, off, 45), InvalidArgument);
+        CHECK_THROWS_AS(dfb::ThinLensCamera(off, view, up, 45, 0.1f, 1), InvalidArgument);
+        CHECK_THROWS_AS(dfb::ThinLensCamera(eye, view, up, 45, bad, 1), InvalidArgument);
+        CHECK_THROWS_AS(dfb::StereoCamera(eye, view, up, 45, bad, 1), InvalidArgument);
+        CHECK_THROWS_AS(dfb::DomeCamera(off, view, up), InvalidArgument);
+        CHECK_THROWS_AS(dfb::OrbitBlurCamera(eye, view, up, 45, off, {0, 1, 0}, 5), InvalidArgument);
+        CHECK_THROWS_AS(dfb::OrbitBlurCamera(eye, view, up, 45, {0, 0, 0}, off, 5), InvalidArgument);
+    }
+    CHECK_THROWS_AS(dfb::ThinLensCamera(eye, view, up, 45, 0.1f, Limits::quiet_NaN()), InvalidArgument);
+    CHECK_THROWS_AS(dfb::StereoCamera(eye, view, up, 45, 0.1f, Limits::quiet_NaN()), InvalidArgument);
+}
+
 } // namespace cameras_cases
