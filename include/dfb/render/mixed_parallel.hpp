@@ -20,6 +20,7 @@
 #include <algorithm>
 #include <atomic>
 #include <chrono>
+#include <cmath>
 #include <cstddef>
 #include <cstdint>
 #include <mutex>
@@ -46,13 +47,14 @@ struct RoundRobinBricks {
 // The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
-    // Takes the costs of the frame of this report, and forgets all others. Call it on all ranks, between frames. Sends
-    // nothing and waits for nothing.
+    // Takes the costs of the frame of this report, and forgets all others. One that is not finite is not known. Call it
+    // on all ranks, between frames. Sends nothing and waits for nothing.
     void update(const FrameReport& report)
     {
         costs_.clear();
         for (const Figure& figure : report.figures)
-            costs_[figure.key] = figure.value;
+            if (std::isfinite(figure.value))
+                costs_[figure.key] = figure.value;
     }
 
     // Returns the key under which FrameReport::figures has the cost of a brick in a tile.

@@ -1,12 +1,31 @@
-// What the loop over bricks in order does first.
+// Bricks that several ranks hold, and bricks in order.
 #include "catch.hpp"
 
+#include <dfb/comm/inproc_transport.hpp>
+#include <dfb/distributed_framebuffer.hpp>
+#include <dfb/ops/sort_last.hpp>
 #include <dfb/render/mixed_parallel.hpp>
 
+#include <atomic>
+#include <chrono>
+#include <limits>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
 namespace mixed_parallel_cases {
+
+namespace {
+
+template <class Op>
+using FrameBuffer = dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, dfb::InprocTransport>;
+
+const dfb::PerspectiveCamera pinhole({0, 1, 8}, {0, 0, 0}, {0, 1, 0}, 35);
+
+} // namespace
 
 TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
 {
@@ -44,6 +63,33 @@ TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
                    {3, 2, 1}});
     CHECK(work.generationOf(work.jobs[1]) == 0);
     CHECK(work.generationOf(work.jobs[5]) == 2);
+}
+
+TEST_CASE("A cost that is not a number leaves the work shared out evenly", "[mixed]")
+{
+    int onRank[2] = {};
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::AlphaBlend> fb(communicator, {64, 64});
+        dfb::World world;
+        std::vector<dfb::BrickInTile> pairs;
+        for (int brick = 0; brick < 8; ++brick) {
+            world.add({static_cast<std::uint32_t>(brick), {}});
+            pairs.push_back({brick, 0});
+        }
+        const dfb::SharedWorld shared(fb, world);
+        dfb::MeasuredCostBricks owner;
+        dfb::FrameReport report;
+        for (int brick = 0; brick < 8; ++brick)
+            report.figures.push_back({dfb::MeasuredCostBricks::keyOf(static_cast<std::uint32_t>(brick), 0), 1});
+        report.figures[3].value = std::numeric_limits<double>::quiet_NaN();
+        owner.update(report);
+        owner.plan(shared, pairs, std::vector<int>(pairs.size(), 1));
+        if (fb.rank() == 0)
+            for (const auto& brick : shared.bricks())
+                ++onRank[owner(brick, 0, 0)];
+    });
+    CHECK(onRank[0] == 4);
+    CHECK(onRank[1] == 4);
 }
 
 } // namespace mixed_parallel_cases
