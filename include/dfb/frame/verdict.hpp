@@ -320,8 +320,10 @@ struct Verdict {
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
-        if (!a.differing.empty())
-            a.error = disagreement(a.differing); // other errors follow from it
+        // Other errors follow from it. But a camera that throws on one rank is why its FrameConfig::order is missing.
+        const bool isCause = a.error && a.error->kind == ErrorKind::UserCode && a.terms.allowPartial == 0;
+        if (!a.differing.empty() && !isCause)
+            a.error = disagreement(a.differing);
         using Words = std::array<std::uint64_t, sizeof(Sums) / 8>;
         auto sums = loadAs<Words>(reinterpret_cast<const std::byte*>(&a.sums));
         const auto more = loadAs<Words>(reinterpret_cast<const std::byte*>(&b.sums));

@@ -25,6 +25,22 @@ using FrameBuffer = dfb::DistributedFrameBuffer<Op, dfb::NoPixelOp, dfb::InprocT
 
 const dfb::PerspectiveCamera pinhole({0, 1, 8}, {0, 0, 0}, {0, 1, 0}, 35);
 
+// Throws on rank 1 when it is asked where its rays begin.
+struct BrokenCamera {
+    int rank = 0;
+
+    std::optional<dfb::Vec3> commonEye() const
+    {
+        if (rank == 1)
+            throw std::runtime_error("no eye");
+        return pinhole.commonEye();
+    }
+    dfb::Footprint project(const dfb::Box3& bounds, int width, int height) const
+    {
+        return pinhole.project(bounds, width, height);
+    }
+};
+
 } // namespace
 
 TEST_CASE("Fronts come first, and all else in the order that it had", "[mixed]")
@@ -90,6 +106,25 @@ TEST_CASE("A cost that is not a number leaves the work shared out evenly", "[mix
     });
     CHECK(onRank[0] == 4);
     CHECK(onRank[1] == 4);
+}
+
+TEST_CASE("What a camera throws on one rank is what all ranks report", "[mixed]")
+{
+    std::atomic<int> told{0};
+    dfb::runRanks(3, [&](dfb::InprocCommunicator communicator) {
+        FrameBuffer<dfb::AlphaBlend> fb(communicator, {64, 64});
+        const auto id = static_cast<std::uint32_t>(fb.rank());
+        const dfb::SharedWorld world(fb, dfb::World({{id, {{-1, -1, -1.0f - id}, {1, 1, -0.0f - id}}}}));
+        dfb::RoundRobinBricks owner;
+        dfb::MixedParallelLoop loop(fb, world, owner);
+        try {
+            loop.render(BrokenCamera{fb.rank()}, [](const dfb::Brick&, auto&) {});
+        } catch (const dfb::FrameError& e) {
+            told += e.info().kind == dfb::ErrorKind::UserCode && e.info().rank == 1
+                    && std::string(e.what()).find("no eye") != std::string::npos;
+        }
+    });
+    CHECK(told == 3);
 }
 
 } // namespace mixed_parallel_cases
