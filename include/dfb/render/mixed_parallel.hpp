@@ -484,8 +484,13 @@ private:
         tile.generation = generation;
         tile.children = job.item + 1 < pairs.size() && pairs[job.item + 1].tile == pair.tile;
         tile.source = brick.id;
-        detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
-        frame.setTile(tile);
+        try {
+            detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
+            frame.setTile(tile);
+        } catch (...) {
+            tellBehind(frame, job, false); // in a partial frame others would wait for this word
+            throw;
+        }
         if (tile.children > 0 && frame.opaqueHides(pair.tile))
             tellBehind(frame, job, frame.hidesRest(tile));
     }

@@ -127,4 +127,47 @@ TEST_CASE("What a camera throws on one rank is what all ranks report", "[mixed]"
     CHECK(told == 3);
 }
 
+// The first brick hides the other in one frame, and throws in the next. Rank 1 is late, so it has been told to wait.
+TEST_CASE("Nobody waits for word of an input whose renderer has thrown", "[mixed]")
+{
+    using Clock = std::chrono::steady_clock;
+    std::atomic<bool> hasThrown{false}, isSeen{false};
+    const auto waitFor = [](const std::atomic<bool>& flag) {
+        const auto limit = Clock::now() + std::chrono::seconds(10);
+        while (!flag && Clock::now() < limit)
+            std::this_thread::yield();
+    };
+    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+        dfb::FrameBufferConfig config{64, 64};
+        config.quiet = std::chrono::seconds(30);
+        FrameBuffer<dfb::OrderedBlend> fb(communicator, config);
+        const auto id = static_cast<std::uint32_t>(fb.rank());
+        const dfb::SharedWorld world(fb, dfb::World({{id, {{-1, -1, -1.0f - id}, {1, 1, -0.0f - id}}}}));
+        dfb::RoundRobinBricks owner;
+        dfb::OrderedLoop loop(fb, world, owner);
+        const std::vector<int> order = dfb::visibilityOrder(world, pinhole);
+        const auto opaque = [](auto& tile) { tile.forEachPixel([](int, int, float* rgba, float&) { rgba[3] = 1; }); };
+        loop.render(pinhole, order, [&](const dfb::Brick&, auto& tile) { opaque(tile); });
+        dfb::FrameConfig params;
+        params.allowPartial = true;
+        if (fb.rank() == 1)
+            waitFor(hasThrown);
+        auto frame = loop.start(
+            pinhole, order,
+            [&](const dfb::Brick& brick, auto& tile) {
+                (brick.id == 0 ? hasThrown : isSeen) = true;
+                if (brick.id == 0)
+                    throw std::runtime_error("the front is gone");
+                opaque(tile);
+            },
+            params);
+        if (fb.rank() == 0) {
+            waitFor(isSeen);
+            frame.cancel();
+        }
+        frame.end();
+    });
+    CHECK(isSeen);
+}
+
 } // namespace mixed_parallel_cases
