@@ -44,8 +44,8 @@ struct SamplingConfig {
 //   while (!sampler.done())
 //       sampler.update(loop.render(renderTile, sampler.next()));
 //
-// Call reset() after a frame that throws FrameError: the accumulated samples are lost. One thread at a time may use it.
-// Its members send nothing and wait for nothing.
+// Call reset(), not update(), after a frame that throws FrameError or is partial (FrameReport::failure): the
+// accumulated samples are lost. One thread at a time may use it. Its members send nothing and wait for nothing.
 class AdaptiveSampler {
 public:
     // Throws InvalidArgument unless firstSamples is 2 or more, maxSamples at least firstSamples, frameSamples 1 or
