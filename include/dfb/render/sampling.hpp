@@ -102,35 +102,26 @@ public:
     std::int64_t samplesTaken() const
     {
         std::int64_t sum = 0;
-        for (std::size_t t = 0; t < taken_.size(); ++t)
-            sum += taken_[t] * pixelsOf(t);
+        for (std::size_t t = 0; t < taken_.size(); ++t) {
+            const Region r = layout_.region(static_cast<int>(t));
+            sum += std::int64_t{taken_[t]} * r.width() * r.height();
+        }
         return sum;
     }
     std::int64_t samplesSaved() const
     {
-        const int most = *std::max_element(taken_.begin(), taken_.end());
-        std::int64_t all = 0;
-        for (std::size_t t = 0; t < taken_.size(); ++t)
-            all += most * pixelsOf(t);
-        return all - samplesTaken();
+        const std::int64_t most = *std::max_element(taken_.begin(), taken_.end());
+        return most * layout_.width() * layout_.height() - samplesTaken();
     }
 
 private:
     static constexpr double untouched = -1; // nothing projects to the tile
 
-    std::int64_t pixelsOf(std::size_t tile) const
-    {
-        const Region r = layout_.region(static_cast<int>(tile));
-        return static_cast<std::int64_t>(r.width()) * r.height();
-    }
-
     void decide()
     {
         plan_.resize(taken_.size());
         for (std::size_t t = 0; t < taken_.size(); ++t)
-            plan_[t] = {taken_[t], 0};
-        for (std::size_t t = 0; t < taken_.size(); ++t)
-            plan_[t].count = std::min(wanted(t), config_.maxSamples) - taken_[t];
+            plan_[t] = {taken_[t], std::min(wanted(t), config_.maxSamples) - taken_[t]};
         // Few samples may have missed something small. A tile therefore gets at least a quarter of its neighbour's
         // samples, so that an edge that only just reaches into it is not lost.
         for (int row = 0; row < layout_.tilesY(); ++row)
