@@ -103,7 +103,7 @@ inline bool setLook(FileLook& look, const std::string& key, const std::string& v
     const auto wrong = [&value](const char* what) { throw std::invalid_argument("'" + value + "' is not " + what); };
     const auto vector = [&](const char* what) {
         const std::vector<float> v = detail::numbersOf(value, 3);
-        if (v.empty())
+        if (v.empty() || !isUsable({v[0], v[1], v[2]}))
             wrong(what);
         return v.empty() ? Vec3{} : Vec3{v[0], v[1], v[2]};
     };
@@ -120,11 +120,11 @@ inline bool setLook(FileLook& look, const std::string& key, const std::string& v
     } else if (key == "opacity") {
         look.opacity = one(0, 1, "a number from 0 to 1");
     } else if (key == "translate") {
-        look.translate = vector("X,Y,Z");
+        look.translate = vector("X,Y,Z, each below 1e15");
     } else if (key == "scale") {
         look.scale = one(1e-6f, 1e6f, "a number from 1e-6 to 1e6");
     } else if (key == "rotate") {
-        look.rotate = vector("X,Y,Z in degrees");
+        look.rotate = vector("X,Y,Z in degrees, each below 1e15");
     } else if (key == "clip") {
         const std::vector<float> v = detail::numbersOf(value, 6);
         if (v.empty() || !(v[0] < v[3] && v[1] < v[4] && v[2] < v[5]))

@@ -57,8 +57,8 @@ public:
     {
         const auto point = [](const char* name, const std::string& text) {
             const std::vector<float> v = detail::numbersOf(text, 3);
-            if (v.empty())
-                throw CLI::ValidationError(name, "'" + text + "' is not X,Y,Z with three numbers");
+            if (v.empty() || !isUsable({v[0], v[1], v[2]}))
+                throw CLI::ValidationError(name, "'" + text + "' is not X,Y,Z with three numbers below 1e15");
             return Vec3{v[0], v[1], v[2]};
         };
         if (app_.count("--eye") > 0)
@@ -74,7 +74,7 @@ public:
             } else {
                 view.up = point("--up", up_);
             }
-            if (isZero(view.up) || !isUsable(view.up))
+            if (isZero(view.up))
                 throw CLI::ValidationError("--up", "'" + up_ + "' is no direction");
             view.isUpGiven = true;
         }

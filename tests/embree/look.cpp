@@ -147,7 +147,8 @@ TEST_CASE("Wrong settings of a file are refused in one line that names them", "[
                               "translate=1,1,inf", "rotate=x",     "clip=0,0,0,1,1", "clip=0,0,0,1,1,0",
                               "range=1",           "range=2,1",    "range=1,1",      "range=1%,101%",
                               "range=50%,1%",      "isovalue=",    "isovalue=1,,2",  "isovalue=nan",
-                              "transfer=",         "opacity=0.5x", "opacity= 0.5",   "=1"}) {
+                              "transfer=",         "opacity=0.5x", "opacity= 0.5",   "=1",
+                              "translate=0,0,2e15"}) {
         const std::string error = errorOf([&] { parseSceneFile(std::string("v.raw:") + wrong, {".raw"}); });
         INFO(wrong << ": " << error);
         CHECK(isLineWith(error, wrong));

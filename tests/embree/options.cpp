@@ -240,7 +240,7 @@ TEST_CASE("The camera's place and the look arrive", "[options]")
           == (dfb::normalChannel | dfb::primitiveIdChannel | dfb::instanceIdChannel));
     CHECK(options({"demo", "--cinema", "50%.cdb"}).output == "50%%.cdb/frame_%04d.png");
     for (const std::string option : {"--eye", "--target", "--up"})
-        for (const std::string value : {"1,2", "1,2,3,4", "1,2,nan", "a", "1, 2,3", "w", ""})
+        for (const std::string value : {"1,2", "1,2,3,4", "1,2,nan", "1,2e15,3", "a", "1, 2,3", "w", ""})
             checkRefused({option + "=" + value});
     checkRefused({"--up", "0,0,0"});
     checkRefused({"--zoom", "0"});
