@@ -10,6 +10,7 @@
 #include <dfb/frame/verdict.hpp>
 
 #include <algorithm>
+#include <atomic>
 #include <chrono>
 #include <cstdint>
 #include <exception>
@@ -40,6 +41,7 @@ public:
     {
         terms_ = terms;
         verdict_.reset();
+        isCreditInDoubt_ = false;
         endedAt_.reset();
         givesUpAt_.reset();
         quiescence_.newFrame(quiet);
@@ -102,6 +104,8 @@ public:
             return isPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
         };
         // Where something is missing, credit may be missing, too: nobody waits for it then.
+        if (isMissing(why))
+            isCreditInDoubt_ = true;
         mailbox_.flow().drop(matters, isPartial && !isMissing(why));
         if (isPartial && !frame_.areTilesFinished())
             tiles_.gather().flush();
@@ -301,11 +305,12 @@ private:
 
     // Where only end() moves messages, all that others have sent must have been taken before any rank may leave: who
     // polls no more takes nothing, and its sender would wait in end() for it to go. In a frame that may be partial
-    // credit must not be waited for after that, either: who has left gives none.
+    // credit must not be waited for after that, either: who has left gives none. But credit that may be lost must not
+    // hold up the vote: then finished tiles still have as long as waitForFinishedTiles() takes.
     bool mayVote() const
     {
         const bool needsCaller = mailbox_.connection().needsCaller();
-        return ((!needsCaller && !terms_.allowPartial) || mailbox_.flow().allSent())
+        return ((!needsCaller && !terms_.allowPartial) || isCreditInDoubt_ || mailbox_.flow().allSent())
                && (!needsCaller || mailbox_.connection().quiet());
     }
 
@@ -449,8 +454,9 @@ private:
     std::function<void(Verdict&)> addFigures_;
     FrameTerms terms_;
     bool lastFailed_ = false;
-    std::optional<Verdict> verdict_;       // set once, before the frame is Decided
-    std::optional<TraceSpan> verdictSpan_; // from this rank's vote on
+    std::atomic<bool> isCreditInDoubt_{false}; // something is missing that may be credit
+    std::optional<Verdict> verdict_;           // set once, before the frame is Decided
+    std::optional<TraceSpan> verdictSpan_;     // from this rank's vote on
     Quiescence quiescence_;
     // Of the thread that is in end():
     std::optional<Clock::time_point> endedAt_;   // beginEnd() was called

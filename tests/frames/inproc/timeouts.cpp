@@ -662,6 +662,61 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
     }
 }
 
+TEST_CASE("A partial frame does without finished tiles whose credit was lost", "[timeouts]")
+{
+    using Large = dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>, dfb::NoPixelOp, BoardTransport>;
+    for (const auto progress : {dfb::Progress::Auto, dfb::Progress::Caller}) {
+        const auto board = std::make_shared<Board>();
+        board->inspect = [](int, int to, const MessageHeader& header, dfb::Buffer&) {
+            return header.kind == MessageKind::Credit && header.number == 1 && to == 1 ? Board::What::Lose
+                                                                                       : Board::What::Pass;
+        };
+        std::vector<std::string> texts(2), after(2);
+        int complete = 0, completeAfter = 0, tiles = 0;
+        runOn(
+            board, 2,
+            [&](const auto& communicator) {
+                auto config = configOf(scene::makeScene(0, 1, 640, 640));
+                config.messages.poolBytes = 0; // 1 MiB; the tiles have 6 MiB
+                config.image.format = dfb::OutputFormat::RGBA32F;
+                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+                dfb::NetworkConfig options;
+                options.progress = progress;
+                Large fb(communicator, config, options);
+                const auto rank = static_cast<std::size_t>(fb.rank());
+                const auto frame = [&](int& count) {
+                    dfb::FrameConfig params;
+                    params.allowPartial = true;
+                    params.timeout = std::chrono::milliseconds(limitMs);
+                    const auto report = dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Owned)
+                                            .render(
+                                                [](auto& tile) {
+                                                    tile.forEachPixel([](int x, int y, float* rgba, float&) {
+                                                        rgba[0] = static_cast<float>((x + y) % 2); // so it all travels
+                                                        rgba[3] = 1;
+                                                    });
+                                                },
+                                                params);
+                    if (fb.isDisplayRank())
+                        tiles = fb.layout().tileCount();
+                    for (int tile = 0; fb.isDisplayRank() && tile < tiles; ++tile)
+                        count += fb.isComplete(tile);
+                    if (report.failure)
+                        throw dfb::FrameError(*report.failure);
+                };
+                texts[rank] = outcomeOf([&] { frame(complete); });
+                after[rank] = outcomeOf([&] { frame(completeAfter); });
+            },
+            progress == dfb::Progress::Caller ? std::optional<std::uint64_t>(1) : std::nullopt);
+        INFO((progress == dfb::Progress::Caller ? "caller" : "auto") << joined(texts) << joined(after));
+        CHECK(allSame(texts));
+        CHECK(has(texts[0], "timed out"));
+        CHECK((complete > 0 && complete < tiles));
+        CHECK(after == std::vector<std::string>(2, "fine"));
+        CHECK(completeAfter == tiles);
+    }
+}
+
 TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()", "[timeouts]")
 {
     const auto board = std::make_shared<Board>();
