@@ -41,10 +41,10 @@ set(door_of_tbb tbb_executor.hpp)
 # The calls of MPI that the library makes. They wait for no other rank: in those that do, MPI libraries spin, hold their
 # lock, and wait for ever for a rank that has failed. MPI_Finalize() is for MpiSession alone. "Request" is a type.
 set(calls_of_mpi
-    Abort Cancel Comm_create_keyval Comm_delete_attr Comm_free Comm_free_keyval Comm_get_attr Comm_idup Comm_rank
-    Comm_set_attr Comm_set_errhandler Comm_size Error_class Error_string Finalize Get_count Get_processor_name Iallgather
-    Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv Isend Issend Query_thread Request Test Test_cancelled Testall
-    Testsome)
+    Abort Cancel Comm_create_keyval Comm_delete_attr Comm_free Comm_free_keyval Comm_get_attr Comm_idup
+    Comm_rank Comm_set_attr Comm_set_errhandler Comm_size Comm_test_inter Error_class Error_string Finalize
+    Get_count Get_processor_name Iallgather Iallreduce Ialltoall Ibarrier Ibcast Init_thread Irecv Isend Issend
+    Query_thread Request Test Test_cancelled Testall Testsome)
 
 # Who must not see whom, however many includes are in between. Rooms are folders; of the headers at the root those count
 # as pixels that say what a tile is and what is made of it.

@@ -575,7 +575,7 @@ private:
 
 // Connects the ranks of a communicator, for framebuffers, compositors and walls that share the connection. Collective,
 // as is the destruction of the connection. Waits for all ranks. With MPI below MPI_THREAD_SERIALIZED on the thread that
-// initialised MPI. Throws InvalidArgument for MPI_COMM_NULL, and TransportError.
+// initialised MPI. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator, and TransportError.
 template <class Transport = MpiTransport>
 std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})
 {

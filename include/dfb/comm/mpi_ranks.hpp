@@ -37,13 +37,15 @@ public:
         bool seesMine = false;                 // my memory
     };
 
-    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL; TransportError on all ranks if they
-    // were built with different packet formats, and on one alone if a collective of MPI fails there. What else goes
-    // wrong on a rank, all learn in firstFailed().
+    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator; TransportError
+    // on all ranks if they were built with different packet formats, and on one alone if a collective of MPI fails
+    // there. What else goes wrong on a rank, all learn in firstFailed().
     MpiRanks(MPI_Comm communicator, MemoryPool& pool)
     {
         if (communicator == MPI_COMM_NULL)
             failArgument("the communicator is MPI_COMM_NULL: only ranks that have one can take part");
+        if (int isInter = 0; MPI_Comm_test_inter(communicator, &isInter) == MPI_SUCCESS && isInter)
+            failArgument("the communicator is an intercommunicator: make one of both groups by MPI_Intercomm_merge()");
         duplicate(communicator);
         attempt([this] {
             check(MPI_Comm_set_errhandler(comm_, MPI_ERRORS_RETURN), "MPI_Comm_set_errhandler");

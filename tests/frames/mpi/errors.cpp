@@ -85,6 +85,21 @@ std::vector<int> culprits()
 
 } // namespace
 
+TEST_CASE("An intercommunicator is refused", "[errors]")
+{
+    const int rank = rankIn(MPI_COMM_WORLD);
+    if (sizeOf(MPI_COMM_WORLD) == 1)
+        return;
+    MPI_Comm group = MPI_COMM_NULL, both = MPI_COMM_NULL;
+    MPI_Comm_split(MPI_COMM_WORLD, rank == 0 ? 0 : 1, rank, &group);
+    MPI_Intercomm_create(group, 0, MPI_COMM_WORLD, rank == 0 ? 1 : 0, 0, &both);
+    const std::string text = outcomeOf([&] { dfb::connect(both); });
+    INFO(text);
+    CHECK((has(text, "InvalidArgument") && has(text, "MPI_Intercomm_merge")));
+    MPI_Comm_free(&both);
+    MPI_Comm_free(&group);
+}
+
 TEST_CASE("An exception on one rank fails the frame on all", "[errors]")
 {
     const Scene s = scene::makeScene(9);
