@@ -47,19 +47,20 @@ public:
     static constexpr int postedPackets = 8;                         // receives; their memory is said above
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
-    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL. Throws TransportError if MPI is not
-    // initialised, is finalised, or was initialised below MPI_THREAD_MULTIPLE while `progress` is Thread; and on all
-    // ranks if they were built with different packet formats, or if one of them cannot make its transport, with its
-    // rank and the reason. The others cannot be told, and wait, only if a collective of MPI fails on one rank, or finds
-    // no memory there for its result. Below MPI_THREAD_SERIALIZED to be called by the thread that initialised MPI.
+    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator. Throws
+    // TransportError if MPI is not initialised, or is finalised; and on all ranks if they were built with different
+    // packet formats, or if one of them cannot make its transport, with its rank and the reason: as one where MPI was
+    // initialised below MPI_THREAD_MULTIPLE and `progress` is Thread. The others cannot be told, and wait, only if a
+    // collective of MPI fails on one rank, or finds no memory there for its result. Below MPI_THREAD_SERIALIZED to be
+    // called by the thread that initialised MPI.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
-        : onlyThread_(threadFor(progress)),
+        : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
           pool_(std::move(pool)), ranks_(communicator, *pool_), packet_(pool_)
     {
         int failed = size();
         try {
-            ranks_.attempt([this] { prepare(); });
+            ranks_.attempt([this, progress] { prepare(progress); });
             failed = ranks_.firstFailed();
         } catch (...) {
             abandon();
@@ -185,14 +186,9 @@ public:
 
 private:
     // The only thread that may call MPI; none if all may.
-    static std::thread::id threadFor(Progress progress)
+    static std::thread::id onlyThread()
     {
         const int level = detail::mpiLevel();
-        if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
-            throw TransportError(
-                detail::printed("MPI was initialised at thread level %s, Progress::Thread needs MPI_THREAD_MULTIPLE: "
-                                "call MPI_Init_thread with it, or leave Progress::Auto",
-                                detail::mpiLevelName(level)));
         if (level >= MPI_THREAD_SERIALIZED)
             return {};
         if (!detail::mpiSays(MPI_Is_thread_main))
@@ -202,8 +198,14 @@ private:
         return std::this_thread::get_id();
     }
 
-    void prepare()
+    void prepare(Progress progress)
     {
+        const int level = detail::mpiLevel();
+        if (level < MPI_THREAD_MULTIPLE && progress == Progress::Thread)
+            throw TransportError(
+                detail::printed("MPI was initialised at thread level %s, Progress::Thread needs MPI_THREAD_MULTIPLE: "
+                                "call MPI_Init_thread with it, or leave Progress::Auto",
+                                detail::mpiLevelName(level)));
         const int* tagBound = nullptr;
         int found = 0;
         check(MPI_Comm_get_attr(comm(), MPI_TAG_UB, &tagBound, &found), "MPI_Comm_get_attr");
