@@ -85,6 +85,22 @@ class Errors(unittest.TestCase):
         error = errors_of(framebuffer, lambda thing, rank: thing.render([brick(rank)], CAMERA, draw))[0]
         self.assertEqual(error.message, "Mute")
 
+    def test_what_ends_a_program_is_no_error(self):
+        for ending in (KeyboardInterrupt, SystemExit):
+            def body(comm):
+                def draw(thing, tile):
+                    if comm.rank == 1:
+                        raise ending
+                    fill(thing, tile)
+                with framebuffer(comm) as fb:
+                    try:
+                        fb.render([brick(comm.rank)], CAMERA, draw)
+                    except BaseException as error:
+                        return error
+            errors = dfb.run_ranks(2, body)
+            self.assertIs(type(errors[1]), ending)
+            self.assertEqual((type(errors[0]), errors[0].message), (dfb.Error, ending.__name__))
+
     def test_operation_throws_on_one_rank(self):
         def failing(inputs):
             if inputs[0].source == 1:

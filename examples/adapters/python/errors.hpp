@@ -73,6 +73,12 @@ inline py::object valueOf(const py::error_already_set& error)
     return value;
 }
 
+// Makes `exception`, as it is, the exception of this thread's Python.
+inline void setAgain(const py::object& exception)
+{
+    PyErr_SetObject(reinterpret_cast<PyObject*>(Py_TYPE(exception.ptr())), exception.ptr());
+}
+
 // The first exception of Python that the callbacks of a call threw on this rank. Only with the GIL.
 class Cause {
 public:
@@ -126,7 +132,8 @@ void withPython(Cause& cause, const Body& body)
 }
 
 // Calls body() without the GIL, and returns its result. What it throws of dfb becomes dfb.Error, whose cause is the
-// exception of the callback that threw on this rank.
+// exception of the callback that threw on this rank. A callback's KeyboardInterrupt or SystemExit is thrown itself: a
+// program that goes on after errors is to end for those.
 template <class Body>
 auto withoutGil(const Cause& cause, const Body& body)
 {
@@ -134,7 +141,11 @@ auto withoutGil(const Cause& cause, const Body& body)
         const py::gil_scoped_release released;
         return body();
     } catch (const dfb::Error& error) {
-        setError(error, cause.first());
+        const py::object& first = cause.first();
+        if (first.is_none() || PyObject_IsInstance(first.ptr(), PyExc_Exception) == 1)
+            setError(error, first);
+        else
+            setAgain(first);
         throw py::error_already_set();
     }
 }

@@ -82,7 +82,7 @@ inline py::list runRanks(int count, const py::object& body)
         const py::object& first = cause->first();
         if (first.is_none())
             throw;
-        PyErr_SetObject(reinterpret_cast<PyObject*>(Py_TYPE(first.ptr())), first.ptr());
+        setAgain(first);
         throw py::error_already_set();
     }
     py::list list;
