@@ -85,11 +85,11 @@ public:
         }
 
         // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when it returns. Does
-        // nothing in a frame that has failed. Any thread. Waits only while this rank has more than messages.poolBytes
-        // under way, and runs tasks of the executor meanwhile; a thread that may not call MPI does not wait. Throws
-        // InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or pass that the frame
-        // does not have, and for a negative generation or number of children. Throws OutOfMemory. An input that
-        // contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
+        // nothing in a frame that has failed, or after end(). Any thread. Waits only while this rank has more than
+        // messages.poolBytes under way, and runs tasks of the executor meanwhile; a thread that may not call MPI does
+        // not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or
+        // pass that the frame does not have, and for a negative generation or number of children. Throws OutOfMemory.
+        // An input that contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
         // Sends pixels that lie in your own memory; they are not read any more when it returns, unless you promise
         // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Throws InvalidArgument also if a channel
@@ -98,7 +98,7 @@ public:
 
         // Whether an input of that tile and generation cannot be seen and need not be rendered: this rank knows of an
         // opaque input of a lower generation. False unless the operation has opaqueHides(). setTile() drops hidden
-        // inputs. Any thread. Waits for nothing.
+        // inputs. Any thread. Waits for nothing. Nobody checks the index.
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
         // Whether `tile`, which has been set, hides the inputs of higher generations. If it does, call hide() for the
         // ranks that have such inputs. Any thread. Waits for nothing.
@@ -113,6 +113,7 @@ public:
         }
 
         // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
+        // Nobody checks the index.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
         // Tells `rank` that an input of this rank will probably hide its inputs of `generation` and higher ones. That
         // rank should wait before it renders them. This rank must then call hide() or, if they can be seen, show().
@@ -127,7 +128,7 @@ public:
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
         }
         // Whether another rank has said mayHide() about an input, and neither hide() nor show() yet. Any thread. Waits
-        // for nothing.
+        // for nothing. Nobody checks the index.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
         // Waits until heard() returns true or the frame has failed. heard() is called first, and again after each
         // hide(), mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
