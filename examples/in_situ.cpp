@@ -334,11 +334,13 @@ struct Sight {
     }
 };
 
+constexpr float wholeView = 2.4f; // the distance, in sides of the grid, from which all of it is in the image
+
 // From a slow orbit around a grid of n^3 voxels.
 Sight orbit(int n, int step)
 {
     const float angle = 0.6f + 6e-4f * float(step), c = std::cos(angle), s = std::sin(angle);
-    return {0.5f * float(n - 1) * Vec3{1, 1, 1}, dfb::normalize(Vec3{c, 0.5f, s}), 2.4f * float(n), c, s};
+    return {0.5f * float(n - 1) * Vec3{1, 1, 1}, dfb::normalize(Vec3{c, 0.5f, s}), wholeView * float(n), c, s};
 }
 
 // As the viewers want it.
@@ -373,7 +375,7 @@ public:
         if (fb_.allReduce({error.empty()}, FrameBuffer::Reduce::Min)[0] == 0)
             return error.empty() ? "the display rank cannot listen" : error;
         const double middle = 0.5 * (options.size - 1);
-        wishes_.camera = {55, 26, 2.4, {middle, middle, middle}};
+        wishes_.camera = {55, 26, double(wholeView), {middle, middle, middle}};
         wishes_.width = width;
         wishes_.height = height;
         if (!view_)
@@ -400,6 +402,8 @@ public:
             const bool waits = wishes_.isPaused && stepsTaken_ >= wishes_.steps && !isBetweenPictures;
             const std::uint64_t look = wishes_.look;
             wishes_ = example::shareWishes(fb_, heard(waits));
+            if (wishes_.camera.distance == 0)
+                wishes_.camera.distance = double(wholeView);
             if (wishes_.ends)
                 return false;
             if (!wishes_.isPaused)

@@ -252,6 +252,9 @@ void step(const Job& job)
     const json next = job.see(job.post("/command", {{"command", "step"}}), false);
     if (next["frame"]["step"] != at + 20 || pausedAt(4) != at + 20)
         fail("a step of " + std::to_string(next["frame"]["step"].get<int>() - at));
+    const json whole = job.see(job.post("/camera", {{"distance", 0}}), false);
+    if (!(whole["frame"]["distance"] > 1)) // all of the grid is in the image
+        fail("a distance of " + whole["frame"]["distance"].dump());
     job.post("/command", {{"command", "go"}});
     for (int last = at; last < at + 100;)
         last = job.see(0, false)["frame"]["step"].get<int>();
