@@ -3,6 +3,7 @@
 // frame that must be equal on all ranks. FrameFigures: the figures that a rank collects while the frame is open.
 #pragma once
 
+#include <dfb/comm/heartbeat.hpp>
 #include <dfb/comm/message.hpp>
 #include <dfb/frame.hpp>
 #include <dfb/frame/agreement.hpp>
@@ -15,7 +16,6 @@
 #include <cstring>
 #include <exception>
 #include <iterator>
-#include <limits>
 #include <mutex>
 #include <optional>
 #include <string>
@@ -78,7 +78,7 @@ struct FrameTerms {
             failArgument("at most %d layers", p.maxLayers);
         if (p.owners && operations.keepsState)
             failArgument("owners of a frame's own, with a tile operation that keeps state");
-        if (const long long ms = p.timeout.count(); ms < 0 || ms > std::numeric_limits<std::int32_t>::max())
+        if (const long long ms = p.timeout.count(); ms < 0 || ms > longestTimeout.count())
             failArgument("a time-out of %lld ms", ms);
     }
 
