@@ -4,6 +4,7 @@
 
 #include "forward.hpp"
 #include "shuffled.hpp"
+#include "undisturbed.hpp"
 
 #include <dfb/dfb.hpp>
 
@@ -168,16 +169,23 @@ inline void runOn(const std::shared_ptr<Board>& board, int ranks,
         throw std::runtime_error(thrown);
 }
 
-// Runs all cases at once, each for itself: most of the time they wait. Then checks what came of them, one by one.
+// Runs all cases at once, each for itself: most of the time they wait. All again if the process stood still meanwhile.
+// Then checks what came of them, one by one.
 // `run(item)` makes no use of Catch, `check(item, result)` may.
 template <class Item, class Run, class Check>
 void eachAtOnce(const std::vector<Item>& items, const Run& run, const Check& check)
 {
-    std::vector<std::future<decltype(run(items.front()))>> results;
-    for (const Item& item : items)
-        results.push_back(std::async(std::launch::async, [&run, &item] { return run(item); }));
+    const auto results = undisturbed([&] {
+        std::vector<std::future<decltype(run(items.front()))>> running;
+        for (const Item& item : items)
+            running.push_back(std::async(std::launch::async, [&run, &item] { return run(item); }));
+        std::vector<decltype(run(items.front()))> all;
+        for (auto& one : running)
+            all.push_back(one.get());
+        return all;
+    });
     for (std::size_t i = 0; i < items.size(); ++i)
-        check(items[i], results[i].get());
+        check(items[i], results[i]);
 }
 
 inline std::string joined(const std::vector<std::string>& texts)

@@ -1,6 +1,6 @@
 // Runs the cases over MPI.
-#include "ranks.hpp"
 #include "everywhere.hpp"
+#include "ranks.hpp"
 
 #include <exception>
 #include <future>
@@ -12,13 +12,21 @@ void frame_cases::runEverywhere(Run run, bool)
     const bool isFirst = rankIn(MPI_COMM_WORLD) == 0;
     if (isFirst)
         one = std::async(std::launch::async, inProcess, run, 1);
-    Result result;
-    try {
-        const MPI_Comm world = MPI_COMM_WORLD;
-        result = run(AnyTransport::Communicator::of<dfb::MpiTransport>(world, false));
-    } catch (const std::exception& e) {
-        result.wrong += std::string("thrown: ") + e.what();
-    }
+    const auto runCase = [&] {
+        Result mine;
+        try {
+            const MPI_Comm world = MPI_COMM_WORLD;
+            mine = run(AnyTransport::Communicator::of<dfb::MpiTransport>(world, false));
+        } catch (const std::exception& e) {
+            mine.wrong += std::string("thrown: ") + e.what();
+        }
+        return mine;
+    };
+    const Result result = undisturbed(runCase, [](bool stoodStill, const auto& mine) {
+        bool any[] = {stoodStill, !mine.get().wrong.empty()};
+        MPI_Allreduce(MPI_IN_PLACE, any, 2, MPI_CXX_BOOL, MPI_LOR, MPI_COMM_WORLD);
+        return any[0] && any[1];
+    });
     CHECK(result.wrong == "");
     if (isFirst)
         CHECK(result.hash == one.get().hash);

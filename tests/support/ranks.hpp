@@ -1,6 +1,8 @@
 // Ranks and what they have in common. All but the first two are collective over MPI_COMM_WORLD.
 #pragma once
 
+#include "undisturbed.hpp"
+
 #include <dfb/comm/node_memory.hpp>
 
 #include <mpi.h>
@@ -31,6 +33,16 @@ inline bool sameEverywhere(const std::string& text)
     std::copy_n(text.begin(), std::min(text.size(), first.size() - 1), first.begin());
     MPI_Bcast(first.data(), static_cast<int>(first.size()), MPI_CHAR, 0, MPI_COMM_WORLD);
     return text.compare(0, first.size() - 1, first.data()) == 0;
+}
+
+// Runs a case until no rank's process stood still: see undisturbed().
+template <class Run>
+auto undisturbedRanks(const Run& run)
+{
+    return undisturbed(run, [](bool stoodStill, const auto&) {
+        MPI_Allreduce(MPI_IN_PLACE, &stoodStill, 1, MPI_CXX_BOOL, MPI_LOR, MPI_COMM_WORLD);
+        return stoodStill;
+    });
 }
 
 // Whether each rank sees memory of the next one; a system may not allow it.

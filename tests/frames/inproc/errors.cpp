@@ -1496,32 +1496,39 @@ TEST_CASE("An operation that takes longer than a frame may fails the frame, not 
         void process(dfb::PixelTile&) const { std::this_thread::sleep_for(std::chrono::milliseconds(slowMs)); }
     };
     constexpr int limitMs = 1000;
-    std::vector<std::string> texts(2), after(2);
-    dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
-        using Fb = FrameBuffer<Blend, Slow>;
-        auto config = configOf(scene::makeScene(0, 1, 32, 16)); // a tile each
-        Fb fb(communicator, config);
-        const auto rank = static_cast<std::size_t>(fb.rank());
-        slowMs = 5 * limitMs / 2;
-        dfb::FrameConfig params;
-        params.timeout = std::chrono::milliseconds(limitMs);
-        texts[rank] = outcomeOf([&] {
-            auto frame = fb.begin(params);
-            sendOwned(fb, frame);
-            frame.end();
+    struct Outcome {
+        std::vector<std::string> texts{2}, after{2};
+    };
+    const auto runCase = [&] {
+        Outcome o;
+        dfb::runRanks(2, [&](dfb::InprocCommunicator communicator) {
+            using Fb = FrameBuffer<Blend, Slow>;
+            auto config = configOf(scene::makeScene(0, 1, 32, 16)); // a tile each
+            Fb fb(communicator, config);
+            const auto rank = static_cast<std::size_t>(fb.rank());
+            slowMs = 5 * limitMs / 2;
+            dfb::FrameConfig params;
+            params.timeout = std::chrono::milliseconds(limitMs);
+            o.texts[rank] = outcomeOf([&] {
+                auto frame = fb.begin(params);
+                sendOwned(fb, frame);
+                frame.end();
+            });
+            slowMs = 0;
+            o.after[rank] = outcomeOf([&] {
+                auto frame = fb.begin();
+                sendOwned(fb, frame);
+                frame.end();
+            });
         });
-        slowMs = 0;
-        after[rank] = outcomeOf([&] {
-            auto frame = fb.begin();
-            sendOwned(fb, frame);
-            frame.end();
-        });
-    });
-    INFO(joined(texts) << joined(after));
-    CHECK(allSame(texts));
-    CHECK(has(texts[0], "FrameError: dfb: timed out"));
-    CHECK(has(texts[0], "are still being finished"));
-    CHECK(after == std::vector<std::string>(2, "fine"));
+        return o;
+    };
+    const Outcome o = undisturbed(runCase);
+    INFO(joined(o.texts) << joined(o.after));
+    CHECK(allSame(o.texts));
+    CHECK(has(o.texts[0], "FrameError: dfb: timed out"));
+    CHECK(has(o.texts[0], "are still being finished"));
+    CHECK(o.after == std::vector<std::string>(2, "fine"));
 }
 
 } // namespace errors_cases

@@ -112,6 +112,13 @@ Run run(const std::shared_ptr<Board>& board, int ranks, dfb::FrameBufferConfig c
     return result;
 }
 
+// The same for a case that is not one of eachAtOnce().
+template <class... Args>
+Run runAlone(const Args&... args)
+{
+    return undisturbed([&] { return run(args...); });
+}
+
 void send(FrameBuffer::Frame& frame, int index, int generation, std::uint32_t source, std::uint16_t part, int children,
           int pass = 0)
 {
@@ -270,11 +277,12 @@ TEST_CASE("An announced input that is never sent is named on every rank", "[time
 
 TEST_CASE("A tile that gets nothing at all, and a pass that does", "[timeouts]")
 {
-    const Run none = run(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer& fb, auto& frame) {
-        for (int tile : fb.ownedTiles())
-            if (tile != 6)
-                send(frame, tile, 0, 0, 0, 0);
-    });
+    const Run none =
+        runAlone(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer& fb, auto& frame) {
+            for (int tile : fb.ownedTiles())
+                if (tile != 6)
+                    send(frame, tile, 0, 0, 0, 0);
+        });
     INFO(joined(textsOf(none.endings)));
     CHECK(allSame(textsOf(none.endings)));
     REQUIRE(none.endings[0].error);
@@ -287,7 +295,7 @@ TEST_CASE("A tile that gets nothing at all, and a pass that does", "[timeouts]")
 
     auto params = timed(false);
     params.passes = 3;
-    const Run pass = run(std::make_shared<Board>(), 2, smallConfig(), params, [](FrameBuffer& fb, auto& frame) {
+    const Run pass = runAlone(std::make_shared<Board>(), 2, smallConfig(), params, [](FrameBuffer& fb, auto& frame) {
         for (int tile : fb.ownedTiles())
             for (int p = 0; p < 3; ++p)
                 if (tile != 7 || p != 2)
@@ -382,7 +390,7 @@ TEST_CASE("What several owners miss is all listed, whoever's time was up first",
 
 TEST_CASE("More than one tile of an owner: the first are listed, the rest are counted", "[timeouts]")
 {
-    const Run r = run(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer&, auto&) {});
+    const Run r = runAlone(std::make_shared<Board>(), 2, smallConfig(), timed(false), [](FrameBuffer&, auto&) {});
     INFO(joined(textsOf(r.endings)));
     CHECK(allSame(textsOf(r.endings)));
     CHECK(has(r.endings[0].text, "and 6 more tiles")); // each has 14
@@ -614,51 +622,61 @@ TEST_CASE("Lost credit, or requests for it: setTile() does not wait for ever, an
         // All of a kind that rank 1 gets or sends: of credit the next would make good for one that is lost. With 9
         // ranks a sender's own part of the pool is less than a message.
         const int ranks = kind == MessageKind::Credit ? 2 : 9;
-        const auto board = std::make_shared<Board>();
-        std::atomic<bool> lost{false};
-        board->inspect = [&](int from, int to, const MessageHeader& header, dfb::Buffer&) {
-            const bool loses =
-                header.kind == kind && header.number == 1 && (kind == MessageKind::Credit ? to == 1 : from == 1);
-            lost = lost || loses;
-            return loses ? Board::What::Lose : Board::What::Pass;
+        struct Outcome {
+            std::vector<Ending> endings;
+            std::size_t wrong = 1;
+            bool lost = false;
         };
-        std::vector<Ending> endings(static_cast<std::size_t>(ranks));
-        std::size_t wrong = 1;
         const Scene s = scene::makeScene(4, 2, 320, 320);
-        runOn(board, ranks, [&](const auto& communicator) {
-            auto config = configOf(s);
-            config.messages.poolBytes = 0; // 1 MiB
-            config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
-            Large fb(communicator, config);
-            {
-                auto frame = fb.begin(timed(true));
-                std::vector<dfb::TileInput> inputs;
-                for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
-                    for (std::uint16_t part = 0; part < 2; ++part)
-                        if (fb.rank() == 1)
-                            inputs.push_back({tile, 1, part});
-                frame.declare(inputs);
-                const auto tile = std::make_unique<Large::Tile>();
-                for (const dfb::TileInput& input : inputs) { // 4 MB
-                    frame.start(*tile, input.tile);
-                    for (int i = 0; i < 4 * 64 * 64; ++i)
-                        tile->color[i] = static_cast<float>(i % 7 + 1);
-                    tile->generation = 1;
-                    tile->part = input.part;
-                    frame.setTile(*tile);
+        const auto runCase = [&] {
+            Outcome o;
+            o.endings.resize(static_cast<std::size_t>(ranks));
+            const auto board = std::make_shared<Board>();
+            std::atomic<bool> lost{false};
+            board->inspect = [&](int from, int to, const MessageHeader& header, dfb::Buffer&) {
+                const bool loses =
+                    header.kind == kind && header.number == 1 && (kind == MessageKind::Credit ? to == 1 : from == 1);
+                lost = lost || loses;
+                return loses ? Board::What::Lose : Board::What::Pass;
+            };
+            runOn(board, ranks, [&](const auto& communicator) {
+                auto config = configOf(s);
+                config.messages.poolBytes = 0; // 1 MiB
+                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 0; };
+                Large fb(communicator, config);
+                {
+                    auto frame = fb.begin(timed(true));
+                    std::vector<dfb::TileInput> inputs;
+                    for (int tile = 0; tile < fb.layout().tileCount(); ++tile)
+                        for (std::uint16_t part = 0; part < 2; ++part)
+                            if (fb.rank() == 1)
+                                inputs.push_back({tile, 1, part});
+                    frame.declare(inputs);
+                    const auto tile = std::make_unique<Large::Tile>();
+                    for (const dfb::TileInput& input : inputs) { // 4 MB
+                        frame.start(*tile, input.tile);
+                        for (int i = 0; i < 4 * 64 * 64; ++i)
+                            tile->color[i] = static_cast<float>(i % 7 + 1);
+                        tile->generation = 1;
+                        tile->part = input.part;
+                        frame.setTile(*tile);
+                    }
+                    o.endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
                 }
-                endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
-            }
-            const auto report = scene::renderLoop(fb, s, Loop::Declared);
-            if (fb.isDisplayRank())
-                wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
-        });
-        INFO((kind == MessageKind::Credit ? "credit" : "requests") << joined(textsOf(endings)));
-        CHECK(lost);
-        CHECK(allSame(textsOf(endings)));
-        CHECK((endings[0].error && endings[0].error->kind == dfb::ErrorKind::TimedOut));
-        CHECK(has(endings[0].text, "of rank 1"));
-        CHECK(wrong == 0);
+                const auto report = scene::renderLoop(fb, s, Loop::Declared);
+                if (fb.isDisplayRank())
+                    o.wrong = scene::wrongValues(Picture(fb.image(), report), scene::referenceOf(s));
+            });
+            o.lost = lost;
+            return o;
+        };
+        const Outcome o = undisturbed(runCase);
+        INFO((kind == MessageKind::Credit ? "credit" : "requests") << joined(textsOf(o.endings)));
+        CHECK(o.lost);
+        CHECK(allSame(textsOf(o.endings)));
+        CHECK((o.endings[0].error && o.endings[0].error->kind == dfb::ErrorKind::TimedOut));
+        CHECK(has(o.endings[0].text, "of rank 1"));
+        CHECK(o.wrong == 0);
     }
 }
 
@@ -666,82 +684,93 @@ TEST_CASE("A partial frame does without finished tiles whose credit was lost", "
 {
     using Large = dfb::DistributedFrameBuffer<dfb::BasicImageParallel<64>, dfb::NoPixelOp, BoardTransport>;
     for (const auto progress : {dfb::Progress::Auto, dfb::Progress::Caller}) {
-        const auto board = std::make_shared<Board>();
-        board->inspect = [](int, int to, const MessageHeader& header, dfb::Buffer&) {
-            return header.kind == MessageKind::Credit && header.number == 1 && to == 1 ? Board::What::Lose
-                                                                                       : Board::What::Pass;
+        struct Outcome {
+            std::vector<std::string> texts{2}, after{2};
+            int complete = 0, completeAfter = 0, tiles = 0;
         };
-        std::vector<std::string> texts(2), after(2);
-        int complete = 0, completeAfter = 0, tiles = 0;
-        runOn(
-            board, 2,
-            [&](const auto& communicator) {
-                auto config = configOf(scene::makeScene(0, 1, 640, 640));
-                config.messages.poolBytes = 0; // 1 MiB; the tiles have 6 MiB
-                config.image.format = dfb::OutputFormat::RGBA32F;
-                config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
-                dfb::NetworkConfig options;
-                options.progress = progress;
-                Large fb(communicator, config, options);
-                const auto rank = static_cast<std::size_t>(fb.rank());
-                const auto frame = [&](int& count) {
-                    dfb::FrameConfig params;
-                    params.allowPartial = true;
-                    params.timeout = std::chrono::milliseconds(limitMs);
-                    const auto report = dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Owned)
-                                            .render(
-                                                [](auto& tile) {
-                                                    tile.forEachPixel([](int x, int y, float* rgba, float&) {
-                                                        rgba[0] = static_cast<float>((x + y) % 2); // so it all travels
-                                                        rgba[3] = 1;
-                                                    });
-                                                },
-                                                params);
-                    if (fb.isDisplayRank())
-                        tiles = fb.layout().tileCount();
-                    for (int tile = 0; fb.isDisplayRank() && tile < tiles; ++tile)
-                        count += fb.isComplete(tile);
-                    if (report.failure)
-                        throw dfb::FrameError(*report.failure);
-                };
-                texts[rank] = outcomeOf([&] { frame(complete); });
-                after[rank] = outcomeOf([&] { frame(completeAfter); });
-            },
-            progress == dfb::Progress::Caller ? std::optional<std::uint64_t>(1) : std::nullopt);
-        INFO((progress == dfb::Progress::Caller ? "caller" : "auto") << joined(texts) << joined(after));
-        CHECK(allSame(texts));
-        CHECK(has(texts[0], "timed out"));
-        CHECK((complete > 0 && complete < tiles));
-        CHECK(after == std::vector<std::string>(2, "fine"));
-        CHECK(completeAfter == tiles);
+        const auto runCase = [&] {
+            Outcome o;
+            const auto board = std::make_shared<Board>();
+            board->inspect = [](int, int to, const MessageHeader& header, dfb::Buffer&) {
+                return header.kind == MessageKind::Credit && header.number == 1 && to == 1 ? Board::What::Lose
+                                                                                           : Board::What::Pass;
+            };
+            runOn(
+                board, 2,
+                [&](const auto& communicator) {
+                    auto config = configOf(scene::makeScene(0, 1, 640, 640));
+                    config.messages.poolBytes = 0; // 1 MiB; the tiles have 6 MiB
+                    config.image.format = dfb::OutputFormat::RGBA32F;
+                    config.image.ownerMap = [](int, const dfb::TileLayout&, int) { return 1; };
+                    dfb::NetworkConfig options;
+                    options.progress = progress;
+                    Large fb(communicator, config, options);
+                    const auto rank = static_cast<std::size_t>(fb.rank());
+                    const auto frame = [&](int timeoutMs, int& count) {
+                        dfb::FrameConfig params = timed(false, timeoutMs);
+                        params.allowPartial = true;
+                        const auto report = dfb::ImageParallelLoop(fb, dfb::WorkDistribution::Owned)
+                                                .render(
+                                                    [](auto& tile) {
+                                                        tile.forEachPixel([](int x, int y, float* rgba, float&) {
+                                                            rgba[0] =
+                                                                static_cast<float>((x + y) % 2); // so it all travels
+                                                            rgba[3] = 1;
+                                                        });
+                                                    },
+                                                    params);
+                        if (fb.isDisplayRank())
+                            o.tiles = fb.layout().tileCount();
+                        for (int tile = 0; fb.isDisplayRank() && tile < o.tiles; ++tile)
+                            count += fb.isComplete(tile);
+                        if (report.failure)
+                            throw dfb::FrameError(*report.failure);
+                    };
+                    o.texts[rank] = outcomeOf([&] { frame(limitMs, o.complete); });
+                    o.after[rank] = outcomeOf([&] { frame(60000, o.completeAfter); });
+                },
+                progress == dfb::Progress::Caller ? std::optional<std::uint64_t>(1) : std::nullopt);
+            return o;
+        };
+        const Outcome o = undisturbed(runCase);
+        INFO((progress == dfb::Progress::Caller ? "caller" : "auto") << joined(o.texts) << joined(o.after));
+        CHECK(allSame(o.texts));
+        CHECK(has(o.texts[0], "timed out"));
+        CHECK((o.complete > 0 && o.complete < o.tiles));
+        CHECK(o.after == std::vector<std::string>(2, "fine"));
+        CHECK(o.completeAfter == o.tiles);
     }
 }
 
 TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()", "[timeouts]")
 {
-    const auto board = std::make_shared<Board>();
-    board->inspect = [](int, int, const MessageHeader& header, dfb::Buffer&) {
-        return header.kind == MessageKind::Credit && header.number == 1 ? Board::What::Lose : Board::What::Pass;
-    };
     using Large = dfb::DistributedFrameBuffer<dfb::BasicAlphaBlend<64>, dfb::NoPixelOp, BoardTransport>;
-    std::vector<std::string> texts(2);
-    runOn(board, 2, [&](const auto& communicator) {
-        auto config = configOf(scene::makeScene(0, 1, 640, 640));
-        config.messages.poolBytes = 0; // 1 MiB
-        Large fb(communicator, config);
-        texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
-            auto frame = fb.begin(timed(false));
-            const auto tile = std::make_unique<Large::Tile>();
-            for (int index = 0; index < fb.layout().tileCount(); ++index) {
-                frame.start(*tile, index);
-                for (int i = 0; i < 4 * 64 * 64; ++i)
-                    tile->color[i] = static_cast<float>(i % 7 + 1);
-                tile->generation = 1;
-                frame.setTile(*tile);
-            }
-            frame.end();
+    const auto runCase = [&] {
+        const auto board = std::make_shared<Board>();
+        board->inspect = [](int, int, const MessageHeader& header, dfb::Buffer&) {
+            return header.kind == MessageKind::Credit && header.number == 1 ? Board::What::Lose : Board::What::Pass;
+        };
+        std::vector<std::string> texts(2);
+        runOn(board, 2, [&](const auto& communicator) {
+            auto config = configOf(scene::makeScene(0, 1, 640, 640));
+            config.messages.poolBytes = 0; // 1 MiB
+            Large fb(communicator, config);
+            texts[static_cast<std::size_t>(fb.rank())] = outcomeOf([&] {
+                auto frame = fb.begin(timed(false));
+                const auto tile = std::make_unique<Large::Tile>();
+                for (int index = 0; index < fb.layout().tileCount(); ++index) {
+                    frame.start(*tile, index);
+                    for (int i = 0; i < 4 * 64 * 64; ++i)
+                        tile->color[i] = static_cast<float>(i % 7 + 1);
+                    tile->generation = 1;
+                    frame.setTile(*tile);
+                }
+                frame.end();
+            });
         });
-    });
+        return texts;
+    };
+    const auto texts = undisturbed(runCase);
     INFO(joined(texts));
     for (const std::string& text : texts)
         CHECK((has(text, "timed out") || (has(text, "TransportError") && !has(text, "time limit"))));
@@ -750,52 +779,63 @@ TEST_CASE("Credit lost in both directions: no rank waits for ever in setTile()",
 TEST_CASE("Time-outs in frames of one framebuffer leave the other on the same connection alone", "[timeouts]")
 {
     const Scene s = scene::makeScene(5, 4);
-    std::vector<std::string> texts(3);
-    std::size_t wrong = 2;
-    runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
-        const auto connection = dfb::connect<BoardTransport>(communicator);
-        FrameBuffer a(connection, configOf(s)), b(connection, configOf(s));
-        {
-            auto frameB = b.begin(scene::paramsOf(s));
+    struct Outcome {
+        std::vector<std::string> texts{3};
+        std::size_t wrong = 2;
+    };
+    const auto runCase = [&] {
+        Outcome o;
+        runOn(std::make_shared<Board>(), 3, [&](const BoardTransport::Communicator& communicator) {
+            const auto connection = dfb::connect<BoardTransport>(communicator);
+            FrameBuffer a(connection, configOf(s)), b(connection, configOf(s));
             {
-                auto frameA = a.begin(timed(false));
-                texts[static_cast<std::size_t>(a.rank())] = endingOf(frameA).text;
+                auto frameB = b.begin(scene::paramsOf(s));
+                {
+                    auto frameA = a.begin(timed(false));
+                    o.texts[static_cast<std::size_t>(a.rank())] = endingOf(frameA).text;
+                }
+                for (int index : b.ownedTiles())
+                    send(frameB, index, 0, 0, 0, 0);
+                frameB.end();
             }
-            for (int index : b.ownedTiles())
-                send(frameB, index, 0, 0, 0, 0);
-            frameB.end();
-        }
-        for (FrameBuffer* fb : {&a, &b}) {
-            const auto report = scene::renderLoop(*fb, s, Loop::Listing3);
-            if (fb->isDisplayRank())
-                wrong -= scene::wrongValues(Picture(fb->image(), report), scene::referenceOf(s)) == 0;
-        }
-    });
-    INFO(joined(texts));
-    CHECK((allSame(texts) && has(texts[0], "FrameError: dfb: timed out")));
-    CHECK(wrong == 0);
+            for (FrameBuffer* fb : {&a, &b}) {
+                const auto report = scene::renderLoop(*fb, s, Loop::Listing3);
+                if (fb->isDisplayRank())
+                    o.wrong -= scene::wrongValues(Picture(fb->image(), report), scene::referenceOf(s)) == 0;
+            }
+        });
+        return o;
+    };
+    const Outcome o = undisturbed(runCase);
+    INFO(joined(o.texts));
+    CHECK((allSame(o.texts) && has(o.texts[0], "FrameError: dfb: timed out")));
+    CHECK(o.wrong == 0);
 }
 
 TEST_CASE("Progress by the caller: an absent rank that does not poll is a TransportError after twice the time",
           "[timeouts]")
 {
-    std::promise<void> otherDone;
-    std::vector<Ending> endings(2);
-    runOn(
-        std::make_shared<Board>(), 2,
-        [&](const auto& communicator) {
-            dfb::NetworkConfig options;
-            options.progress = dfb::Progress::Caller;
-            FrameBuffer fb(communicator, smallConfig(), options);
-            auto frame = fb.begin(timed(true));
-            frame.declare({});
-            if (fb.rank() == 1)
-                otherDone.get_future().wait_for(std::chrono::seconds(20));
-            endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
-            if (fb.rank() == 0)
-                otherDone.set_value();
-        },
-        1);
+    const auto runCase = [&] {
+        std::promise<void> otherDone;
+        std::vector<Ending> endings(2);
+        runOn(
+            std::make_shared<Board>(), 2,
+            [&](const auto& communicator) {
+                dfb::NetworkConfig options;
+                options.progress = dfb::Progress::Caller;
+                FrameBuffer fb(communicator, smallConfig(), options);
+                auto frame = fb.begin(timed(true));
+                frame.declare({});
+                if (fb.rank() == 1)
+                    otherDone.get_future().wait_for(std::chrono::seconds(20));
+                endings[static_cast<std::size_t>(fb.rank())] = endingOf(frame);
+                if (fb.rank() == 0)
+                    otherDone.set_value();
+            },
+            1);
+        return endings;
+    };
+    const auto endings = undisturbed(runCase);
     INFO(joined(textsOf(endings)));
     for (const Ending& e : endings) {
         REQUIRE(e.error);

@@ -1,5 +1,6 @@
 // The image of the display rank, into which the owners of its node write themselves.
 #include "catch.hpp"
+#include "everywhere.hpp"
 #include "large_image.hpp"
 #include "random_scene.hpp"
 #include "ranks.hpp"
@@ -95,12 +96,13 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         return;
     const int rank = rankIn(MPI_COMM_WORLD);
     const Scene s = sceneFor(5, 2);
-    for (const bool allowPartial : {false, true}) {
+    const auto runCase = [&](bool allowPartial) {
+        frame_cases::Result result;
         constexpr int threads = 2; // the slow tile keeps one of them
         dfb::DistributedFrameBuffer<SlowBlend> fb(MPI_COMM_WORLD, scene::configOf(s, threads));
         dfb::FrameReport report;
-        CHECK(goodFrame(fb, s, report));
-        CHECK(goodFrame(fb, s, report));
+        for (int i = 0; i < 2; ++i)
+            result.expect(goodFrame(fb, s, report), "a frame before");
         const std::int64_t messagesBefore = report.messagesSent;
         const std::byte* imageBefore = fb.image().bytes();
         const Picture before(fb.image(), report);
@@ -124,11 +126,13 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
         const std::string text =
             scene::outcomeOf([&] { report = scene::renderLoop(fb, impatient, scene::Loop::Declared); });
         if (allowPartial)
-            CHECK((report.failure && report.failure->kind == dfb::ErrorKind::TimedOut && report.tilesIncomplete > 0));
+            result.expect(report.failure && report.failure->kind == dfb::ErrorKind::TimedOut
+                              && report.tilesIncomplete > 0,
+                          "not partial: " + text);
         else
-            CHECK(scene::has(text, "timed out"));
+            result.expect(scene::has(text, "timed out"), text);
         if (rank == 0) {
-            CHECK(fb.image().empty() == !allowPartial);
+            result.expect(fb.image().empty() == !allowPartial, "an image, or none");
             // Who still writes costs its tiles, and no others.
             const Picture after(fb.image(), report);
             const std::size_t width = static_cast<std::size_t>(s.width), pixelBytes = dfb::bytesPerPixel(before.format);
@@ -144,18 +148,24 @@ TEST_CASE("From an owner that does not leave the image is taken away", "[shared_
                              != 0;
                 }
             }
-            CHECK(lost == 0);
-            CHECK(wrong == 0);
+            result.expect(lost == 0 && wrong == 0,
+                          std::to_string(lost) + " tiles lost, " + std::to_string(wrong) + " rows wrong");
             MPI_Send(&word, 1, MPI_INT, 1, 0, MPI_COMM_WORLD);
         }
         waiter.join();
-        CHECK((rank != 1 || isThere));
+        result.expect(rank != 1 || isThere, "rank 1 was not at that tile");
         slowTile = -1;
-        for (int i = 0; i < 3; ++i)
-            CHECK(goodFrame(fb, s, report));
-        CHECK((rank != 0 || fb.image().bytes() != imageBefore));
-        CHECK(report.messagesSent > messagesBefore); // tiles are sent again
-    }
+        const std::string after = scene::outcomeOf([&] {
+            for (int i = 0; i < 3; ++i)
+                result.expect(goodFrame(fb, s, report), "a frame after");
+        });
+        result.expect(after == "fine", after);
+        result.expect(rank != 0 || fb.image().bytes() != imageBefore, "the same image");
+        result.expect(report.messagesSent > messagesBefore, "tiles are not sent again");
+        return result;
+    };
+    for (const bool allowPartial : {false, true})
+        CHECK(undisturbedRanks([&] { return runCase(allowPartial); }).wrong == "");
 }
 
 // More than the ranks of a node share (NodeMemory::capacity): finished tiles are lent, or go through MPI.
