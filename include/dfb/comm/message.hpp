@@ -1,6 +1,6 @@
-// Messages as bytes: MessageHeader, which every one starts with, so that it is recognised before it is used, and its
-// checksum; and the bodies of small control messages (manifests, verdicts): SmallBytes holds one, ByteWriter and
-// ByteReader go field by field. A reader never reads beyond its end.
+// Messages as bytes. Every message starts with a MessageHeader, by which it is recognised before it is used, and which
+// holds its checksum. The bodies of small control messages (manifests, verdicts): SmallBytes holds one, ByteWriter and
+// ByteReader write and read one field by field. A reader never reads beyond the end of its bytes.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -23,7 +23,7 @@
 #endif
 
 // crc32c: the checksum of messages, CRC-32C (Castagnoli) as in iSCSI (RFC 3720). It finds all errors of up to three
-// bits in messages of up to 256 MiB, and all that lie within 32 bits.
+// bits in messages of up to 256 MiB, and all errors whose wrong bits lie within 32 bits.
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
@@ -37,7 +37,7 @@ constexpr Crc32cTables makeCrc32cTables()
     for (std::uint32_t b = 0; b < 256; ++b) {
         std::uint32_t sum = b;
         for (int bit = 0; bit < 8; ++bit)
-            sum = (sum >> 1) ^ ((sum & 1) != 0 ? 0x82f63b78u : 0); // the polynomial, its highest power last
+            sum = (sum >> 1) ^ ((sum & 1) != 0 ? 0x82f63b78u : 0); // the polynomial, bit-reversed
         tables[0][b] = sum;
     }
     for (std::size_t k = 1; k < tables.size(); ++k)
@@ -48,7 +48,7 @@ constexpr Crc32cTables makeCrc32cTables()
 
 inline constexpr Crc32cTables crc32cTables = makeCrc32cTables();
 
-// On any processor, eight bytes at a time.
+// For any processor, eight bytes at a time.
 inline std::uint32_t crc32cByTable(const std::byte* data, std::size_t byteCount, std::uint32_t before)
 {
     const auto& t = crc32cTables;
@@ -64,7 +64,7 @@ inline std::uint32_t crc32cByTable(const std::byte* data, std::size_t byteCount,
 
 using Crc32cFunction = std::uint32_t (*)(const std::byte*, std::size_t, std::uint32_t);
 
-// With the processor's instruction, where there is one.
+// Uses the processor's instruction, where there is one.
 #if defined(__x86_64__) && defined(__GNUC__)
 __attribute__((target("sse4.2"))) inline std::uint32_t crc32cByInstruction(const std::byte* data, std::size_t byteCount,
                                                                            std::uint32_t before)
@@ -95,8 +95,9 @@ inline Crc32cFunction fastestCrc32c() { return crc32cByTable; }
 
 } // namespace detail
 
-// The checksum of `byteCount` bytes; of bytes that come in pieces, with that of the pieces `before`. From any thread.
-// On a server processor about 11 GB/s with the instruction and 3 GB/s without, where memcpy has 25 to 100.
+// Returns the checksum of `byteCount` bytes. If data comes in pieces, `before` is the checksum of the pieces before.
+// Any thread. On a server processor it takes about 11 GB/s with the instruction and 3 GB/s without; memcpy has 25 to
+// 100 GB/s there.
 inline std::uint32_t crc32c(const std::byte* data, std::size_t byteCount, std::uint32_t before = 0)
 {
     static const detail::Crc32cFunction fastest = detail::fastestCrc32c();
@@ -107,20 +108,20 @@ namespace detail {
 
 enum class MessageKind : std::uint8_t {
     ReduceUp,      // a partial result of a reduction
-    ReduceDown,    // its result
+    ReduceDown,    // the result of a reduction
     Fragment,      // an input of a tile, to its owner
-    Manifest,      // the inputs that a rank will send to this owner
-    ManifestAck,   // the owner has it
-    FinishedTiles, // a batch, to the display rank
+    Manifest,      // which inputs the sender will send to this owner
+    ManifestAck,   // the owner has the manifest
+    FinishedTiles, // a batch of them, to the display rank
     TilesDone,     // how many finished tiles a rank has for the display rank, and which it has put into the image
     Abort,         // the frame has failed on the sender
     CreditRequest, // the sender has more for this rank than it may send
-    Credit,        // how much the receiver of this may send
-    JobRequest,    // the sender has nothing more to render, to the rank that hands jobs out
-    Jobs,          // a range of them
+    Credit,        // how much the receiver of this message may send
+    JobRequest,    // to the rank that hands out jobs: the sender has nothing more to render
+    Jobs,          // a range of jobs
     ImagePlace,    // where in shared memory the image of the display rank lies
     Failure,       // the sender's connection cannot go on, nor can ranks that wait for it
-    Ping,          // to be answered at once with the next
+    Ping,          // to be answered at once with a Pong
     Pong,          // the sender is there, and answers whenever it is asked
     Hidden,        // from which generation on inputs of a tile cannot be seen
     Leaving        // the sender destroys its object, and takes part in nothing that begins from now on
@@ -134,9 +135,9 @@ struct MessageHeader {
     std::uint8_t version = formatVersion;
     MessageKind kind = MessageKind::Fragment;
     std::uint32_t receiver = 0; // address of the receiving object
-    std::int64_t number = 0;    // of the frame; of the reduction
-    std::uint32_t sequence = 0; // running, per sender and destination; set by the connection, as is the next
-    std::uint32_t checksum = 0; // CRC-32C of the message with 0 in this place; 0: there is none
+    std::int64_t number = 0;    // of the frame, or of the reduction
+    std::uint32_t sequence = 0; // running number per sender and destination; set by the connection
+    std::uint32_t checksum = 0; // set by the connection: CRC-32C of the message with 0 in this place; 0: none
 
     static MessageHeader of(MessageKind kind, std::uint32_t receiver = 0, std::int64_t number = 0)
     {
@@ -203,7 +204,7 @@ struct Arrival {
     Buffer message;
 };
 
-// The bytes of a control message, of which the usual ones need no memory of their own.
+// The bytes of a control message. A message of usual size needs no memory from the heap.
 class SmallBytes {
 public:
     SmallBytes() = default;
@@ -226,7 +227,7 @@ public:
         fewCount_ = 0;
         many_.clear();
     }
-    // Not of its own bytes.
+    // The bytes must not be its own.
     void append(const std::byte* first, const std::byte* last)
     {
         const auto count = static_cast<std::size_t>(last - first);
@@ -245,7 +246,7 @@ private:
 
     std::size_t fewCount_ = 0;
     std::array<std::byte, most> few_{};
-    std::vector<std::byte> many_; // all of them, if they are more than that
+    std::vector<std::byte> many_; // all bytes, if there are more than `most`
 };
 
 inline Buffer makeMessage(MemoryPool& pool, const MessageHeader& header, const SmallBytes& body = {})
@@ -304,7 +305,7 @@ public:
         const std::byte* from = take(count);
         std::copy(from, from + count, to);
     }
-    // All that is left.
+    // Appends all bytes that are left to `out`.
     void copyTo(ByteWriter& out) const { out.putBytes(next_, next_ + left_); }
     // Throws Error (MalformedMessage) when bytes are left.
     void end() const

@@ -1,8 +1,8 @@
 // ReductionTable: non-blocking all-reduce operations made of messages, along a binomial tree rooted at rank 0.
 //
-// Each has a key, so that any number may be under way, contributions may come before this rank takes part, and those
-// of an abandoned one are recognised. (A collective of the MPI library would have to be entered by all ranks in the
-// same order, also by a rank whose frame has failed.)
+// Each reduction has a key. So any number of reductions may be under way, contributions may come before this rank takes
+// part, and contributions to an abandoned reduction are recognised. (A collective of the MPI library would have to be
+// entered by all ranks in the same order, even by a rank whose frame has failed.)
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -40,7 +40,8 @@ inline std::vector<int> treeNeighbours(int rank, int size)
 
 } // namespace detail
 
-// All members may be called from any thread. The callbacks are called without a lock held, on the calling thread.
+// All members may be called from any thread. `send` and `done` are called on the calling thread, without a lock held;
+// `combine` is called on the calling thread with the table locked.
 class ReductionTable {
 public:
     using Bytes = detail::SmallBytes;
@@ -58,8 +59,8 @@ public:
             states_.emplace_back(children_.size() + 1);
     }
 
-    // Takes part with `own`; every rank does so once per key, or again when it has got the result. `done` gets the
-    // result, the same on all ranks.
+    // Takes part with `own`. Every rank does so once per key; it may use the key again when it has got the result.
+    // `done` gets the result, which is the same on all ranks.
     void enter(const ReductionKey& key, Bytes own, Combine combine, Done done)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -140,7 +141,7 @@ public:
 private:
     int parent() const noexcept { return rank_ & (rank_ - 1); }
 
-    // Those that are over are used again.
+    // A reduction under way. States of reductions that are over are used again.
     struct State {
         explicit State(std::size_t partCount) : parts(partCount) {}
 
@@ -167,7 +168,7 @@ private:
                 return &state;
         return nullptr;
     }
-    // Its place, or a new one.
+    // Returns the state with this key, or a new one.
     State& stateOf(const ReductionKey& key)
     {
         State* state = find(key);
@@ -180,7 +181,7 @@ private:
         return *state;
     }
 
-    // All parts are here.
+    // Whether all parts are here.
     static bool hasAll(const State& state)
     {
         return std::all_of(state.parts.begin(), state.parts.end(), [](const auto& part) { return part.has_value(); });
@@ -220,7 +221,7 @@ private:
     std::vector<int> children_;
     std::mutex mutex_;
     std::vector<State> states_;           // few
-    std::vector<ReductionKey> forgotten_; // the last of each scope
+    std::vector<ReductionKey> forgotten_; // for each scope the last number
 };
 
 DFB_NAMESPACE_END

@@ -1,7 +1,7 @@
 // The contract of a transport: how bytes get from rank to rank. A transport is passive: it makes progress only when
 // somebody calls poll(). It knows nothing of tiles.
 //
-//   using Communicator = ...;                   what a program has: a group of ranks, and which of them this one is
+//   using Communicator = ...;                   the program's handle of a group of ranks and of this rank in it
 //   T(const Communicator&, std::shared_ptr<MemoryPool>, Progress);
 //                                               collective over the communicator. Messages of two transports on one
 //                                               communicator do not mix. Throws TransportError
@@ -11,46 +11,47 @@
 //   bool wakesOnArrival() const;                whether nap() ends when a message arrives that needs poll(). A few
 //                                               polls may be needed to deliver it
 //   void start(TransportHandler&);              from now on the handler may be called
-//   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks. To another rank. Messages
-//                                               arrive once, in any order; they may have any size, also 0. A message to
-//                                               a rank that has stopped is dropped
+//   void send(int destination, Buffer&&);       after start(). Any thread. Never blocks. `destination` is another rank.
+//                                               A message arrives once; messages arrive in any order. They may have any
+//                                               size, also 0. A message to a rank that has stopped is dropped
 //   bool poll();                                between start() and stop(), one thread at a time. Never blocks. Sends
-//                                               and receives what it can, and calls the handler. Returns whether there
-//                                               was anything
-//   bool quiet() const;                         any thread. Nothing waits to be sent: all messages will arrive although
-//                                               this rank does not poll any more
-//   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until soon after there is something to
-//                                               send, interrupt() is called, or `limit` has passed
+//                                               and receives what it can, and calls the handler. Returns whether
+//                                               anything moved
+//   bool quiet() const;                         any thread. Whether nothing waits to be sent: all messages will then
+//                                               arrive even if this rank does not poll any more
+//   void nap(std::chrono::nanoseconds limit);   on the thread that polls. Sleeps until there is something to send,
+//                                               interrupt() is called, or `limit` has passed, or until soon after that
 //   void interrupt();                           any thread, also within a call of the handler. Ends the nap under way,
 //                                               or else the next one
 //   void stop(bool orderly);                    once, after start(), when no thread is in another member. Afterwards
 //                                               the handler is not called. Orderly: this rank expects no more messages;
-//                                               what it has sent reaches all ranks that have not called stop(); it may
-//                                               wait until all ranks have called it or the handler has failed(). Not
-//                                               orderly: it waits for nobody; other ranks may get fail(), and messages
-//                                               under way may be lost
+//                                               what it has sent reaches all ranks that have not called stop();
+//                                               the call may wait until all ranks have made it or the handler has
+//                                               failed(). Not orderly: it waits for nobody; other ranks may get fail(),
+//                                               and messages under way may be lost
 //
 // Optional, if other ranks can see memory of this one (see comm/mpi_transport.hpp). Places in that memory are counted
 // in units of bytesOfPlace, at which the memory is aligned:
-//   bool lendsTo(int other) const;              whether that rank sees this one's
+//   bool lendsTo(int other) const;              whether that rank sees this rank's memory
 //   std::int32_t placeOf(const std::byte* p) const;
 //                                               the place that holds *p, or -1 if others do not see it
 //   std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const;
-//                                               so many bytes from a place of another rank's memory on, or null. They
-//                                               can be read as long as the transport lives
+//                                               the first of `byteCount` bytes at a place in another rank's memory, or
+//                                               null. They can be read as long as the transport lives
 //
 // Optional, if a thread of the library's own may not always poll:
 //   static bool mayHaveThread(const Communicator&);
-//                                               whether the constructor takes Progress::Thread on this rank. Never
-//                                               throws. It makes Thread or Caller of Progress::Auto, which the
+//                                               whether the constructor accepts Progress::Thread on this rank. Never
+//                                               throws. Decides between Thread and Caller for Progress::Auto, which the
 //                                               constructor never gets
 //
 // Optional, if ranks may share processors:
 //   int sharingRanks() const;                   how many ranks, this one included, may run on this rank's processors
 //
 // Optional, if it can end the job whose processes the ranks are:
-//   void abort(const std::string& text);        between start() and stop(), or in waiting(), on the thread that polls.
-//                                               Prints why on standard error and ends all ranks. Does not return
+//   void abort(const std::string& text);        between start() and stop(), or in TransportHandler::waiting(), on the
+//                                               thread that polls. Prints `text` on standard error and ends all ranks.
+//                                               Does not return
 //
 // Messages may outlive the transport.
 // testing/transport_conformance.hpp checks whether a transport keeps this contract.
@@ -89,8 +90,8 @@ class TransportHandler {
 public:
     virtual void receive(int source, Buffer&& message) = 0;
     virtual void fail(const ErrorInfo& error) = 0; // the transport cannot go on
-    virtual bool failed() const = 0;               // it cannot, or another rank has said so
-    // Called repeatedly by a stop() that waits for other ranks, on its thread. It may call send().
+    virtual bool failed() const = 0;               // the transport cannot go on, or another rank has said so
+    // Called repeatedly by a stop() that waits for other ranks, on the thread that called it. It may call send().
     virtual void waiting() {}
 
 protected:
@@ -143,7 +144,7 @@ DFB_DETECTS(limits_threads_v, T::mayHaveThread(std::declval<const typename T::Co
 DFB_DETECTS(knows_sharing_v, std::declval<const T&>().sharingRanks());
 DFB_DETECTS(can_abort_v, std::declval<T&>().abort(std::declval<const std::string&>()));
 
-// Thread or Caller for Progress::Auto.
+// Replaces Progress::Auto by Thread or Caller.
 template <class T>
 Progress resolved(Progress progress, [[maybe_unused]] const typename T::Communicator& communicator)
 {
@@ -183,8 +184,8 @@ constexpr bool checkTransport()
 
 inline constexpr std::int64_t bytesOfPlace = 64;
 
-// Link: a transport of any type behind an abstract class, so that its users are no templates. Its members are those of
-// the contract above.
+// Link: an abstract class that hides the type of a transport, so that its users need not be templates. Its members are
+// those of the contract above.
 class Link {
 public:
     virtual ~Link() = default;
