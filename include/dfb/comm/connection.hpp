@@ -39,10 +39,11 @@ struct NetworkConfig {
     bool sharedMemory = true;
     // A rank counts as lost if no message has come from it for this long while messages are expected. It may have
     // ended, hang, or be out of reach. Needs a progress thread on both ranks. 0: this rank watches no other, and no
-    // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse others. It also limits how long a reduction
-    // waits after a message that could not be read; for this 0 means no limit, unless the frame has a time-out.
+    // other watches it. Otherwise 100 ms to 24 days; framebuffers refuse other values. It also limits how long a
+    // reduction waits after a message that could not be read; for this 0 means no limit, unless the frame has a
+    // time-out.
     std::chrono::milliseconds peerTimeout = defaultPeerTimeout;
-    // Called when a rank is lost, by a thread of the library, once on one or several of the other ranks. It must be
+    // Called by a thread of the library when a rank is lost, once, on one or several of the other ranks. It must be
     // quick and must not throw. All ranks then get a TransportError with the lost rank in ErrorInfo::rank. Null: the
     // error is printed to standard error, and the job ends with MPI_Abort, because MPI does not go on without a rank.
     std::function<void(const ErrorInfo&)> onPeerLost{};
@@ -54,19 +55,19 @@ namespace detail {
 class MessageReceiver {
 public:
     virtual void receive(int source, const MessageHeader& header, Buffer&& message) = 0;
-    virtual void malformed(const ErrorInfo& error) = 0; // a message of rank error.from; it may have been for this one
+    virtual void malformed(const ErrorInfo& error) = 0; // a message of rank error.from that was perhaps for this object
     virtual void connectionFailed() = 0;
 
 protected:
     ~MessageReceiver() = default;
 };
 
-// Which messages of one sender have come: each number once, in any order.
+// Records which messages of one sender have come. They come in any order; each number counts once.
 class SequenceWindow {
 public:
     SequenceWindow() { holes_.reserve(16); }
 
-    // Returns whether it is new. Throws Error (MalformedMessage) for one that is too far ahead.
+    // Returns whether the message is new. Throws Error (MalformedMessage) for a number that is too far ahead.
     bool arrive(std::uint32_t sequence)
     {
         const auto ahead = static_cast<std::int32_t>(sequence - next_);
@@ -79,7 +80,7 @@ public:
             return true;
         }
         const auto hole = std::lower_bound(holes_.begin(), holes_.end(), sequence, [this](auto a, auto b) {
-            return next_ - a > next_ - b; // also where the numbers have begun again
+            return next_ - a > next_ - b; // also right if the numbers have wrapped around
         });
         if (hole == holes_.end() || *hole != sequence)
             return false;
@@ -87,7 +88,7 @@ public:
         return true;
     }
 
-    // Messages that later ones have overtaken, or that are lost.
+    // How many messages are missing: later ones have overtaken them, or they are lost.
     std::size_t missing() const noexcept { return holes_.size(); }
 
 private:
@@ -102,7 +103,7 @@ private:
 // ranks, and destroyed before it. Any thread may call any member, unless it says otherwise.
 class Connection final : private TransportHandler {
 public:
-    // See connect(). `pool`: the one that the link has.
+    // See connect(). `pool`: the pool that `link` was made with.
     Connection(NetworkConfig config, std::shared_ptr<MemoryPool> pool, std::unique_ptr<Link> link)
         : config_(std::move(config)), pool_(std::move(pool)), link_(std::move(link))
     {
@@ -114,15 +115,15 @@ public:
             if (heartbeat_.isOn())
                 for (const int other : detail::treeNeighbours(rank_, size_))
                     sendSign(other, detail::MessageKind::Pong);
-        } catch (const std::exception& e) { // no thread, no memory: the others have made theirs
+        } catch (const std::exception& e) { // no thread or memory: the others may wait for this rank
             leave(e.what());
             end();
             throw;
         }
     }
 
-    // Waits for the other ranks, unless an exception is passing that they do not get: they may never come here then, so
-    // it tells them and leaves.
+    // Waits for the other ranks. But if an exception is passing that the other ranks do not get, they may never come
+    // here; then it tells them and leaves.
     ~Connection()
     {
         if (std::uncaught_exceptions() > exceptions_ && thrownByAll_.expired())
@@ -138,13 +139,13 @@ public:
 
     // How many threads this rank should use: the processors that the calling thread may run on, divided by the number
     // of this connection's ranks on this node that may run there, too; at least 1. A framebuffer that is given no
-    // executor makes so many.
+    // executor makes this many threads.
     int threadShare() const noexcept
     {
         return dfb::threadShare(Processors::ofThisThread().count(), link_->sharingRanks());
     }
 
-    // More than two ranks share a processor.
+    // Whether there are more than two ranks per processor.
     bool isOversubscribed() const noexcept { return isOversubscribed_; }
 
     // Moves messages, and returns whether any moved. Not needed with a progress thread. Does nothing on a thread that
@@ -153,8 +154,8 @@ public:
 
     // ---- for the objects that it serves
 
-    // Gives the receiver an address, which is the same on all ranks, and then the messages that have come for it
-    // already.
+    // Gives the receiver an address, which is the same on all ranks, and then the messages that have already come for
+    // it.
     void attach(detail::MessageReceiver& receiver, std::uint32_t& address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -171,7 +172,8 @@ public:
         stray_.reset();
     }
 
-    // Ends the calls of the receiver. Messages that come for it are dropped.
+    // Waits for calls of the receiver that are under way; then there are no more. Messages that still come for it are
+    // dropped.
     void detach(std::uint32_t address)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -198,8 +200,8 @@ public:
         return header.sequence;
     }
 
-    // Whether another rank sees memory of this one; the place of a block of pool() there, or -1; and the memory at a
-    // place of another rank, or null.
+    // isSeenBy(): whether another rank sees memory of this rank. placeOf(): the place of a block of pool() in that
+    // memory, or -1. blockAt(): the memory at a place of another rank, or null.
     bool isSeenBy(int other) const { return other != rank() && link_->lendsTo(other); }
     std::int32_t placeOf(const std::byte* block) const { return link_->placeOf(block); }
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const
@@ -207,11 +209,11 @@ public:
         return link_->blockAt(other, place, byteCount);
     }
 
-    // Whether each sees memory of the other.
+    // Whether this rank and the other one see memory of each other.
     bool sharesMemoryWith(int other) const { return isSeenBy(other) && blockAt(other, 2, 0); }
 
-    // The lowest rank on this one's node: of those that share memory with it. 0 with a transport that knows of no
-    // shared memory: all are taken to be on one node.
+    // The lowest rank on this rank's node, which is this rank and those that share memory with it. 0 with a transport
+    // that does not know of shared memory: then all ranks are taken to be on one node.
     int firstOnNode() const
     {
         int first = 0;
@@ -220,8 +222,8 @@ public:
         return first;
     }
 
-    // Any byte of such a block: its offset in the memory of this rank that others see, or -1; and bytes at an offset in
-    // that of another rank, or null.
+    // offsetOf(): the offset of any byte of a block of pool() in the memory of this rank that others see, or -1.
+    // bytesAt(): the bytes at an offset in such memory of another rank, or null.
     std::int64_t offsetOf(const std::byte* address) const
     {
         const std::int64_t place = placeOf(address);
@@ -239,8 +241,8 @@ public:
         return block ? block + before : nullptr;
     }
 
-    // Notes that all ranks have the same configuration, `checksums` included. Before that, messages may come with or
-    // without a checksum; see checkChecksum(). Any number of times.
+    // Notes that all ranks have the same configuration, `checksums` included. Before that, messages of the set-up may
+    // come with or without a checksum; see checkChecksum(). May be called any number of times.
     void setAlike() noexcept { isAlike_ = true; }
 
     // How many messages came twice and were dropped, since the start.
@@ -261,7 +263,8 @@ public:
     // Says that messages may come from now on (true), or no more (false). Each true is followed by one false.
     void expectMessages(bool expect) { progress_.expectMessages(expect); }
 
-    // Returns what the exception that all ranks throw now must keep: while it does, the connection ends in order.
+    // For an exception that all ranks throw now: returns an object that the exception must keep. While that exists, the
+    // connection ends in order although an exception is passing.
     std::shared_ptr<const void> throwByAll()
     {
         auto whileThrown = std::make_shared<char>();
@@ -290,8 +293,8 @@ public:
     using Expecting = Telling<&Connection::expectMessages>;
     // The connection looks for messages often.
     using Hurry = Telling<&Connection::hurry>;
-    // The calling thread moves messages in place of the progress thread: it stays in calls that do so. Two threads on
-    // one processor would take turns for each message.
+    // The calling thread moves messages in place of the progress thread, because it stays in calls that do so.
+    // Otherwise the two threads, if they share a processor, would take turns for each message.
     using StandIn = Telling<&Connection::standIn>;
 
     // For a thread that waits: moves messages in place of the progress thread, if there is one. Returns whether any
@@ -319,8 +322,8 @@ public:
         throw TransportError(*failure_);
     }
 
-    // Tells the other ranks that this one cannot go on, so that nobody waits for it. Returns false if it has failed
-    // before.
+    // Tells the other ranks that this one cannot go on, so that nobody waits for it. Returns false if the connection
+    // had failed already.
     bool giveUp(const ErrorInfo& error)
     {
         if (!setFailure(error))
@@ -348,7 +351,7 @@ private:
     void end()
     {
         progress_.stop();
-        if (failed_) // what tells the others of it should still leave, but not at any cost
+        if (failed_) // the messages that tell the others should leave, but this waits 0.1 s at most
             for (int tries = 0; tries < 100 && link_->mayPoll() && !link_->quiet(); ++tries) {
                 link_->poll();
                 std::this_thread::sleep_for(std::chrono::milliseconds(1));
@@ -362,8 +365,9 @@ private:
         return crc == 0 ? 1 : crc;
     }
 
-    // By such messages ranks find out whether they were set up alike, and that they cannot go on. A rank that uses
-    // checksums reads those of one that does not, and the other way round, so that both can say what differs.
+    // Whether ranks find out by messages of this kind whether they were set up alike, or that they cannot go on. A rank
+    // that uses checksums also reads such messages without one, and a rank that uses none reads those with one, so that
+    // both can say what differs.
     static bool isOfSetUp(detail::MessageKind kind)
     {
         using Kind = detail::MessageKind;
@@ -421,14 +425,14 @@ private:
 
     using Receiver = std::pair<std::uint32_t, detail::MessageReceiver*>;
 
-    // The end if there is none.
+    // Returns the end if there is none.
     std::vector<Receiver>::iterator findReceiver(std::uint32_t address)
     {
         return std::find_if(receivers_.begin(), receivers_.end(),
                             [&](const Receiver& r) { return r.first == address; });
     }
 
-    // Objects are made in the same order on all ranks, so that no rank is far ahead.
+    // Objects are made in the same order on all ranks, so a sender cannot have many more of them than this rank.
     void checkReceiver(std::uint32_t address)
     {
         constexpr std::uint32_t mostAhead = 1024;
@@ -480,7 +484,7 @@ private:
         return isOn ? config_.peerTimeout : std::chrono::milliseconds(0);
     }
 
-    // Short enough for questions to be answered in time.
+    // Short enough to answer a Ping in time.
     Clock::duration longestNap() const
     {
         const Clock::duration longest = std::chrono::seconds(1);
@@ -492,7 +496,7 @@ private:
         send(other, detail::makeMessage(*pool_, detail::MessageHeader::of(kind)));
     }
 
-    // Between two polls, by the thread that polls.
+    // Called between two polls, by the thread that polls.
     void beat(Clock::time_point now, bool expecting)
     {
         if (isAsked_ && isAsked_.exchange(false)) {
@@ -526,7 +530,7 @@ private:
                             rank(), static_cast<long long>(config_.peerTimeout.count()));
         const ErrorInfo error = detail::errorInfo(ErrorKind::Transport, text, other);
         if (!config_.onPeerLost)
-            link_->abort(error.describe()); // if the transport can
+            link_->abort(error.describe()); // does not return if the transport can do it
         if (giveUp(error) && config_.onPeerLost)
             config_.onPeerLost(error);
     }
@@ -553,15 +557,15 @@ private:
     // Under peersMutex_:
     std::unordered_map<int, Peer> peers_; // made when first needed
     detail::Heartbeat heartbeat_{detail::treeNeighbours(rank_, size_), peerTimeout()};
-    std::vector<int> askers_; // that want a sign of life
+    std::vector<int> askers_; // the ranks that have sent a Ping
 
     std::atomic<bool> isAsked_{false}; // there are askers
     Clock::time_point nextBeat_{};     // only the thread that polls uses it
 
-    std::mutex mutex_; // held while a receiver is called, so that detach() can be sure
+    std::mutex mutex_; // held while a receiver is called, so that detach() waits for the call
     std::vector<Receiver> receivers_;
-    std::vector<detail::Arrival> unexpected_; // for receivers to come
-    std::optional<ErrorInfo> stray_;          // of the malformed message that came before its receiver
+    std::vector<detail::Arrival> unexpected_; // for receivers that are not attached yet
+    std::optional<ErrorInfo> stray_;          // of a malformed message that came when there was no receiver
     std::uint32_t addresses_ = 0;
 
     mutable std::mutex failureMutex_;
@@ -574,8 +578,9 @@ private:
 };
 
 // Connects the ranks of a communicator, for framebuffers, compositors and walls that share the connection. Collective,
-// as is the destruction of the connection. Waits for all ranks. With MPI below MPI_THREAD_SERIALIZED on the thread that
-// initialised MPI. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator, and TransportError.
+// as is the destruction of the connection. Waits for all ranks. With MPI below MPI_THREAD_SERIALIZED it must be called
+// by the thread that initialised MPI. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator, and
+// TransportError.
 template <class Transport = MpiTransport>
 std::shared_ptr<Connection> connect(const typename Transport::Communicator& communicator, NetworkConfig config = {})
 {

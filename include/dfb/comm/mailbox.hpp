@@ -34,10 +34,10 @@ namespace detail {
 class MailboxOwner {
 public:
     // Takes a message. Called in tasks, for several messages at once and in any order. Messages of reductions come
-    // here, too, and are passed on to receiveReduction(); those of reduce() do not.
+    // here, too, and the owner passes them on to receiveReduction(). Those of reduce() do not come here.
     virtual void incoming(int source, const MessageHeader& header, Buffer&& message) = 0;
-    // Is told of a message of rank error.from that could not be read. Nobody knows its kind, or for whom it was. If
-    // this cannot make a frame fail, it calls keepDamage().
+    // A message of rank error.from could not be read. Nobody knows its kind, or which object it was for. If no frame
+    // can fail because of it, the owner calls keepDamage().
     virtual void undecodable(const ErrorInfo& error) = 0;
     virtual void work(int) {} // runs the work of submitWork(number), in a task
     virtual void polled() {}  // called by wait() after it has moved messages itself
@@ -50,7 +50,7 @@ class Mailbox final : private MessageReceiver {
 public:
     using Bytes = ReductionTable::Bytes;
     using Clock = std::chrono::steady_clock;
-    // The scopes of reduce(), and of rounds that check whether anything is under way. The handler has others.
+    // The scopes of reduce(), and of the rounds that check whether anything is under way. The owner uses others.
     static constexpr std::uint32_t ownScope = 0, quietScope = ~std::uint32_t{0};
 
     // `poolBytes`: see FlowControl. `trace` may be null.
@@ -73,13 +73,13 @@ public:
         inbox_.reserve(256); // usually no more wait at once
     }
 
-    // Begins to call the handler. Collective, in the same order for all objects of a connection.
+    // Begins to call the handler. Collective: all ranks call it in the same order for the objects of a connection.
     void start() { connection_->attach(*this, address_); }
 
     ~Mailbox() { stop(); }
 
-    // Ends the calls of the handler, and waits for those under way. Tells the neighbours that this rank takes part in
-    // nothing that begins from now on.
+    // Ends the calls of the handler, and waits for those under way. Tells the neighbours in the tree of reductions that
+    // this rank takes part in nothing that begins from now on.
     void stop()
     {
         if (!isEnding_ && !failed())
@@ -90,7 +90,7 @@ public:
         isEnding_ = true;
         while (tasks_ > 0) {
             lock.unlock();
-            const bool did = executor_->help(); // nobody else does if it has no workers
+            const bool did = executor_->help(); // without workers nobody else runs the tasks
             lock.lock();
             if (!did)
                 changed_.wait_for(lock, std::chrono::milliseconds(2), [this] { return tasks_ == 0; });
@@ -105,14 +105,15 @@ public:
     Executor& executor() const noexcept { return *executor_; }
     TraceSink* trace() const noexcept { return trace_; } // or null
 
-    // Begins to count credit anew; see FlowControl. No message with credit may be in a task.
+    // Begins an epoch and counts credit anew; see FlowControl. No task may be handling a message with credit.
     void newEpoch(std::int64_t number)
     {
         sentOn_ = takenOn_ = 0;
         flow_.newEpoch();
         enterEpoch(number);
     }
-    // Begins an epoch without that. Gives up if a neighbour in the tree of reductions has left before it.
+    // Begins an epoch without counting credit anew. Gives up if a neighbour in the tree of reductions has left before
+    // it.
     void enterEpoch(std::int64_t number)
     {
         epoch_ = number;
@@ -120,8 +121,8 @@ public:
     }
     FlowControl& flow() noexcept { return flow_; }
 
-    // Sends a message, also to this rank itself. Any thread; never blocks. One with pixels needs credit of its
-    // receiver, and is kept here until it has it.
+    // Sends a message, also to this rank itself. Any thread; never blocks. A message with pixels needs credit of its
+    // receiver, and is kept here until there is enough.
     void send(int destination, Buffer&& message)
     {
         const auto header = loadAs<MessageHeader>(message.data());
@@ -129,7 +130,7 @@ public:
             enqueue(destination, header, std::move(message));
             return;
         }
-        countSent(message); // now, so that a frame's figures have it
+        countSent(message); // now, so that the figures of the frame include it even if it has to wait
         if (needsCredit(header.kind))
             flow_.send(destination, std::move(message));
         else
@@ -156,10 +157,10 @@ public:
         return kind == MessageKind::Fragment || kind == MessageKind::FinishedTiles;
     }
 
-    // Waits until the messages that this rank has sent, and that nobody has taken out of an inbox yet, have no more
-    // than poolBytes, or until over(). Runs waiting tasks meanwhile, so that ranks that wait for each other get on.
-    // Returns at once on a thread that cannot make progress. Returns false if nobody takes anything for as long as
-    // `limit`, unless that is 0.
+    // Waits until over(), or until the messages that this rank has sent and no receiver has taken out of its inbox have
+    // at most poolBytes in all. Runs waiting tasks meanwhile, so that ranks that wait for each other get on. Does not
+    // wait on a thread that cannot make progress. Returns false if nothing is taken for as long as `limit`, unless that
+    // is 0.
     bool waitForRoom(FunctionRef<bool()> over, std::chrono::milliseconds limit)
     {
         std::size_t before = flow_.underWay();
@@ -170,7 +171,7 @@ public:
         const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
         const Connection::Hurry hurry(*connection_);
         for (auto lastChange = Clock::now(); !done();) {
-            if (const std::size_t now = flow_.underWay(); now != before) { // also more: another thread has found room
+            if (const std::size_t now = flow_.underWay(); now != before) { // or it has grown: another thread found room
                 before = now;
                 lastChange = Clock::now();
             } else if (limit.count() > 0 && Clock::now() - lastChange > limit) {
@@ -191,8 +192,8 @@ public:
         return true;
     }
 
-    // Throws InvalidArgument on a thread that cannot make the progress that it is going to wait for. Calls that wait
-    // begin with it.
+    // Throws InvalidArgument if the calling thread would have to move messages while it waits, but may not. Calls that
+    // wait begin with this check.
     void requireProgress() const
     {
         if (connection_->needsCaller() && !connection_->mayPoll())
@@ -206,8 +207,9 @@ public:
             ++takenOn_;
     }
 
-    // Returns how many messages of the epoch have been sent and taken, of those that make their receiver do something.
-    // Returns nothing unless this object rests: no task of it is queued or runs, and nothing waits to be sent.
+    // Returns how many messages of the epoch this rank has sent and taken; only those count that make their receiver do
+    // something. Returns nothing unless this object rests: none of its tasks is queued or runs, and nothing waits to be
+    // sent.
     std::optional<Quiescence::Report> countsAtRest()
     {
         const Quiescence::Report counts{sentOn_, takenOn_};
@@ -218,10 +220,10 @@ public:
         }
         if (!flow_.allSent() || !connection_->quiet() || counts.sent != sentOn_ || counts.taken != takenOn_)
             return std::nullopt;
-        return counts; // they did not change while there was no task
+        return counts; // they are the same before and after the check for tasks
     }
 
-    // Takes a message about credit of the current epoch. Returns false if it is another one. Throws Error
+    // Takes a message about credit of the current epoch. Returns false if the message is of another kind. Throws Error
     // (MalformedMessage).
     bool receiveCredit(int source, const MessageHeader& header, const Buffer& message)
     {
@@ -262,8 +264,8 @@ public:
                             bytesOf(message));
     }
 
-    // Keeps the error of a message that could not be read. It may have been for something that this rank has not begun
-    // yet, which then fails: the next frame, or the next reduce().
+    // Keeps the error of a message that could not be read. The message may have been for something that this rank has
+    // not begun yet, which then fails: the next frame, or the next reduce().
     void keepDamage(const ErrorInfo& error)
     {
         const std::lock_guard<std::mutex> lock(damageMutex_);
@@ -275,7 +277,7 @@ public:
         return std::exchange(damage_, std::nullopt);
     }
 
-    // Ends the connection because of a message of rank `source` without which nothing can go on.
+    // Ends the connection, because a message of rank `source` was needed to go on and is of no use.
     void giveUp(int source, ErrorInfo error)
     {
         error.rank = rank();
@@ -293,8 +295,8 @@ public:
         connection_->interrupt();
     }
 
-    // Waits until ready(), which must not take a lock that a caller of notify() holds. Moves messages if no thread
-    // does. Returns false if `deadline` passes before. Throws TransportError.
+    // Waits until ready(), which must not take a lock that a caller of notify() holds. Moves messages itself if no
+    // other thread does. Returns false if `deadline` passes before. Throws TransportError.
     bool wait(FunctionRef<bool()> ready, std::optional<Clock::time_point> deadline = std::nullopt)
     {
         const TraceSpan span(trace_, TraceEvent::Kind::Wait, epoch_);
@@ -304,9 +306,9 @@ public:
         const Connection::Hurry hurry(*connection_);
         std::unique_lock<std::mutex> lock(mutex_);
         if (!connection_->needsCaller()) {
-            // Workers may be short: those of several ranks in one process can all be in waitForRoom(), each for the
-            // others. So this looks for tasks now and then; less often while there are none, as with many ranks in a
-            // process looking takes all the time.
+            // There may be too few workers: those of several ranks in one process can all be in waitForRoom(), waiting
+            // for each other. So this thread looks for tasks now and then. It looks less often while there are none,
+            // because with many ranks in a process looking would take all the time.
             constexpr std::chrono::milliseconds shortest{2}, longest{32};
             for (std::chrono::milliseconds pause = shortest; !over() && !late();) {
                 const auto next = Clock::now() + pause;
@@ -319,14 +321,15 @@ public:
                 lock.lock();
             }
         } else {
-            // A nap takes about 0.1 ms, and a frame waits for some five messages one after the other. But a rank that
-            // is awake takes time from those that it shares a processor with.
+            // This thread stays awake at first, because a nap takes about 0.1 ms, and a frame waits for some five
+            // messages one after the other. But a rank that is awake takes time from the ranks that share its
+            // processor.
             SpinWait spin(std::chrono::microseconds(connection_->isOversubscribed() ? 30 : 1000));
-            // Messages that were just queued must leave also when this is over, such as results for ranks below in the
-            // tree.
+            // Messages that were just queued, such as results for ranks below in the tree, must leave even if the wait
+            // is over.
             while ((!over() || (!failed() && !connection_->quiet())) && !late()) {
                 lock.unlock();
-                // Before a task, as other ranks may wait for messages that this one has queued.
+                // Polls before running a task, as other ranks may wait for messages that this one has queued.
                 const bool moved = connection_->poll();
                 if (executor_->help() || moved)
                     spin.renew();
@@ -344,8 +347,9 @@ public:
     }
 
     // Combines `own` over all ranks, and returns the result. Collective. Waits for all ranks. Throws InvalidArgument as
-    // requireProgress() does, and TransportError; also if a message could not be read that may have been a part of
-    // this, and there is no result within a second, or within peerTimeout if the message came before this call.
+    // requireProgress() does, and TransportError. If a message could not be read, it may have been a part of this
+    // reduction. Then reduce() throws TransportError, too, if there is no result within a second, or within peerTimeout
+    // if the message came before this call; see waitForResult().
     Bytes reduce(Bytes own, ReductionTable::Combine combine)
     {
         requireProgress();
@@ -355,7 +359,7 @@ public:
         };
         const auto result = std::make_shared<Result>(); // outlives this call if the transport fails
         const std::int64_t number = reductionCount_++;
-        auto damage = takeDamage(); // now: the others go on when they have this rank's part
+        auto damage = takeDamage(); // now: with this rank's part the others go on to what comes next
         checkLeft();
         const Connection::Expecting expecting(*connection_);
         try {
@@ -365,7 +369,7 @@ public:
                                   result->there = true;
                                   notify();
                               });
-        } catch (const Error& e) { // from an earlier message of a rank below in the tree
+        } catch (const Error& e) { // an earlier message of a rank below in the tree is malformed
             giveUp(-1, e.info());
         }
         waitForResult([&] { return result->there.load(); }, number == 0, std::move(damage));
@@ -394,10 +398,11 @@ public:
         return reduced;
     }
 
-    // Returns the bytes of each rank, by rank; their numbers may differ. Collective. Waits and throws as allReduce().
+    // Returns the bytes of each rank, indexed by rank; their sizes may differ. Collective. Waits and throws as
+    // allReduce().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call)
     {
-        ByteWriter mine = partOf(call); // then of each rank: which it is, the size, the bytes
+        ByteWriter mine = partOf(call); // then, for each rank: its number, the size, the bytes
         mine.put(static_cast<std::int32_t>(rank()));
         mine.put(static_cast<std::uint64_t>(own.size()));
         mine.putBytes(own.data(), own.data() + own.size());
@@ -407,7 +412,7 @@ public:
         });
         std::vector<std::vector<std::byte>> result;
         ByteReader in = partIn(all);
-        for (int from = 0; from < size(); ++from) { // in order, as they were combined
+        for (int from = 0; from < size(); ++from) { // they were combined in this order
             const auto whose = in.get<std::int32_t>();
             const auto byteCount = in.get<std::uint64_t>();
             in.require(whose == from && byteCount <= in.left());
@@ -419,8 +424,8 @@ public:
     }
 
 private:
-    // The beginning of what this rank brings to a call: the lowest rank that it is of, and the call's name. Once ranks
-    // have turned out to make different calls: -1, and a text.
+    // Begins the part that this rank brings to a call, with its rank and the call's name. In a combined part the lowest
+    // of the ranks stands there; or -1 and a text, if the ranks have made different calls.
     ByteWriter partOf(const std::string& call) const
     {
         ByteWriter out;
@@ -429,7 +434,8 @@ private:
         return out;
     }
 
-    // Reduces what ranks bring to a call. `combine(a, b, out)` combines what stands behind the call's name.
+    // Reduces the parts that ranks bring to a call. `combine(a, b, out)` combines what follows the call's name in two
+    // parts.
     Bytes reduceParts(ByteWriter&& mine, std::function<void(ByteReader&, ByteReader&, ByteWriter&)> combine)
     {
         return reduce(std::move(mine).bytes(), [combine = std::move(combine)](const Bytes& a, const Bytes& b) {
@@ -452,8 +458,8 @@ private:
         });
     }
 
-    // A reader of what all have brought, behind the call's name. Throws InvalidArgument if they have made different
-    // calls.
+    // Returns a reader of the combined part of all ranks, behind the call's name. Throws InvalidArgument if the ranks
+    // have made different calls.
     ByteReader partIn(const Bytes& result) const
     {
         ByteReader in(result);
@@ -464,19 +470,20 @@ private:
         return in;
     }
 
-    // A message that could not be read may have been a part of this reduction, if others are not here yet, or of the
-    // next, if they are through. The first reduction is that of its owner's constructor. `damage`: from before.
+    // A message that could not be read may have been a part of this reduction, if some ranks have not entered it yet,
+    // or of the next, if the other ranks are through. The first reduction is the one in the constructor of the
+    // mailbox's owner. `damage`: the error of a message that came before this reduction.
     void waitForResult(FunctionRef<bool()> ready, bool isFirst, std::optional<ErrorInfo> damage)
     {
-        constexpr std::chrono::milliseconds soon{1000}; // when all seem to be here
+        constexpr std::chrono::milliseconds soon{1000}; // when all ranks seem to be here
         const std::chrono::milliseconds late = connection_->config().peerTimeout;
         if (!isFirst && late.count() == 0)
-            damage.reset(); // that is no limit; what is damaged from now on sets one
+            damage.reset(); // no limit; a message that is damaged from now on sets one
         const bool wasBefore = damage.has_value();
         std::optional<Clock::time_point> deadline;
         if (damage)
             deadline = Clock::now() + (isFirst ? soon : late);
-        do { // also if the parts of all were here: with Progress::Caller wait() sends the result on
+        do { // even with the result: with Progress::Caller it is wait() that sends it on
             if (!wait([&] { return ready() || (!damage && isDamaged()); }, deadline)) {
                 giveUp(damage->from, *damage);
             } else if (!damage && (damage = takeDamage())) {
@@ -516,8 +523,8 @@ private:
         Clock::time_point last_ = Clock::now();
     };
 
-    // For a moment a waiting thread runs tasks and moves messages itself: threads that it would have to wake may wait
-    // for a core.
+    // For a moment a waiting thread runs tasks and moves messages itself, because threads that it would have to wake
+    // may have to wait for a core.
     void waitAwake(FunctionRef<bool()> over)
     {
         if (!connection_->hasProgressThread() || connection_->needsCaller())
@@ -530,7 +537,8 @@ private:
         }
     }
 
-    // Runs task(*this) on the executor. With 8 bytes of captures it takes no memory: a std::function holds 16.
+    // Runs task(*this) on the executor. A task with at most 8 bytes of captures needs no memory from the heap: a
+    // std::function holds 16, and `this` takes 8.
     template <class Task>
     void submit(Task task)
     {
@@ -567,8 +575,8 @@ private:
             ++sentOn_;
     }
 
-    // Whether a message makes its receiver do something for its frame. Credit does not: it only lets waiting messages
-    // go, which count themselves.
+    // Whether a message makes its receiver do something for its frame. Credit does not: it only releases waiting
+    // messages, which are counted themselves.
     static bool carriesOn(MessageKind kind, const Buffer& message)
     {
         switch (kind) {
@@ -583,14 +591,14 @@ private:
     {
         return kind == MessageKind::ReduceUp || kind == MessageKind::ReduceDown;
     }
-    // Of reduce(), or of no purpose at all.
+    // Whether a message is of reduce(), or of a reduction without a scope.
     static bool isOwnReduction(MessageKind kind, const Buffer& message)
     {
         return isReduction(kind)
                && (message.size() < sizeof(MessageHeader) + sizeof(std::uint32_t) || scopeOf(message) == ownScope);
     }
 
-    // To another rank, now that it may go.
+    // Sends a message to another rank; it needs no credit, or has got it.
     void pass(int destination, Buffer&& message)
     {
         TraceSpan span(trace_, TraceEvent::Kind::Send, epoch_);
@@ -612,20 +620,21 @@ private:
         event->sequence = header.sequence;
     }
 
-    // The body of the message: how many calls of reduce() the rank has begun, and how many exceptions are passing
-    // there.
+    // The body of a Leaving message: how many calls of reduce() its sender has begun, and how many exceptions are
+    // passing there.
     struct Leaving {
         std::int64_t reductions, exceptions;
     };
 
-    // A neighbour in the tree of reductions that has destroyed its object, and the last epoch that it has begun.
+    // A neighbour in the tree of reductions that has destroyed its object, and the last epoch that it had begun.
     struct Left {
         int rank;
         std::int64_t epoch;
         Leaving how;
     };
 
-    // Gives up if this rank has begun something in which a rank that has left takes no part: it would never end.
+    // Gives up if this rank has begun something in which a rank that has left does not take part, because it would
+    // never end.
     void checkLeft()
     {
         std::vector<Left> all;
@@ -702,14 +711,14 @@ private:
                 }
             }
         } catch (const Error& e) {
-            giveUp(a.source, e.info()); // a rank waits for this in any case
+            giveUp(a.source, e.info()); // whichever it was, some rank waits for it
             return;
         }
         handler_.incoming(a.source, a.header, std::move(a.message));
     }
 
-    // Checks the number of a message of reduce(). It belongs to the last one that this rank has begun, or to the next
-    // if this rank has passed on the result of the last.
+    // Checks the number of a message of reduce(). It must be that of the last reduction that this rank has begun, or of
+    // the next one if this rank has passed on the result of the last.
     void requireCanBe(const MessageHeader& header)
     {
         const std::int64_t begun = reductionCount_, number = header.number;
@@ -737,7 +746,7 @@ private:
     ReductionTable reductions_;
     std::atomic<std::int64_t> bytesSent_{0}, messagesSent_{0};
     std::atomic<std::uint64_t> sentOn_{0}, takenOn_{0}; // see countsAtRest()
-    std::atomic<std::int64_t> reductionCount_{0};       // of reduce()
+    std::atomic<std::int64_t> reductionCount_{0};       // calls of reduce() so far
     std::mutex damageMutex_;
     std::optional<ErrorInfo> damage_; // under damageMutex_
 
