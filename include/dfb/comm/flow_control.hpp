@@ -1,11 +1,12 @@
-// FlowControl: how much a rank may send to another before that one has room again: credit in bytes, from one
-// pool per receiver.
+// FlowControl: limits how much a rank may send to another one before the receiver has room again. The limit is credit
+// in bytes, from one pool per receiver.
 //
-// Each sender has a part of half the pool without asking. It asks for more (CreditRequest) and gets it from the other
-// half, in the order of asking and always for whole messages, so that credit that is granted is used and comes back. A
-// credit returns when the receiver has taken the message out of its inbox. Thus the messages on the way to a rank and
-// in its inbox never exceed its pool, however many senders there are. Counts are running totals within an epoch (a
-// frame): a Credit that overtakes another does no harm, and nothing that got lost outlives its epoch.
+// Half of a pool is divided among the senders, who use their parts without asking. A sender that needs more asks for it
+// (CreditRequest) and gets it from the other half, in the order of asking and always for whole messages, so that credit
+// that is granted is used and comes back. A credit returns when the receiver has taken the message out of its inbox.
+// Thus the messages on the way to a rank and in its inbox never exceed its pool, however many senders there are. Counts
+// are running totals within an epoch (a frame): a Credit that overtakes another does no harm, and what got lost has no
+// effect beyond its epoch.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -29,7 +30,7 @@ public:
     // The bodies of CreditRequest and Credit messages.
     struct Request {
         std::uint64_t first = 0; // the total that is needed for the first message that waits
-        std::uint64_t all = 0;   // and for as many as should come at once
+        std::uint64_t all = 0;   // the total for as many as should come at once
     };
     struct Credit {
         std::uint64_t granted = 0;  // the total that may be sent
@@ -65,9 +66,9 @@ public:
         matters_ = nullptr;
     }
 
-    // From now on only messages of this epoch count for which `matters(message)` is true. Forgets the others that wait,
-    // and drops those that still come. `keepsAsked`: what credit was asked for still goes, as the receiver sets room
-    // aside for it that others need.
+    // From now on only those messages of this epoch count for which `matters(message)` is true. Drops others that wait,
+    // and those that are given to send() later. `keepsAsked`: messages for which credit was asked are kept, because the
+    // receiver sets aside room for them that other senders need.
     void drop(std::function<bool(const Buffer&)> matters, bool keepsAsked)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -120,14 +121,14 @@ public:
             callbacks_.transmit(destination, std::move(message));
     }
 
-    // Bytes that were given to send() and that no receiver has taken out of its inbox as far as is known.
+    // Bytes that were given to send() and that, as far as is known, no receiver has taken out of its inbox.
     std::size_t underWay() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         return underWay_;
     }
 
-    // In words: which ranks have not taken how much.
+    // A text that says which ranks have not taken how many bytes.
     std::string notTaken() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -143,7 +144,8 @@ public:
         return text;
     }
 
-    // Throws Error (MalformedMessage) for more bytes than its pool, or than were sent.
+    // Takes a Credit of rank `from`. Throws Error (MalformedMessage) if it grants more bytes than a pool has, or says
+    // that more were consumed than were sent.
     void credited(int from, const Credit& credit)
     {
         if (credit.granted > credit.consumed && credit.granted - credit.consumed > pool_)
@@ -184,14 +186,14 @@ public:
         peakInboxBytes_ = std::max(peakInboxBytes_, inboxBytes_);
     }
 
-    // It is of another epoch, and has been thrown away.
+    // A message that has arrived is of another epoch, and has been thrown away.
     void discarded(std::size_t byteCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         inboxBytes_ -= byteCount;
     }
 
-    // It has been taken out.
+    // A message of this epoch has been taken out of the inbox.
     void consumed(int source, std::size_t byteCount)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -199,8 +201,8 @@ public:
         in.consumed += byteCount;
         inboxBytes_ -= byteCount;
         updateExtra(in);
-        // Not for each message. But the bytes that no sender has been told of must stay below its part of the pool, as
-        // it may be waiting for them.
+        // A Credit is not sent for every message. But the bytes that a sender has not been told of must stay below its
+        // part of the pool, as it may be waiting for them.
         if (in.consumed - in.told >= allowance_ / 2)
             grant(source, in, in.consumed + allowance_);
         serve(lock);
@@ -219,7 +221,7 @@ public:
             failMalformed("a request for more than the largest message", static_cast<std::int64_t>(pool_ / 4),
                           static_cast<std::int64_t>(request.first - in.granted));
         if (request.first <= in.granted || (in.asks() && request.first <= in.request.first))
-            return; // it has its answer, or a later one has overtaken it
+            return; // it has been answered, or a later request has overtaken it
         if (!in.asks())
             asking_.push(source);
         in.request = request;
@@ -243,7 +245,7 @@ private:
     };
     struct Incoming {
         std::uint64_t granted = 0, consumed = 0; // totals
-        std::uint64_t told = 0;                  // of consumed
+        std::uint64_t told = 0;                  // how much of `consumed` the sender was told
         std::uint64_t extra = 0;                 // granted beyond the allowance and not consumed
         Request request;
 
@@ -272,7 +274,7 @@ private:
         return place->second;
     }
 
-    // For the first message that waits, and as many of the next as fit in a quarter of the pool.
+    // Asks for the first message that waits, and for as many of the next as fit in a quarter of the pool with it.
     Request requestOf(Outgoing& out) const
     {
         Request request;
@@ -309,7 +311,8 @@ private:
         grants_.push({source, {in.granted, in.consumed}});
     }
 
-    // Answers the senders that have asked, the first one first, as far as the pool reaches; then tells them.
+    // Grants credit to the senders that have asked, in that order, as far as the pool reaches; then sends them their
+    // Credits.
     void serve(std::unique_lock<std::mutex>& lock)
     {
         while (!asking_.empty()) {
@@ -336,13 +339,13 @@ private:
 
     const std::size_t pool_, allowance_;
     mutable std::mutex mutex_;
-    std::size_t free_; // of the half that is granted on request: what is nobody's `extra`
-    // Of each rank since it was first met:
+    std::size_t free_; // bytes of the half that is granted on request which are in nobody's `extra`
+    // For each rank, from when it was first met:
     std::unordered_map<int, Peer> peers_;
     Fifo<int> asking_;
-    Fifo<std::pair<int, Credit>> grants_; // to be told
+    Fifo<std::pair<int, Credit>> grants_; // not yet sent to their ranks
     std::size_t underWay_ = 0, inboxBytes_ = 0, peakInboxBytes_ = 0;
-    std::function<bool(const Buffer&)> matters_; // null: all does
+    std::function<bool(const Buffer&)> matters_; // null: all messages matter
     Callbacks callbacks_;
 };
 

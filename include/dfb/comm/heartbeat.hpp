@@ -1,7 +1,7 @@
-// Heartbeat: which ranks this one listens for, when to ask them for a sign of life, and which of them is lost. It only
-// says so: the connection sends and receives.
+// Heartbeat: decides which ranks this one listens for, when to ask them for a sign of life, and which of them is lost.
+// The connection sends and receives the messages for it.
 //
-// Needed as MPI tells nobody that a rank has ended or hangs: a receive from it just never completes.
+// It is needed because MPI tells nobody that a rank has ended or hangs: a receive from it just never completes.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -14,13 +14,13 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Minutes, as a rank may be held for a while and then go on: stopped by a batch system, by swapping, in a debugger. How
+// Some minutes, as a rank may be held up for a while and then go on: by a batch system, by swapping, in a debugger. How
 // long it renders does not matter, since its progress thread answers meanwhile.
 inline constexpr std::chrono::milliseconds defaultPeerTimeout{300000};
 
 namespace detail {
 
-// 24 days. Clocks count nanoseconds, so that times of centuries overflow.
+// 24 days. Clocks count nanoseconds, so times of centuries would overflow.
 inline constexpr std::chrono::milliseconds longestTimeout{std::numeric_limits<std::int32_t>::max()};
 
 class Heartbeat {
@@ -28,9 +28,10 @@ public:
     using Time = std::chrono::steady_clock::time_point;
     using Duration = Time::duration;
 
-    // `neighbours`: the ranks that this one listens for, and they for it: those in the tree of reductions, whose
-    // messages they get in each frame anyway. Each rank has one at least and no more than log2 of their number, and
-    // whichever ranks are lost, one of them has a neighbour that is not. `timeout` 0: it listens for nobody.
+    // `neighbours`: the ranks that this one listens for, as they do for it. They are its neighbours in the tree of
+    // reductions, whose messages it gets in each frame anyway. Each of several ranks has at least one neighbour, and
+    // none has more than log2 of their number, rounded up. Whichever ranks are lost, one of them has a neighbour that
+    // is not. `timeout` 0: this rank listens for nobody.
     Heartbeat(const std::vector<int>& neighbours, std::chrono::milliseconds timeout) : timeout_(timeout)
     {
         for (const int rank : neighbours)
@@ -40,13 +41,13 @@ public:
 
     bool isOn() const noexcept { return !peers_.empty(); }
 
-    // Without a message for so long, a rank is asked; and it must answer sooner than that.
+    // A rank that has sent nothing for this long is asked. It must answer in less time than this.
     Duration patience() const noexcept { return timeout_ / 4; }
     // How often to call due().
     Duration interval() const noexcept { return timeout_ / 32; }
 
-    // A message has come from that rank. `promises`: it says by it that it answers at any time; before that nobody
-    // counts on it.
+    // A message has come from that rank. `promises`: by this message the rank says that it answers at any time. Until
+    // it has said so, it is neither asked nor counted as lost.
     void heard(int rank, bool promises)
     {
         for (Peer& peer : peers_)
@@ -62,9 +63,9 @@ public:
         int lost = -1; // nothing has been heard of this rank for the whole time-out
     };
 
-    // Returns the messages that are due, for a rank that has polled since the last call. Time counts only while the
-    // rank is `expecting` messages. It does not count after a long time without a call: this rank was then held up
-    // itself, and messages of the others may still wait to be received.
+    // Returns whom to ask, and which rank is lost. This rank must have polled since the last call. Time counts only
+    // while this rank is `expecting` messages. It does not count if the last call was long ago: this rank was then held
+    // up itself, and messages of the others may still wait to be received.
     Due due(Time now, bool expecting)
     {
         const bool wasHere = isExpecting_ && now - last_ <= patience();
@@ -89,7 +90,7 @@ private:
     struct Peer {
         int rank;
         bool heard = false, promises = false;
-        Time since{}, asked{}; // nothing was heard since; or asked last
+        Time since{}, asked{}; // since when nothing was heard; when it was last asked
     };
 
     Duration timeout_;

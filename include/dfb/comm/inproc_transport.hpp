@@ -143,7 +143,7 @@ public:
         Endpoint& peer = endpoint(destination);
         std::lock_guard<std::mutex> lock(peer.mutex);
         if (peer.stopped)
-            return; // it has its verdict and left: nothing that it could still need
+            return; // it has its verdict and has left, and needs no more messages
         if (peer.handler)
             peer.handler->receive(rank_, std::move(message));
         else
@@ -183,7 +183,7 @@ inline void runRanks(int rankCount, const std::function<void(InprocCommunicator)
     const auto hub = std::make_shared<detail::InprocHub>(rankCount);
     std::mutex mutex;
     std::exception_ptr first;
-    const auto leave = [&](int rank, const std::string& why) { // in a handler of an exception
+    const auto leave = [&](int rank, const std::string& why) { // called in a catch block
         {
             const std::lock_guard<std::mutex> lock(mutex);
             if (!first)

@@ -1,6 +1,6 @@
-// ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a
-// few microseconds after the last message, then naps, the longer the less comes, and shorter while somebody waits.
-// Between polls it calls a function for work by the clock, such as the heartbeat.
+// ProgressThread: calls poll() of a link so that messages move while the renderer works. It polls for a few
+// microseconds after the last message, then naps. The naps are longer if less comes, and shorter while somebody waits.
+// Between polls it calls a function for work that is due at certain times, such as the heartbeat.
 #pragma once
 
 #include <dfb/comm/transport.hpp>
@@ -25,8 +25,8 @@ class ProgressThread {
 public:
     using Clock = std::chrono::steady_clock;
 
-    // Does not start yet. `link` must live until stop(). `between` is called by the thread when there has been a
-    // poll since the last time; with nothing to do it sleeps for `longestNap` at most.
+    // Does not start the thread yet. `link` must live until stop(). The thread calls `between` if there has been a poll
+    // since it did so last. With nothing to do it sleeps for `longestNap` at most.
     ProgressThread(Link& link, Clock::duration longestNap, std::function<void(Clock::time_point now)> between)
         : link_(link), longestNap_(longestNap), between_(std::move(between))
     {
@@ -40,7 +40,7 @@ public:
         thread_ = std::thread([this] { run(); });
     }
 
-    // After this poll() is not called any more; the other members may be.
+    // Ends the thread: after this it does not call poll() any more. The other members may still be called.
     void stop()
     {
         stop_ = true;
@@ -51,7 +51,8 @@ public:
 
     bool running() const noexcept { return thread_.joinable(); }
 
-    // Polls on the calling thread, unless another one is doing so; true if anything moved. From any thread that may.
+    // Polls on the calling thread, unless another thread is polling. Returns whether anything moved. From any thread
+    // that may call poll() of the link.
     bool tryPoll()
     {
         const std::unique_lock<std::mutex> lock(pollMutex_, std::try_to_lock);
@@ -62,7 +63,8 @@ public:
         return moved;
     }
 
-    // Whether messages may come in: if not, and nothing waits to be sent, the thread sleeps. From any thread.
+    // Says whether messages may come in; each true is followed by one false. If none may, and nothing waits to be sent,
+    // the thread sleeps. From any thread.
     void expectMessages(bool expect)
     {
         expecting_ += expect ? 1 : -1;
@@ -71,8 +73,8 @@ public:
     }
     bool expectsMessages() const noexcept { return expecting_ > 0; }
 
-    // Begins (true) or ends (false) that a thread which calls tryPoll() all the time stands in for this one, which
-    // polls every 2 ms meanwhile. Calls nest and must balance. From any thread.
+    // True: a thread that calls tryPoll() all the time now stands in for this one, which meanwhile polls only every few
+    // milliseconds. False: it does so no more. Calls nest and must balance. From any thread.
     void standIn(bool more)
     {
         if (more) {
@@ -87,10 +89,11 @@ public:
             standInLeft_.notify_one();
     }
     bool hasStandIn() const noexcept { return standIns_ > 0; }
-    // Whether messages are moved by threads that call.
+    // Whether threads that wait must poll: this one does not run, or has a stand-in.
     bool needsCaller() const noexcept { return !running() || hasStandIn(); }
 
-    // Somebody waits for messages from now on, or no more; as often false as true. From any thread.
+    // True: from now on somebody waits for messages. False: no more. Each true is followed by one false. From any
+    // thread.
     void hurry(bool more)
     {
         if (more && waiting_++ == 0)
@@ -110,7 +113,7 @@ private:
         const auto between = [&](int shortest, int longest) {
             return std::clamp<Clock::duration>(idle / 8, microseconds(shortest), microseconds(longest));
         };
-        // The network library may need more calls to finish messages that it has taken.
+        // Only after a while, as the network library may need more calls to finish messages that it has taken.
         if (!expectsMessages() && quiet && idle > std::chrono::milliseconds(10))
             return longestNap_;
         if (link_.wakesOnArrival())
