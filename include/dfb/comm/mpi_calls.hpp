@@ -24,8 +24,8 @@ inline const char* mpiLevelName(int level)
                                             : "MPI_THREAD_MULTIPLE";
 }
 
-// Throws TransportError unless the call was successful. `rank`: this one; `peer`: whom it was about, or -1. That one
-// may be the cause: over a network MPI can find that a rank is gone before the library does.
+// Throws TransportError unless the call was successful. `rank`: this rank. `peer`: the rank that the call was about, or
+// -1. It may be the cause: over a network MPI can find that a rank is gone before the library does.
 inline void checkMpi(int code, const char* call, int rank, int peer = -1)
 {
     if (code == MPI_SUCCESS)
@@ -50,8 +50,8 @@ inline bool mpiSays(int (*ask)(int*))
     return answer != 0;
 }
 
-// Ends the process, and says why, if MPI_Finalize() is called while this lives. For transports that another thread
-// polls: it would call MPI meanwhile. (MPI_Finalize() deletes the attributes of MPI_COMM_SELF first.)
+// Ends the process, and says why, if MPI_Finalize() is called while this object lives. For transports that another
+// thread polls, which might call MPI at that time. (MPI_Finalize() deletes the attributes of MPI_COMM_SELF first.)
 class NoFinalize {
 public:
     explicit NoFinalize(bool isNeeded)

@@ -1,7 +1,7 @@
 // MpiRanks: the ranks of an MpiTransport, which find each other when it is made. They duplicate the caller's
 // communicator, compare the formats of their packets, and share memory with the ranks of their node.
 //
-// Ranks of every version of this file first duplicate the communicator and gather the 8 bytes of their packetFormat on
+// In every version of this file, ranks first duplicate the communicator and gather the 8 bytes of their packetFormat on
 // it. No version may change that.
 #pragma once
 
@@ -34,12 +34,12 @@ public:
     // A rank as this one sees it.
     struct Other {
         std::shared_ptr<NodeMemory> itsMemory; // null: this rank does not see it
-        bool seesMine = false;                 // my memory
+        bool seesMine = false;                 // whether it sees the memory of this rank
     };
 
     // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator; TransportError
     // on all ranks if they were built with different packet formats, and on one alone if a collective of MPI fails
-    // there. What else goes wrong on a rank, all learn in firstFailed().
+    // there. Of anything else that goes wrong on a rank, all ranks learn in firstFailed().
     MpiRanks(MPI_Comm communicator, MemoryPool& pool)
     {
         if (communicator == MPI_COMM_NULL)
@@ -61,7 +61,7 @@ public:
     }
 
     // Runs a step that a rank does alone. A rank that fails does no more such steps. It still takes part in the steps
-    // of all ranks, as they wait for it there, until it can tell them.
+    // that all ranks do together, as they wait for it there, until firstFailed() tells them.
     void attempt(FunctionRef<void()> step)
     {
         if (wrong_[0] != 0)
@@ -75,7 +75,7 @@ public:
         }
     }
 
-    // The first rank on which a step has failed, for reason(); size() if there is none. Collective.
+    // Returns the first rank on which a step has failed, for reason(), or size() if there is none. Collective.
     int firstFailed()
     {
         const int mine = wrong_[0] != 0 ? rank_ : size_;
@@ -92,7 +92,7 @@ public:
     }
     const char* reason() const noexcept { return wrong_.data(); }
 
-    MPI_Comm comm() const noexcept { return comm_; }   // the duplicate; MPI_COMM_NULL after the two below
+    MPI_Comm comm() const noexcept { return comm_; }   // the duplicate; MPI_COMM_NULL after free() or abandon()
     void free() { MPI_Comm_free(&comm_); }             // collective
     void abandon() noexcept { comm_ = MPI_COMM_NULL; } // MPI keeps it
     int rank() const noexcept { return rank_; }
@@ -102,7 +102,8 @@ public:
     // This rank's memory, if another rank sees it; else null.
     const std::shared_ptr<NodeMemory>& memory() const noexcept { return memory_; }
     bool doAllSeeMine() const noexcept { return doAllSeeMine_; }
-    // How many ranks of this node, with this one, may run on this rank's processors; and how many those are.
+    // How many ranks of this node, including this one, may run on this rank's processors; and the number of these
+    // processors.
     int sharingRanks() const noexcept { return sharingRanks_; }
     int processors() const noexcept { return processors_; }
 
@@ -118,7 +119,7 @@ private:
         check(MPI_Comm_size(comm_, &size_), "MPI_Comm_size");
     }
 
-    // One of each rank, on all ranks.
+    // Returns the values of all ranks, on all ranks.
     template <class T>
     std::vector<T> gather(const T& mine) const
     {
@@ -223,7 +224,7 @@ private:
     std::vector<Other> others_;
     std::shared_ptr<NodeMemory> memory_;
     bool doAllSeeMine_ = false;
-    // Why this rank can have no transport; empty if nothing is wrong. Takes no memory, of which there may be none.
+    // Why this rank can have no transport; empty if nothing is wrong. An array, as there may be no memory for a string.
     std::array<char, 512> wrong_{};
 };
 

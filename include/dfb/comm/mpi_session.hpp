@@ -25,10 +25,9 @@ DFB_NAMESPACE_BEGIN
 // The constructor's thread is the one that may call MPI below MPI_THREAD_SERIALIZED (see Progress).
 class MpiSession {
 public:
-    // Initialises MPI at this thread level or a higher one; without `level` at the highest that it has. With
+    // Initialises MPI at this thread level or a higher one; without `level` at the highest that the library has. With
     // MPI_THREAD_MULTIPLE messages move by themselves (see Progress). Throws TransportError if MPI has been initialised
-    // or finalised before, or does not have the level. Collective over MPI_COMM_WORLD; waits as
-    // MPI_Init_thread() does.
+    // or finalised before, or does not have the level. Collective over MPI_COMM_WORLD; waits as MPI_Init_thread() does.
     MpiSession(int& argc, char**& argv, std::optional<int> level = std::nullopt);
 
     MpiSession(const MpiSession&) = delete;
@@ -43,7 +42,7 @@ public:
     // ever. The destructor then waits for nobody, and when the process exits, it aborts the job with code 1.
     void giveUp() noexcept { isGivenUp_ = true; }
 
-    // Of MPI_COMM_WORLD. Any thread. They wait for nothing.
+    // Rank and size in MPI_COMM_WORLD, and the level. Any thread may call these members. They wait for nothing.
     int rank() const noexcept { return rank_; }
     int size() const noexcept { return size_; }
     int level() const noexcept { return level_; } // that MPI was initialised at
@@ -89,8 +88,9 @@ DFB_COMPILED_ONCE MpiSession::~MpiSession()
         abortJob();
 }
 
-// Where one rank's exception is another's, the ranks come here together. Waits until all can have said why, half a
-// second at most. Then waits for the launcher: it may drop output that a rank has written just before MPI_Abort.
+// If all ranks end with the same exception, they come here together. So this waits until all can have reported it, half
+// a second at most. Then it waits for the launcher, which may drop output that a rank has written just before
+// MPI_Abort.
 DFB_COMPILED_ONCE void MpiSession::abortJob()
 {
     if (detail::mpiSays(MPI_Finalized))
@@ -116,9 +116,10 @@ DFB_COMPILED_ONCE void MpiSession::finalize()
     MPI_Finalize();
 }
 
-// MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each waits for the others to answer
-// the rest in its connections, but a rank that has got further answers no more. With no connection in use, and
-// nothing new on them for a while, it does not. Beyond `most` ranks, opening all connections would cost more than that.
+// MPI_Finalize of MPICH 4 hangs now and then where ranks are connected by TCP: each rank waits for the others to answer
+// what is left in its connections, but a rank that has got further answers no more. It does not hang if no connection
+// is in use and nothing new has come on them for a while. With more than `most` ranks, opening all connections would
+// cost too much.
 DFB_COMPILED_ONCE void MpiSession::partFromAll()
 {
 #if defined(MPICH_VERSION)

@@ -1,8 +1,8 @@
 // MpiTransport: ranks are MPI processes.
 //
-// All MPI calls are made by the constructor, poll() and stop(), and none of them blocks, because MPI libraries spin
-// while they block: a caller that has to wait tests and naps. Works on a duplicate of the caller's communicator; never
-// initialises or finalises MPI.
+// All MPI calls are made by the constructor, the destructor, poll(), stop() and abort(), and none of them waits in a
+// call that blocks, because MPI libraries spin there: a caller that has to wait tests and naps. Works on a duplicate of
+// the caller's communicator; never initialises or finalises MPI.
 //
 // Small messages to one rank travel together, in packets (comm/packet.hpp) of at most 8 KiB, which the libraries send
 // without asking the receiver first. A larger message is announced in a packet. To a rank of the same node the packet
@@ -44,15 +44,15 @@ class MpiTransport {
 public:
     using Communicator = MPI_Comm;
 
-    static constexpr int postedPackets = 8;                         // receives; their memory is said above
+    static constexpr int postedPackets = 8;                         // receives of packets posted at a time
     static constexpr std::size_t chunkBytes = std::size_t(1) << 30; // the most that one call sends: counts are ints
 
-    // Collective over `communicator`. Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator. Throws
-    // TransportError if MPI is not initialised, or is finalised; and on all ranks if they were built with different
-    // packet formats, or if one of them cannot make its transport, with its rank and the reason: as one where MPI was
-    // initialised below MPI_THREAD_MULTIPLE and `progress` is Thread. The others cannot be told, and wait, only if a
-    // collective of MPI fails on one rank, or finds no memory there for its result. Below MPI_THREAD_SERIALIZED to be
-    // called by the thread that initialised MPI.
+    // Collective over `communicator`. Below MPI_THREAD_SERIALIZED it must be called by the thread that initialised MPI.
+    // Throws InvalidArgument for MPI_COMM_NULL or an intercommunicator. Throws TransportError if MPI is not
+    // initialised, or is finalised. Throws TransportError on all ranks if they were built with different packet
+    // formats, or if one of them cannot make its transport; the error then has that rank and the reason. One such
+    // reason is that MPI was initialised there below MPI_THREAD_MULTIPLE and `progress` is Thread. Only if a collective
+    // of MPI fails on one rank, or finds no memory there for its result, the others cannot be told, and wait.
     MpiTransport(const Communicator& communicator, std::shared_ptr<MemoryPool> pool, Progress progress)
         : onlyThread_(onlyThread()),
           noFinalize_(progress != Progress::Caller && detail::mpiLevel() == MPI_THREAD_MULTIPLE),
@@ -79,7 +79,7 @@ public:
             release();
     }
 
-    // Only where any thread may call MPI while others do. False, too, if MPI is not there: the constructor says why.
+    // True if any thread may call MPI while others do. Also false if MPI is not there: the constructor says why.
     static bool mayHaveThread(const Communicator&) noexcept
     {
         int level = MPI_THREAD_SINGLE;
@@ -94,33 +94,35 @@ public:
     int sharingRanks() const noexcept { return ranks_.sharingRanks(); }
     // Whether messages to that rank stay where they are, in memory that it sees.
     bool lendsTo(int other) const noexcept { return ranks_[other].seesMine; }
-    // Where a block of the pool lies for ranks that see it; -1: nowhere.
+    // The place of a block of the pool in the memory that other ranks see; -1: it is not there.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         static_assert(detail::NodeMemory::alignment == bytesOfPlace);
         const auto& memory = ranks_.memory();
         return memory && memory->holds(block) ? memory->placeOf(block) : -1;
     }
-    // The block of another rank that lies there, as long as this lives; null: this rank does not see it.
+    // The block at a place in another rank's memory, valid as long as this lives; null: this rank does not see that
+    // memory.
     std::byte* blockAt(int other, std::int32_t place, std::size_t byteCount) const noexcept
     {
         const auto& memory = ranks_[other].itsMemory;
         return memory ? memory->at(place, byteCount) : nullptr;
     }
     bool needsPolling() const noexcept { return true; }
-    // Below MPI_THREAD_SERIALIZED only the thread that initialised MPI.
+    // Below MPI_THREAD_SERIALIZED only the thread that initialised MPI may.
     bool mayPoll() const noexcept
     {
         return onlyThread_ == std::thread::id() || onlyThread_ == std::this_thread::get_id();
     }
     bool wakesOnArrival() const noexcept { return false; }
-    // Longer where ranks share cores: waking up takes the core from one that computes. Long naps are as they are. Where
-    // all that a rank waits for comes from this node, its doorbell ends the nap.
+    // Naps are longer where ranks share cores, because waking up takes the core from a rank that computes. Naps of at
+    // least 10 ms keep their length. If all that this rank waits for comes from this node, naps are long, since the
+    // doorbell ends them.
     void nap(std::chrono::nanoseconds limit)
     {
         napLimit_ = limit;
         const bool isAwaiting = limit < std::chrono::milliseconds(1);
-        if (Clock::now() - lastWake_.load() < 2 * wakePause) // then send() may not end it
+        if (Clock::now() - lastWake_.load() < 2 * wakePause) // then send() may not end this nap
             limit = std::min(limit, wakePause);
         if (limit < std::chrono::milliseconds(10))
             limit = limit * oversubscription_ / 4;
@@ -151,8 +153,8 @@ public:
         return outbox_.empty() && !sending_;
     }
 
-    // A failure is told to the other ranks, whose poll() then fails with the same error: they would wait for this one.
-    // Afterwards nothing is sent but that, and nothing received.
+    // If it fails, it tells the other ranks, which would wait for this one; their poll() then fails with the same
+    // error. Afterwards nothing is sent but that, and nothing received.
     bool poll()
     {
         if (failed_)
@@ -160,8 +162,8 @@ public:
         return !failed_ && guarded([this] { return move(); });
     }
 
-    // Orderly it is collective: serves the other ranks until all have called it, then goes on until all messages have
-    // come; MPI has nothing left of this transport then.
+    // An orderly stop is collective: it serves the other ranks until all have called stop(), then goes on until all
+    // messages have come. MPI has nothing left of this transport then.
     void stop(bool orderly)
     {
         if (detail::mpiSays(MPI_Finalized)) {
@@ -174,7 +176,7 @@ public:
         abandon();
     }
 
-    // Ends all ranks of MPI_COMM_WORLD: for another communicator MPICH first waits for its ranks, also for dead ones.
+    // Ends all ranks of MPI_COMM_WORLD. For another communicator MPICH first waits for its ranks, even for dead ones.
     [[noreturn]] void abort(const std::string& text)
     {
         std::fprintf(stderr, "%s\n", text.c_str());
@@ -218,16 +220,17 @@ private:
             receive(packets_, {pool_->acquire(detail::packetBytes), 0, MPI_ANY_SOURCE, 0});
     }
 
-    // By how much naps are longer, in quarters, from 4 to 16: by the square of the ranks that there are to a core, as
-    // each wakes up so often, and takes the core from all others that often.
+    // The factor by which naps are longer, in quarters, from 4 to 16. It is the square of the number of ranks per core:
+    // that many ranks wake up, and each takes the core from that many.
     int oversubscription() const
     {
         const std::int64_t ranksPerCore = std::int64_t{4} * ranks_.sharingRanks() / ranks_.processors(); // in quarters
         return static_cast<int>(std::clamp<std::int64_t>(ranksPerCore * ranksPerCore / 4, 4, 16));
     }
 
-    // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile:
-    // to wake the thread that polls for each takes more CPU time than to send it, and they pack better together.
+    // Whether send() ends the nap under way. While nobody waits here (naps are long), a renderer sends tile after tile.
+    // Waking the polling thread for each of them would take more CPU time than sending it, and they pack better
+    // together.
     bool mayWake()
     {
         if (napLimit_.load() < std::chrono::milliseconds(1))
@@ -245,7 +248,8 @@ private:
 
     using Record = detail::PacketRecord;
 
-    // Bytes that MPI has in hand. A longer message goes on when its chunk has gone.
+    // Bytes that MPI is sending or receiving. If the message is longer than a chunk, the next chunk follows when this
+    // one is through.
     struct Transfer {
         Buffer data;
         std::size_t offset = 0; // of the chunk
@@ -268,14 +272,14 @@ private:
         bool addressed = false;
     };
 
-    // More would not be faster, but every poll() looks at each.
+    // More transfers at once would not be faster, but every poll() looks at each.
     static constexpr int sendsPerPeer = 32;
     static constexpr std::size_t bodiesAtOnce = 64;
 
     MPI_Comm comm() const noexcept { return ranks_.comm(); }
     void check(int code, const char* call, int peer = -1) const { detail::checkMpi(code, call, rank(), peer); }
 
-    // `action()`, or false if it failed.
+    // Returns action(), or false if it threw; the transport has then failed.
     bool guarded(detail::FunctionRef<bool()> action)
     {
         try {
@@ -298,7 +302,7 @@ private:
             handler_->fail(error);
     }
 
-    // As far as it can be done: MPI itself may have failed.
+    // Tells all other ranks, as far as possible: MPI itself may have failed.
     void tellFailure(const std::string& text)
     {
         try {
@@ -317,7 +321,7 @@ private:
         }
     }
 
-    // It is quiet when they have gone, or cannot go.
+    // The transport is quiet when the notices have gone, or cannot go.
     void finishNotices()
     {
         int done = 1;
@@ -342,8 +346,8 @@ private:
         if (listener_)
             listener_->look();
         const bool started = !leaving_ && startSends();
-        // A second time, as Open MPI's MPI_Testsome returns what had come before the call, and only then looks for
-        // more: the doorbell would not ring again.
+        // Tries a second time, because Open MPI's MPI_Testsome returns what had come before the call, and only then
+        // looks for more: the doorbell would not ring again for that.
         const bool arrived = receivePackets() || receivePackets();
         const bool delivered = receiveBodies();
         const bool completed = finishSends();
@@ -400,7 +404,7 @@ private:
         while (!peer.waiting.empty() && peer.inFlight < sendsPerPeer) {
             Buffer message = peer.waiting.pop();
             const std::size_t byteCount = message.size();
-            if (lendsTo(destination) && byteCount >= MemoryPool::smallestShared) { // to copy less is quicker
+            if (lendsTo(destination) && byteCount >= MemoryPool::smallestShared) { // copying less is quicker
                 if (const std::byte* lent = pool_->lend(message)) {
                     if (!packet_.hasRoom(0))
                         sendPacket(destination);
@@ -460,7 +464,7 @@ private:
                 sent.offset += static_cast<std::size_t>(sent.count());
                 if (sent.offset < sent.data.size())
                     return startSend(sent);
-                ring(sent.peer); // it may have left only now
+                ring(sent.peer); // the message may have left only now
                 --peers_[static_cast<std::size_t>(sent.peer)].inFlight;
                 return MPI_REQUEST_NULL;
             }))
@@ -559,9 +563,9 @@ private:
 
     // --- completion
 
-    // Calls `next(item, status)` for each that has completed, which returns the request of its next chunk or that it
-    // was the last; removes those. True if there were any. MPI_Testsome reports errors to the handler of MPI_COMM_SELF
-    // or MPI_COMM_WORLD, which by default ends the job.
+    // Calls `next(item, status)` for each transfer that has completed. It returns the request of the next chunk, or
+    // MPI_REQUEST_NULL after the last one; that transfer is then removed. Returns whether any has completed.
+    // MPI_Testsome reports errors to the handler of MPI_COMM_SELF or MPI_COMM_WORLD, which by default ends the job.
     bool testSome(Transfers& transfers, detail::FunctionRef<MPI_Request(Transfer&, const MPI_Status&)> next)
     {
         auto& [requests, items] = transfers;
@@ -600,7 +604,7 @@ private:
 
     // --- the end
 
-    // False if the handler has failed: then the event that it waits for may never come.
+    // Moves messages until done(). Returns false if the handler has failed: then the awaited event may never come.
     bool moveUntil(detail::FunctionRef<bool()> done)
     {
         for (detail::Backoff backoff; !done();) {
@@ -623,9 +627,9 @@ private:
         return moveUntil([&] { return completed(request); });
     }
 
-    // Once all ranks are here none needs an answer. Then each says goodbye to those that it has sent to, with an empty
-    // packet, synchronously: when that has completed, the receiver has all packets that went before. Once it is so on
-    // all ranks nothing but announced bodies can be on the way. False: see moveUntil().
+    // Once all ranks are here, none of them needs an answer. Then each rank says goodbye to those that it has sent to,
+    // with an empty packet sent synchronously: when that send has completed, the receiver has all packets that went
+    // before. Once this is so on all ranks, only announced bodies can be on the way. Returns false as moveUntil() does.
     bool finish()
     {
         if (!barrier() || !moveUntil([this] { return quiet(); }))
@@ -648,7 +652,7 @@ private:
         return moveUntil([this] { return announced_.empty() && receives_.requests.empty(); });
     }
 
-    // Calls `came(packet, status)` for the receives that have got something.
+    // Cancels the posted receives. Calls `came(packet, status)` for those that have got a packet before.
     void cancelPackets(detail::FunctionRef<void(const Transfer&, const MPI_Status&)> came)
     {
         for (MPI_Request& request : packets_.requests)
@@ -666,7 +670,7 @@ private:
         }
     }
 
-    // When no rank needs it any more.
+    // Frees what MPI holds for this transport, when no rank needs it any more.
     void release()
     {
         try {
@@ -686,8 +690,8 @@ private:
         }
     }
 
-    // MPI may still use the buffers, and freeing a communicator is collective: requests that cannot be taken back are
-    // left to it.
+    // Leaves to MPI the requests that cannot be taken back, with their buffers, which it may still use, and the
+    // communicator, because freeing that is collective.
     void abandon()
     {
         int done = 0;
@@ -703,7 +707,7 @@ private:
         ranks_.abandon();
     }
 
-    const std::thread::id onlyThread_; // that may call MPI; none if all may
+    const std::thread::id onlyThread_; // the only one that may call MPI; none if all may
     detail::NoFinalize noFinalize_;
     std::shared_ptr<MemoryPool> pool_;
     detail::MpiRanks ranks_;
@@ -711,7 +715,7 @@ private:
     int lastTag_ = 1;
     int oversubscription_ = 4;
 
-    std::optional<detail::Doorbell::Listener> listener_; // of this rank's memory; none: signal_ in its place
+    std::optional<detail::Doorbell::Listener> listener_; // of this rank's doorbell; without, signal_ is used
     std::atomic<bool> isRungForAll_{false};              // nothing can come that is not announced by the doorbell
     NapSignal signal_;
     mutable std::mutex mutex_;
@@ -725,10 +729,10 @@ private:
     std::vector<std::pair<int, Buffer>> starting_;
     std::vector<Peer> peers_;
     std::vector<int> waitingPeers_;                  // those with messages that wait
-    detail::PacketWriter packet_;                    // that is being filled
-    std::vector<Transfer> bodies_;                   // to follow it
+    detail::PacketWriter packet_;                    // the one that is being filled
+    std::vector<Transfer> bodies_;                   // they are sent after that packet
     Transfers sends_, receives_, notices_, packets_; // packets_: the posted receives
-    detail::Fifo<std::pair<int, Record>> announced_; // messages of these ranks that are to follow
+    detail::Fifo<std::pair<int, Record>> announced_; // source and record of messages to come
     std::vector<int> indices_;
     std::vector<MPI_Status> statuses_;
 };

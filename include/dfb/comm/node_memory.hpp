@@ -1,9 +1,9 @@
-// NodeMemory: memory that the processes of one node all see, so that messages between them are not copied: the sender
+// NodeMemory: memory that the processes of one node all see, so that messages between them are not copied. The sender
 // tells where a block lies, and the receiver reads it there and gives it back. It also has a doorbell for each process.
 //
-// It has no name in the file system that could be left behind: others reach it through the process that made it, and it
-// is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at another, there
-// is none.
+// The memory has no name in the file system that could be left behind: others reach it through the process that made
+// it, and it is gone when nobody has it mapped any more. Linux only; elsewhere, or where a process may not look at
+// another, there is no such memory.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -36,7 +36,7 @@ namespace detail {
 // Doorbell: a word in memory that the processes of a node share, with which they wake a rank that naps.
 class Doorbell {
 public:
-    // One that naps. From several threads at once.
+    // The side of the rank that naps. Its members may be called from several threads at once.
     class Listener {
     public:
         explicit Listener(Doorbell& doorbell)
@@ -44,11 +44,11 @@ public:
         {
         }
 
-        // Before it looks for messages: rings up to now need not end a nap.
+        // To be called before looking for messages: rings up to now need not end a nap.
         void look() noexcept { heard_ = doorbell_.word_.load(); }
 
-        // Naps for `limit`, or until it is interrupted, or with `isAwaiting` until a rank rings. Ends at once if either
-        // has happened since the last nap, or look().
+        // Naps for `limit`, or until it is interrupted, or, with `isAwaiting`, until a rank rings. Ends at once if it
+        // was interrupted since the last nap, or if a rank has rung since the last nap or look().
         void nap(std::chrono::nanoseconds limit, bool isAwaiting) noexcept
         {
             const std::uint32_t word = doorbell_.word_.load();
@@ -69,14 +69,14 @@ public:
         std::atomic<std::uint32_t> heard_, seen_;
     };
 
-    // Of the rank itself: ends its nap, or else the next one.
+    // For the rank itself: ends its nap, or else the next one.
     void interrupt() noexcept
     {
         word_.fetch_add(0x10000);
         if (awaiting_.load() + napping_.load() > 0)
             wake();
     }
-    // Of another rank, that has sent something.
+    // For another rank, which has sent something.
     void ring() noexcept
     {
         word_.fetch_add(1);
@@ -108,17 +108,17 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(Doorbell
 
 class NodeMemory final : public SharedMemory, public BlockOwner, public std::enable_shared_from_this<NodeMemory> {
 public:
-    // How another process of the node finds it. All 0: not at all.
+    // How another process of the node finds the memory. All 0: it cannot.
     struct Address {
         std::int64_t process = 0, file = 0;
-        std::uint64_t secret[2] = {}; // to know that it is this one
+        std::uint64_t secret[2] = {}; // to check that it is this memory
     };
 
-    // The most that one process has. Only used pages take memory.
+    // The most bytes that one process has. Only used pages take memory.
     static constexpr auto capacity = static_cast<std::size_t>(std::uint64_t{1} << 32); // 0 where it has 32 bits
     static constexpr std::size_t alignment = 64;
 
-    // Null if the system has none.
+    // Returns null if the system has no such memory.
     static std::shared_ptr<NodeMemory> create()
     {
 #if defined(MFD_CLOEXEC)
@@ -149,7 +149,8 @@ public:
 #endif
     }
 
-    // That of another process, or of this one, in which blocks are only given back; null if it cannot be reached.
+    // Opens the memory of another process, or of this one. Blocks can be borrowed there and given back, but not taken.
+    // Returns null if it cannot be reached.
     static std::shared_ptr<NodeMemory> open(const Address& address)
     {
 #if defined(MFD_CLOEXEC)
@@ -196,7 +197,7 @@ public:
         if (file_ < 0 || byteCount > capacity || used_ + bytes > capacity)
             return nullptr;
         if (used_ + bytes > allocated_) {
-            // Asked for beforehand: without, to find none when it is first written to would end the process.
+            // Pages are allocated beforehand: if the first write to one found no memory, that would end the process.
             const std::size_t more = (used_ + bytes - allocated_ + step - 1) / step * step;
             if (allocated_ + more > capacity || !allocate(file_, base_, allocated_, more))
                 return nullptr;
@@ -215,9 +216,9 @@ public:
         return stateOf(block).is.load(std::memory_order_acquire) != mine;
     }
 
-    // Where a block lies, in units of `alignment`, for others; and what another process has lent of its memory: the
-    // first `byteCount` bytes of the block there, to be given back by the Buffer's end. Empty if there can be none, or
-    // somebody has it: it would be given back twice.
+    // placeOf(): where a block lies, in units of `alignment`, for others. borrow(): the first `byteCount` bytes of a
+    // block that the process which owns this memory has lent; the Buffer gives it back at its end. Empty if no lent
+    // block can be there, or if somebody has it already, because it would be given back twice.
     std::int32_t placeOf(const std::byte* block) const noexcept
     {
         return static_cast<std::int32_t>(static_cast<std::size_t>(block - base_) / alignment);
@@ -243,15 +244,15 @@ public:
     }
 
 private:
-    // In front of each block. As a float `lent` is a NaN that nobody makes: pixels do not pass for it, wherever a place
-    // may point to.
+    // In front of each block. As a float `lent` is a NaN that nobody makes, so that pixels are never mistaken for it,
+    // wherever a place may point to.
     static constexpr std::uint32_t mine = 0, lent = 0xffa5d3b7, borrowed = 1;
     struct alignas(alignment) State {
         std::atomic<std::uint32_t> is{mine};
     };
     static_assert(std::atomic<std::uint32_t>::is_always_lock_free && sizeof(State) == alignment);
     static_assert(capacity / alignment <= std::size_t{1} << 31);
-    static constexpr std::size_t step = std::size_t{1} << 21; // by which it grows: a large page
+    static constexpr std::size_t step = std::size_t{1} << 21; // the memory grows by this: a large page
 
     NodeMemory(std::byte* base, int file) : base_(base), file_(file), allocated_(file < 0 ? 0 : step) {}
 
@@ -264,7 +265,7 @@ private:
     void giveBack(std::byte* block, int) noexcept override { stateOf(block).is.store(mine, std::memory_order_release); }
 
 #if defined(MFD_CLOEXEC)
-    // At a multiple of `step`: a large page must begin at one.
+    // Maps the file at a multiple of `step`, as a large page must begin at one.
     static std::byte* map(int file)
     {
         void* room = mmap(nullptr, capacity + step, PROT_NONE, MAP_PRIVATE | MAP_ANONYMOUS | MAP_NORESERVE, -1, 0);
@@ -281,7 +282,7 @@ private:
         unmap(base);
         return nullptr;
     }
-    // Multiples of `step`.
+    // `offset` and `byteCount` are multiples of `step`.
     static bool allocate(int file, std::byte* base, std::size_t offset, std::size_t byteCount)
     {
         if (posix_fallocate(file, static_cast<off_t>(offset), static_cast<off_t>(byteCount)) != 0)
@@ -301,7 +302,7 @@ private:
 #endif
 
     std::byte* const base_;
-    const int file_; // -1: of another process
+    const int file_; // -1: opened by open()
     Address address_;
     std::mutex mutex_;
     std::size_t used_ = 2 * alignment, allocated_; // the first bytes are the secret and the doorbell; under mutex_

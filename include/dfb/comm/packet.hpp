@@ -1,6 +1,6 @@
-// Packets: several small messages to one rank as one message of the network. Each stands behind a record. A large
-// message is only announced: its record says that it follows as a message of its own, or where it lies in memory that
-// the receiver sees.
+// Packets: several small messages to one rank travel as one message of the network. In a packet, each follows a record.
+// A large message is only announced: its record says that it follows as a message of its own, or where it lies in
+// memory that the receiver sees.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -17,15 +17,15 @@ namespace detail {
 struct PacketRecord {
     enum Kind : std::uint32_t { Message, Announcement, Lent, Failure };
     std::uint64_t byteCount;
-    std::int32_t tag; // of an announced message; of a lent one, where it lies
+    std::int32_t tag; // the tag of an announced message; the place of a lent one
     Kind kind;
 };
 static_assert(sizeof(PacketRecord) == 16);
 
 constexpr std::size_t packetBytes = 8192; // at most
 
-// Of packets, and of all else that transports over a network say to each other. To be raised with every change: ranks
-// that were built with different ones cannot read each other, and find out before the first packet.
+// The format of packets, and of all else that transports over a network send each other. To be raised with every
+// change: ranks built with different formats cannot read each other's packets, and find out before the first one.
 constexpr std::uint64_t packetFormat = 3;
 
 // Fills one packet after the other. Records begin at multiples of 16.
@@ -38,7 +38,7 @@ public:
     bool hasRoom(std::size_t payloadBytes) const noexcept { return used_ + padded(payloadBytes) <= packetBytes; }
     bool empty() const noexcept { return used_ == 0; }
 
-    // Needs room.
+    // There must be room for it.
     void add(const PacketRecord& record, const std::byte* payload, std::size_t payloadBytes)
     {
         if (empty())
@@ -52,7 +52,7 @@ public:
         used_ += padded(payloadBytes);
     }
 
-    // The packet, and begins the next.
+    // Returns the packet, and begins the next.
     Buffer take()
     {
         packet_.shrink(std::exchange(used_, 0));
@@ -70,9 +70,9 @@ private:
     std::size_t used_ = 0;
 };
 
-// Calls `visit(record, payload)` for each record; one of a message that is elsewhere has no payload. False if the
-// bytes, which need not be trusted, are no packet: then the records before that have been visited. An empty packet is
-// one.
+// Calls `visit(record, payload)` for each record. The payload is null if the message is elsewhere. Returns false if the
+// bytes, which need not be trusted, are no packet; the records before the fault have then been visited. An empty packet
+// is valid.
 template <class Visit>
 bool readPacket(const std::byte* from, std::size_t left, const Visit& visit)
 {
