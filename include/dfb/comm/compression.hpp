@@ -44,8 +44,8 @@ namespace detail {
 
 // CompressionGains: the ranks for which compression makes this rank's messages smaller. The pixels for one rank can be
 // noise, those for another all alike. A rank for which nearly nothing was gained is left alone for some frames and then
-// tried again, more and more seldom. add() may be called from any thread, the others between frames, as is
-// isWorthwhile() during one.
+// tried again, more and more seldom. During a frame any thread may call add() and isWorthwhile(); the others are called
+// between frames.
 class CompressionGains {
 public:
     explicit CompressionGains(int rankCount) : peers_(static_cast<std::size_t>(rankCount)) {}
@@ -60,7 +60,7 @@ public:
         peer.sent += static_cast<std::int64_t>(sent);
     }
 
-    // For how many ranks something was compressed since the last endFrame().
+    // The number of ranks for which something was compressed since the last endFrame().
     std::int64_t links() const
     {
         return std::count_if(peers_.begin(), peers_.end(), [](const Peer& peer) { return peer.sent < peer.raw; });
@@ -83,7 +83,7 @@ public:
     }
 
 private:
-    // The compressed share of the bytes above which compression stops, and below which it starts again.
+    // Of compressed to raw bytes: above `worse` compression stops, and only below `better` it starts again.
     static constexpr double worse = 0.95, better = 0.9;
     static constexpr int firstInterval = 16, longestInterval = 512;
 
@@ -94,18 +94,18 @@ private:
     std::vector<Peer> peers_;
 };
 
-// CompressionTrial: whether a framebuffer's messages are worth compressing, found out by trying, because no formula
+// CompressionTrial: finds out by trying whether a framebuffer's messages are worth compressing, because no formula
 // knows how a network, a codec and the cores work together.
 //
 // Ranks that are told the same times choose the same. To begin with, frames with and without compression take turns.
 // Then the better kind is used. The other is tried again now and then, more and more seldom, and when frames have
-// become much slower or faster. It must be better by a tenth to replace the first.
+// become much slower or faster. If it seems better by a tenth, both take turns again.
 class CompressionTrial {
 public:
     // Whether the next frame is to be compressed.
     bool compresses() const noexcept { return mode_; }
 
-    // The frame with compresses() has taken so long, in any unit. Not to be told of frames that have failed.
+    // The frame with compresses() took this `time`, in any unit. Not to be called for frames that have failed.
     void took(double time)
     {
         switch (phase_) {
@@ -175,7 +175,7 @@ private:
     void probed()
     {
         const double other = median(times_[mode_]), mine = median(times_[!mode_]);
-        if (other < 0.9 * mine) { // or so it seems
+        if (other < 0.9 * mine) { // or so it seems: compare again
             times_ = {};
             begin(Phase::Turns);
             return;
@@ -189,7 +189,7 @@ private:
     Phase phase_ = Phase::WarmUp;
     bool mode_ = false;
     std::size_t frames_ = 0, interval_ = firstInterval, strange_ = 0; // frames in this phase
-    double usual_ = 0;                                                // when it was last looked at
+    double usual_ = 0;                                                // the median time when it was last found out
     std::array<std::vector<double>, 2> times_;                        // without, with
 };
 
@@ -217,10 +217,10 @@ public:
     // A message to that rank had `raw` bytes before the codec, and `sent` after it.
     void sent(int other, std::size_t raw, std::size_t sent) { gains_.add(other, raw, sent); }
 
-    // For how many ranks something was compressed in this frame.
+    // The number of ranks for which something was compressed in this frame.
     std::int64_t links() const { return gains_.links(); }
 
-    // The frame has not failed, and took so long on the slowest rank.
+    // Notes that the frame has not failed, and took this `time` on the slowest rank.
     void endFrame(double time)
     {
         if (codec_)
