@@ -1,4 +1,4 @@
-// Accumulation: which samples of its pixels a frame takes, and whether they go on where those of the last one ended.
+// Accumulation: which samples of its pixels a frame takes, and whether they continue those of the last frame.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -14,11 +14,12 @@ namespace detail {
 class Accumulation {
 public:
     struct Start {
-        bool goesOn = false; // whether the last frame's samples count on
+        bool goesOn = false; // whether this frame continues the last one's samples
         int firstSample = 0; // of each tile in a frame without a plan of samples
     };
 
-    // Throws InvalidArgument for samples that this framebuffer cannot take. `lastFailed`: the last frame has.
+    // Throws InvalidArgument for samples that this framebuffer cannot take. `lastFailed`: whether the last frame has
+    // failed.
     Start begin(const FrameConfig& params, const OperationTraits& traits, int tileCount, int framesInFlight,
                 bool lastFailed) const
     {
@@ -55,7 +56,7 @@ public:
         return {goesOn, 0};
     }
 
-    // The frame has ended well, and began with that sample.
+    // Called when a frame has ended without an error. `firstSample`: the sample that it began with.
     void ended(const FrameConfig& params, int firstSample)
     {
         lastId_ = params.accumulationId;
@@ -64,7 +65,7 @@ public:
 
 private:
     std::uint64_t lastId_ = 0;
-    int next_ = 0; // sample of each tile, if the next frame has no plan and goes on
+    int next_ = 0; // the first sample of each tile, if the next frame has no plan and goes on
 };
 
 } // namespace detail

@@ -35,7 +35,8 @@ std::uint64_t fingerprint(const List& list, const WordOf& wordOf)
     return value;
 }
 
-// The configuration of one rank, or its error. Combined: whether all are right and equal, and which share a node.
+// The configuration of one rank, or its error. Combined, it says whether those of all ranks are right and equal, and
+// which ranks share a node.
 struct Agreement {
     struct OnNode {
         std::int32_t rank = 0, first = 0; // the lowest rank of its node
@@ -146,8 +147,8 @@ struct Agreement {
         return a.bytes();
     }
 
-    // Which settings differ, in words, and their values on both ranks. A hash says least: it is shown if nothing else
-    // differs.
+    // Which settings differ, in words, and their values on both ranks. A hash is shown only if nothing else differs, as
+    // it says least.
     static std::string difference(const std::string& a, int rank, const std::string& b, int otherRank)
     {
         const auto as = settingsOf(a), bs = settingsOf(b);
@@ -209,7 +210,7 @@ private:
     }
 };
 
-// Throws InvalidArgument if a rank of so many cannot work with this configuration.
+// Throws InvalidArgument if a connection of `size` ranks cannot work with this configuration.
 inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& operations, int size,
                         std::chrono::milliseconds peerTimeout)
 {
@@ -241,9 +242,9 @@ inline void checkConfig(const FrameBufferConfig& c, const OperationTraits& opera
 }
 
 // Finds out whether all ranks have the same configuration, which makeMine() returns, and returns what all have.
-// Collective. Throws InvalidArgument on all ranks if something is wrong, as if makeMine() throws on one of them. No
-// rank throws before all know it: the first to throw may destroy the connection, and a rank that has not heard the
-// reason by then would report another error.
+// Collective. Throws InvalidArgument on all ranks if the configurations differ or makeMine() throws on any rank. No
+// rank throws before all know the reason: the first to throw may destroy the connection, and a rank that has not heard
+// the reason by then would report another error.
 template <class MakeMine>
 Agreement agree(Mailbox& mailbox, const MakeMine& makeMine)
 {
@@ -260,7 +261,7 @@ Agreement agree(Mailbox& mailbox, const MakeMine& makeMine)
         try {
             mailbox.reduce({}, [](const SmallBytes& a, const SmallBytes&) { return a; });
         } catch (const TransportError&) {
-            // One rank has left already, so all know.
+            // A rank has left already, so all know the reason.
         }
         throw InvalidArgument(errorInfo(ErrorKind::InvalidArgument, all.text, all.rank),
                               mailbox.connection().throwByAll());

@@ -1,5 +1,5 @@
-// Declarations: every rank tells the owners which inputs it will send, and all learn when all owners
-// know. Counts come from the senders only, so owner and contributor cannot disagree about visibility.
+// Declarations: every rank tells the owners which inputs it will send, and all ranks learn when all owners know. Counts
+// come from the senders only, so owner and contributor cannot disagree about visibility.
 //
 // A rank's declaration holds until the rank declares something else. In each frame a rank sends a manifest to those
 // owners alone for which its inputs are not those of the last frame. The owner acknowledges a manifest and drops the
@@ -22,15 +22,15 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Something that will come for a tile.
+// An input that will come for a tile.
 struct ExpectedInput {
     int tile = 0;
     std::uint32_t source = 0;
     std::uint16_t part = 0;
-    int rank = 0; // that has said so
+    int rank = 0; // the rank that has declared it
 };
 
-// All that will come, by tile.
+// All inputs that will come, by tile.
 class ExpectedInputs {
 public:
     struct Range {
@@ -41,7 +41,7 @@ public:
     };
 
     void clear() { inputs_.clear(); }
-    // Puts these in place of all that come from `ranks`, which ascend.
+    // Puts these in place of all inputs of `ranks`, which ascend.
     void replace(const std::vector<int>& ranks, const std::vector<ExpectedInput>& inputs)
     {
         const auto isReplaced = [&](const ExpectedInput& input) {
@@ -72,8 +72,8 @@ private:
 
 class Declarations {
 public:
-    // `lastHolds`: the declarations up to the last frame have arrived at all owners. It must be the same on all ranks.
-    // False: all of it is forgotten. `haveMoved`: tiles have other owners than in the last frame.
+    // `lastHolds`: whether the declarations up to the last frame have arrived at all owners, the same on all ranks. If
+    // not, all of them are forgotten. `haveMoved`: whether tiles have other owners than in the last frame.
     void newFrame(bool lastHolds, bool haveMoved)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -90,7 +90,8 @@ public:
     }
 
     // Takes note of the inputs that this rank will send: calls send(owner, bytes) for each other owner whose inputs
-    // have changed. `ownerOf(tile)` gives the owner. Returns whether answers are to come. By one thread at a time.
+    // have changed. `ownerOf(tile)` gives the owner. Returns whether acknowledgements are to come. One thread at a time
+    // may call it.
     template <class OwnerOf, class Send>
     bool declare(const std::vector<TileInput>& inputs, int rank, const OwnerOf& ownerOf, const Send& send)
     {
@@ -140,8 +141,8 @@ public:
         return isWaiting;
     }
 
-    // The owner's side, with a manifest of rank `from`. Throws Error (MalformedMessage); `isMine(tile)` tells which
-    // tiles can be meant.
+    // On the owner: takes a manifest of rank `from`. `isMine(tile)`: whether this rank owns a tile. Throws Error
+    // (MalformedMessage).
     template <class IsMine>
     void receive(int from, ByteReader in, const IsMine& isMine)
     {
@@ -163,7 +164,8 @@ public:
         }
     }
 
-    // By rank `from`. True if this was the last acknowledgement that was missing. Throws Error (MalformedMessage).
+    // Takes an acknowledgement of rank `from`. Returns whether it was the last one missing. Throws Error
+    // (MalformedMessage).
     bool acknowledged(int from)
     {
         std::lock_guard<std::mutex> lock(mutex_);
@@ -215,17 +217,17 @@ private:
     }
 
     mutable std::mutex mutex_;
-    ExpectedInputs expected_;                  // since the last complete()
-    std::vector<int> changedRanks_;            // of those that have told this owner something new in this frame
+    ExpectedInputs expected_;                  // as of the last complete()
+    std::vector<int> changedRanks_;            // ranks that have told this owner something new in this frame
     std::vector<ExpectedInput> changedInputs_; // their new inputs
-    std::vector<int> acksMissing_;             // of these owners
+    std::vector<int> acksMissing_;             // owners that have not acknowledged
     bool declared_ = false, isComplete_ = false;
 
     // Only declare() and newFrame() use them.
-    std::vector<TileInput> mine_;          // as it was declared last
-    bool haveMoved_ = false;               // tiles, since then
-    std::vector<Addressed> told_, toTell_; // by owner: told in the last frame; its successor
-    std::vector<Addressed> news_;          // in one of them alone, then one for each owner
+    std::vector<TileInput> mine_;          // what was declared last
+    bool haveMoved_ = false;               // tiles have other owners since then
+    std::vector<Addressed> told_, toTell_; // by owner: what was told last; what is to be told now
+    std::vector<Addressed> news_;          // what only one of them has; then one for each owner
     ByteWriter manifest_;                  // for one owner
 };
 

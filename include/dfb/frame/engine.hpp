@@ -1,5 +1,6 @@
-// Engine: the inside of a framebuffer: frames of one set of tiles, with operations of any type. What it is made of is
-// in frame/frame_engine.hpp, which a program that links dfb::compiled does not compile.
+// Engine: the interface to the implementation of a framebuffer: frames of one set of tiles, one at a time, with
+// operations of any type. The implementation is in frame/frame_engine.hpp, which a program that links dfb::compiled
+// does not compile.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -34,7 +35,7 @@ public:
     virtual const std::vector<int>& ownedTiles() const noexcept = 0;
     virtual int ownerNow(int tile) const noexcept = 0; // in the frame that is open
     virtual const std::vector<int>& ownedNow() const noexcept = 0;
-    virtual const std::vector<int>& nodeOf() const noexcept = 0; // of each rank: the lowest rank of its node
+    virtual const std::vector<int>& nodeOf() const noexcept = 0; // for each rank, the lowest rank on its node
     virtual const Image& image() const noexcept = 0;
     virtual std::int64_t imageFrame() const noexcept = 0;
     virtual Image imageOnAllRanks(Engine& gatherer) = 0; // by an allGather() of that engine
@@ -44,8 +45,8 @@ public:
     virtual std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& own, const char* call) = 0;
 
     virtual bool isOpen() const noexcept = 0;
-    virtual void begin(const FrameConfig& params, FunctionRef<void()> copyData) = 0; // for the operations
-    virtual std::int64_t frame() const noexcept = 0; // the number of the one that has begun last
+    virtual void begin(const FrameConfig& params, FunctionRef<void()> copyData) = 0; // copies the operations' data
+    virtual std::int64_t frame() const noexcept = 0; // the number of the frame that was begun last
     virtual TileHeader headerOf(int tile, int pass) const = 0;
     virtual ChannelMask sent() const noexcept = 0; // the channels of inputs that travel in this frame
     virtual void setTile(const InputPixels& tile) = 0;
@@ -63,8 +64,9 @@ public:
     virtual bool failed() const noexcept = 0;
     virtual void abort(std::int64_t frame, const std::exception_ptr& reason, int tile) = 0;
     virtual void requireProgress() const = 0;
-    virtual void tryVote() = 0; // again, as messages have moved
-    // Those of one framebuffer: when one has moved messages, all try to vote. At first it is alone.
+    virtual void tryVote() = 0; // again, when messages have moved
+    // Gives this engine all engines of its framebuffer: when one has moved messages, all try to vote. Before this call
+    // it is alone.
     virtual void setTogether(std::vector<Engine*> engines) = 0;
     virtual bool isDone() = 0;
     virtual FrameReport end() = 0;
@@ -76,7 +78,7 @@ public:
 DFB_COMPILED_ONCE std::unique_ptr<Engine> makeEngine(std::shared_ptr<Connection> connection, FrameBufferConfig config,
                                                      Operations& operations, int slot);
 
-// Threads for those processors that this rank of the connection has for itself.
+// Makes an executor with Connection::threadShare() threads.
 DFB_COMPILED_ONCE std::shared_ptr<ThreadExecutor> makeThreads(const Connection& connection);
 
 } // namespace detail

@@ -1,5 +1,5 @@
-// FrameEngine: the work of DistributedFrameBuffer behind its interface: it joins the tile pipeline, the messaging
-// layer, the declarations and the verdict into frames.
+// FrameEngine: the implementation of DistributedFrameBuffer. It joins the tile pipeline, the messaging layer, the
+// declarations and the verdict into frames.
 #pragma once
 
 #include <dfb/comm/compression.hpp>
@@ -69,7 +69,7 @@ public:
                 nodeOf_[static_cast<std::size_t>(its.rank)] = its.first;
         tellImagePlace();
     }
-    ~FrameEngine() override { mailbox_->stop(); } // before mailbox_ is null: its tasks use it
+    ~FrameEngine() override { mailbox_->stop(); } // while mailbox_ is not null yet: its tasks use it
 
     int rank() const noexcept override { return mailbox_->rank(); }
     int size() const noexcept override { return mailbox_->size(); }
@@ -103,9 +103,9 @@ public:
         mailbox_->connection().throwIfFailed();
         const bool haveMoved = pipeline_->table().prepare(params.owners);
         params_ = params;
-        declarations_.newFrame(!lastFailed, haveMoved); // after one that failed, owners may know of different ones
+        declarations_.newFrame(!lastFailed, haveMoved); // after a failed frame, owners may know of different ones
 
-        std::exception_ptr userError; // of copying the data, or of the pixel operation's newFrame()
+        std::exception_ptr userError; // thrown by copying the data, or by the pixel operation's newFrame()
         try {
             pipeline_->newFrame(open_.next(), params_, start, haveMoved,
                                 codecFor(config_.image.displayRank) != nullptr);
@@ -123,7 +123,7 @@ public:
         renderNs_ = -1;
         figures_.newFrame();
         std::int64_t rendered = 0;
-        std::vector<int> kept; // without samples, but the pixel operation wants to see all tiles
+        std::vector<int> kept; // tiles without samples, which the pixel operation wants to see all the same
         for (const int tile : ownedNow()) {
             if (pipeline_->table().samples(tile).count > 0)
                 ++rendered;
@@ -236,7 +236,7 @@ public:
     {
         const auto inside = open_.enter(frame);
         if (!inside)
-            return; // it is over
+            return; // the frame is over
         ErrorInfo where;
         where.tile = tile;
         outcome_->fail(reason, where);
@@ -254,7 +254,8 @@ public:
         return did;
     }
 
-    // Polls where no thread does, for a renderer that does not call poll(). Not at each call, as a poll takes time.
+    // Polls if no other thread moves messages, or none runs tasks, for a renderer that does not call poll(). Does so at
+    // most once in a millisecond, as a poll takes time.
     void pollNowAndThen()
     {
         if (!mailbox_->connection().needsCaller() && mailbox_->executor().hasWorkers())
@@ -268,7 +269,7 @@ public:
 
     void requireProgress() const override { mailbox_->requireProgress(); }
 
-    // The end() of this rank, as far as it waits for nobody.
+    // The part of end() that waits for no other rank.
     void beginEnd()
     {
         if (renderNs_ >= 0)
@@ -335,7 +336,7 @@ public:
         return report;
     }
 
-    // A frame that is left without end(), mostly while an exception passes.
+    // Closes a frame that is left without end(), mostly while an exception passes.
     void leave() noexcept override
     {
         const EndOfFrame ending{*this};
@@ -348,7 +349,7 @@ public:
                                               "around what throws tells all ranks its text"));
             outcome_->conclude();
         } catch (const TransportError&) {
-            // begin() will say so.
+            // The next begin() throws it.
         }
     }
 
@@ -395,10 +396,10 @@ private:
         return other == rank() ? nullptr : compression_.codecFor(other, mailbox_->connection().isSeenBy(other));
     }
 
-    // Tells the trace of the frame when it has ended, in whatever way.
+    // Adds the frame to the trace when it has ended, however it ends.
     struct EndOfFrame {
         FrameEngine& engine;
-        Clock::time_point time{}; // not set: when this is destroyed
+        Clock::time_point time{}; // of the end; if not set, the time of destruction
 
         ~EndOfFrame()
         {
@@ -429,11 +430,11 @@ private:
     {
         auto& early = open_.open();
         open_.expectTiles(tiles + static_cast<std::int64_t>(withoutSamples.size()));
-        if (userError) // comes out of end(), on all ranks; nothing is made with half of the frame's data
+        if (userError) // end() throws it on all ranks; nothing is made with half of the frame's data
             outcome_->failWhole(errorInfoOf(userError, {}));
         for (Arrival& a : early)
             incoming(a.source, a.header, std::move(a.message));
-        early.clear(); // some may still be there, if the frame has failed
+        early.clear(); // if the frame has failed, some have not been taken
         failForDamage();
         for (const int tile : withoutSamples)
             if (const auto inside = open_.enter(open_.number()))
@@ -473,8 +474,8 @@ private:
         outcome_->guarded([&] { handle(source, header, std::move(message)); }, where);
     }
 
-    // To the ranks that see the memory of the display rank: they put finished tiles into its image themselves. Who has
-    // not heard of it by the end of the first frame goes on sending tiles.
+    // The display rank tells the ranks that see its memory where its image lies, so that they put finished tiles there
+    // themselves. A rank that has not heard of it by the end of its first frame goes on sending tiles.
     void tellImagePlace()
     {
         if (rank() != config_.image.displayRank)
@@ -493,12 +494,12 @@ private:
         }
     }
 
-    // Nobody knows which frame it was for: if none is open, or this rank has all that it needs for the one that is, the
-    // next one cannot do without it.
+    // Nobody knows which frame the message was for. If no frame is open, or this rank has all that it needs for the
+    // open one, then the next frame lacks the message.
     void undecodable(const ErrorInfo& error) override
     {
-        mailbox_->keepDamage(error);                         // first: begin() opens the gate and then looks
-        if (const auto inside = open_.enter(open_.number())) // until the end: the next begin() waits for it
+        mailbox_->keepDamage(error);                         // first: begin() opens the frame and then looks for damage
+        if (const auto inside = open_.enter(open_.number())) // held to the end: the next begin() waits for it
             failForDamage();
     }
 
@@ -508,12 +509,12 @@ private:
             mailbox_->keepDamage(*damage);
     }
 
-    // Each kind of message goes to the object that it is for.
+    // Passes a message to the object that handles its kind.
     void handle(int source, const MessageHeader& header, Buffer&& message)
     {
         const MessageKind kind = header.kind;
         if (mailbox_->receiveCredit(source, header, message))
-            return outcome_->tryVote(); // it may have waited for that
+            return outcome_->tryVote(); // the vote may have waited for this credit
         if (outcome_->receive(source, header, message))
             return;
         FinalGather& gather = pipeline_->gather();
@@ -548,7 +549,7 @@ private:
     void takeWord(const HiddenTiles::Message& word)
     {
         hidden_.take(word);
-        mailbox_->notify(); // of waitForWord()
+        mailbox_->notify(); // wakes waitForWord()
     }
 
     void receiveDeclaration(int source, const MessageHeader& header, const Buffer& message)
@@ -569,7 +570,7 @@ private:
 
     // ---- tiles
 
-    // Whether a rank shares no memory with this one, on which both agree.
+    // Whether a rank shares no memory with this one. Both ranks give the same answer.
     bool isFar(int other) const { return other != rank() && !mailbox_->connection().sharesMemoryWith(other); }
 
     Buffer encode(const InputPixels& tile, int owner)
@@ -588,7 +589,7 @@ private:
         return mailbox_->connection().isSeenBy(owner) ? pipeline_->encodePlace(tile, offsetOf) : Buffer();
     }
 
-    // The message with an input of rank `source`.
+    // Takes the message with an input from rank `source`.
     void arrive(Buffer&& message, int source)
     {
         const auto sharedBytes = [this, source](std::int64_t offset, std::int64_t byteCount) {
@@ -598,7 +599,7 @@ private:
         arrive([&] { return pipeline_->inputOf(std::move(message), sharedBytes); }, source, isInPlace);
     }
 
-    // Takes the input that make() returns, of rank `source`.
+    // Takes the input from rank `source`, which make() returns.
     template <class Make>
     void arrive(const Make& make, int source, bool isInPlace)
     {
@@ -642,7 +643,7 @@ private:
         static_cast<void>(inside.release()); // work() leaves
     }
 
-    // A tile that is complete.
+    // Finishes a complete tile.
     void work(int tile) override
     {
         const OpenFrame::Inside inside(&open_);
@@ -660,7 +661,7 @@ private:
         }
     }
 
-    // The last of this rank's tiles has been finished.
+    // Called when the last of this rank's tiles has been finished.
     void allFinished()
     {
         pipeline_->gather().flush();
@@ -702,7 +703,7 @@ private:
 
     // ---- the end
 
-    // Adds this rank's counts of the frame to the verdict, and a promise of its renderer that was not kept.
+    // Adds this rank's counts of the frame to the verdict, and an error if its renderer has broken a promise.
     void addFigures(Verdict& v)
     {
         if (const int tile = pipeline_->brokenPromise(); tile >= 0 && !v.error) {
@@ -761,7 +762,7 @@ private:
                                                    mailbox_->address(), sendToDisplay, fail);
         outcome_ = std::make_unique<FrameOutcome>(*mailbox_, open_, *pipeline_,
                                                   [this](Verdict& verdict) { addFigures(verdict); });
-        // The rank after the display rank hands out jobs, as that one has enough to do.
+        // The rank after the display rank hands out jobs, as the display rank has enough to do.
         jobs_.emplace(*mailbox_, open_, *outcome_, (config_.image.displayRank + 1) % size());
     }
 
@@ -784,12 +785,12 @@ private:
     FrameFigures figures_;
     Compression compression_;
     std::atomic<std::int64_t> inputsSent_{0}; // by this rank
-    std::atomic<std::int64_t> renderNs_{-1};  // until end() was called; -1: it was not
+    std::atomic<std::int64_t> renderNs_{-1};  // from begin() until end(); -1: not there yet
     std::int64_t bytesBefore_ = 0, messagesBefore_ = 0, repeatedBefore_ = 0;
     Clock::time_point beginTime_;
     std::atomic<Clock::time_point> lastPoll_{}; // by pollNowAndThen()
 
-    std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others
+    std::unique_ptr<Mailbox> mailbox_; // the last member, as its tasks use the others
 };
 
 #if DFB_HAS_BODIES

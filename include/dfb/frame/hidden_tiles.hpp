@@ -1,5 +1,5 @@
-// HiddenTiles: which inputs of a tile cannot be seen, as an opaque one is in front of them, and which may turn out to
-// be so.
+// HiddenTiles: which inputs of a tile cannot be seen because an opaque input lies in front of them, and which may still
+// turn out to be hidden.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -15,18 +15,18 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// One per rank: the words that it has heard. Any thread may call the members, but newFrame().
+// One object per rank, with the words that this rank has received. Any thread may call the members, except newFrame().
 class HiddenTiles {
 public:
     // The effect of an input on those behind it.
     enum class Word : std::int32_t {
         Hides,
-        MayHide, // it did so in the last frame; Hides or Shows follows
+        MayHide, // it hid them in the last frame; Hides or Shows follows
         Shows
     };
     struct Message {
         std::int32_t tile = 0;
-        std::int32_t generation = 0; // the first one behind
+        std::int32_t generation = 0; // the first generation behind the input
         Word word = Word::Hides;
     };
 
@@ -62,13 +62,13 @@ public:
             std::find_if(open.begin(), open.end(), [&](const Open& o) { return o.generation == message.generation; });
         if (at == open.end())
             at = open.insert(open.end(), {message.generation, 0});
-        at->count += message.word == Word::MayHide ? 1 : -1; // they may overtake each other
+        at->count += message.word == Word::MayHide ? 1 : -1; // the words may overtake each other
     }
 
     // The first generation that cannot be seen.
     int from(int tile) const { return any_ ? from_[static_cast<std::size_t>(tile)].load() : none; }
 
-    // Whether word is to come that may hide an input which is not hidden yet.
+    // Whether a word is still to come that may hide an input which is not hidden yet.
     bool isUndecided(int tile, int generation) const
     {
         if (!anyOpen_ || generation >= from(tile))

@@ -1,6 +1,6 @@
-// The jobs of a frame that every rank could do, half of them shared out beforehand, the other half on demand (guided
-// self-scheduling, Polychronopoulos and Kuck 1987): shares shrink with the work that is left. JobShare has the numbers,
-// JobExchange the messages.
+// The jobs of a frame that every rank could do. Half of them are shared out beforehand, the other half on demand by
+// guided self-scheduling (Polychronopoulos and Kuck 1987): shares shrink with the work that is left. JobShare has the
+// numbers, JobExchange the messages.
 #pragma once
 
 #include <dfb/base/fifo.hpp>
@@ -19,7 +19,7 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// A rank's request for jobs. It also carries the number of jobs, as the rank that gets it may not know that yet.
+// A rank's request for jobs. It also carries the number of all jobs, as the rank that gets it may not know that yet.
 struct JobRequest {
     std::int64_t count = 0;
     std::int32_t workers = 1;
@@ -37,7 +37,7 @@ public:
         asked_ = exhausted_ = false;
     }
 
-    // On the rank that hands out. Throws Error (MalformedMessage).
+    // On the rank that hands out jobs: returns the next range. Throws Error (MalformedMessage).
     JobRange give(const JobRequest& request, int rankCount)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -53,7 +53,8 @@ public:
         return {next_ - size, next_};
     }
 
-    // A range that was handed out to this rank; an empty one: there are no more. Throws Error (MalformedMessage).
+    // Takes a range that was handed out to this rank; an empty one says that there are no more. Throws Error
+    // (MalformedMessage).
     void receive(const JobRange& range)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -66,8 +67,8 @@ public:
             exhausted_ = true;
     }
 
-    // The next range to do: nullopt if it has been asked for and has not come yet; empty if there are no more. `asks`:
-    // whether it is time to ask for more, true once for each request: at most one is out.
+    // Returns the next range to do: nullopt if it has been asked for and has not come yet; an empty one if there are no
+    // more. Sets `asks` if the caller must send a request now; at most one request is out.
     std::optional<JobRange> take(std::int64_t count, int rank, int rankCount, bool& asks)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -87,7 +88,7 @@ public:
         return range;
     }
 
-    // take() would return something.
+    // Whether take() would return a range.
     bool ready() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -105,7 +106,7 @@ private:
     bool asked_ = false, exhausted_ = false;
 };
 
-// One per rank. Rank `server` hands out.
+// One per rank. Rank `server` hands out the jobs.
 class JobExchange {
 public:
     // All must live as long as this.
@@ -116,8 +117,8 @@ public:
 
     void newFrame() { share_.newFrame(); }
 
-    // The next range of `count` jobs; empty if there are no more, or the frame has failed. Waits for the rank that
-    // hands out for at most `timeout`, unless that is 0; then the frame fails.
+    // The next range of `count` jobs; empty if there are no more, or the frame has failed. May wait for the rank that
+    // hands out jobs. If that takes longer than `timeout`, the frame fails; 0: it waits without a limit.
     JobRange next(std::int64_t count, std::chrono::milliseconds timeout)
     {
         std::optional<JobRange> range = take(count);
@@ -153,7 +154,7 @@ public:
     }
 
 private:
-    // Asks for more at once, so that it comes while this is worked on.
+    // Also asks for the next range at once, so that it comes while this one is worked on.
     std::optional<JobRange> take(std::int64_t count)
     {
         bool asks = false;

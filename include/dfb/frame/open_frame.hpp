@@ -1,10 +1,11 @@
 // OpenFrame: the frame that is open on this rank, as a state machine (drawn in docs/architecture.md): its states, who
 // causes a transition, what belongs to it, and what it still waits for.
 //
-// open(), finish() and close() are called by the thread that is in begin() and end(); fail() by any, for a failure of
-// this rank or one that another has told; vote() by any that may have brought about the last thing to wait for;
-// decide() by the one that takes the result of the vote. close() is right in every state: in Voted and before when the
-// transport has failed, so that no verdict comes.
+// The thread that is in begin() or end() calls open(), finish() and close(). Any thread calls fail(), for a failure of
+// this rank, and failElsewhere(), for one that another rank has reported. Any thread calls vote() when it may have
+// brought about the last thing to wait for. The thread that takes the result of the vote calls decide(). close() is
+// right in every state: if the transport has failed, so that no verdict comes, it is called in Voted or an earlier
+// state.
 #pragma once
 
 #include <dfb/comm/message.hpp>
@@ -24,32 +25,32 @@ namespace detail {
 
 enum class FrameState : std::uint8_t {
     Closed,    // before begin() and after end()
-    Rendering, // end() was not called yet
+    Rendering, // end() has not been called yet
     Finishing, // end() waits for the tiles that this rank owns and, on the display rank, for those of the others
     Failed,    // on this rank or another; this rank has not voted yet
     Voted,     // this rank has said how the frame went for it, and waits for the others
-    Decided    // all ranks have: running work may come to its end
+    Decided    // all ranks have voted; work that is running may come to its end
 };
 
-// All members may be called from any thread, but for open(), finish() and close(): one at a time.
+// Any thread may call the members, except open(), finish() and close(): one thread at a time.
 class OpenFrame {
 public:
-    // Frames are numbered from `first`, every `step`.
+    // Frames have the numbers `first`, `first` + `step`, and so on.
     explicit OpenFrame(std::int64_t first = 1, std::int64_t step = 1) : number_(first - step), step_(step)
     {
         for (std::vector<Arrival>* messages : {&early_, &opened_})
-            messages->reserve(256); // how many come early depends on time: mostly no more
+            messages->reserve(256); // how many come early depends on timing; rarely more
     }
 
     FrameState state() const noexcept { return state_; }
-    // The last frame that was opened; not positive before the first. And the one that comes next.
+    // The number of the frame that was opened last (not positive before the first), and of the one that comes next.
     std::int64_t number() const noexcept { return number_; }
     std::int64_t next() const noexcept { return number_ + step_; }
 
     // ---- transitions
 
-    // Opens the next frame and returns the messages that came too early for it, to be taken before the next open().
-    // Throws InvalidArgument unless it is closed.
+    // Opens the next frame and returns its messages that came too early. The caller must take them before the next
+    // open(). Throws InvalidArgument if a frame is open.
     std::vector<Arrival>& open()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -67,7 +68,7 @@ public:
         return opened_;
     }
 
-    // end() was called.
+    // Called when end() has begun.
     void finish()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -79,7 +80,7 @@ public:
         bool isFirst = false; // nobody has told the other ranks yet
         bool inTime = false;  // this rank's vote will say so
     };
-    // The frame has failed here. The first reason counts.
+    // Fails the frame because of an error on this rank. The first reason counts.
     Failure fail(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -88,14 +89,15 @@ public:
         result.inTime = failNow(info);
         return result;
     }
-    // Fails the frame because another rank says so; that one has told all.
+    // Fails the frame because another rank says so. That rank has told all.
     void failElsewhere(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         isTold_ = true;
         failNow(info);
     }
-    // Something was lost, but the frame goes on: the vote says so. False if this rank has voted: then it does not.
+    // Notes that something was lost, but the frame goes on. Returns whether this rank's vote will say so: not if it has
+    // voted already.
     bool note(const ErrorInfo& info)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -104,8 +106,8 @@ public:
         return isBeforeVote();
     }
 
-    // Makes this rank vote, once: when it has called end() and `isDone()`, or the frame has failed and nobody reads
-    // inputs in place any more, and `may()`. True if it is to vote now.
+    // Returns true, once, if this rank is to vote now. It votes when it has called end() and `isDone()` is true, or
+    // when the frame has failed and nobody reads inputs in place any more. In both cases `may()` must be true.
     template <class IsDone, class May>
     bool vote(const IsDone& isDone, const May& may)
     {
@@ -118,7 +120,7 @@ public:
         return true;
     }
 
-    // The verdict of all ranks is here.
+    // Called when the verdict of all ranks is here.
     void decide()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -126,8 +128,8 @@ public:
             state_ = FrameState::Decided;
     }
 
-    // Lets nothing more in, and waits until all have left. `help()` runs work that some of them may be waiting for, and
-    // is false if there is nothing.
+    // Lets nobody enter any more, and waits until all have left. `help()` runs work that some of them may be waiting
+    // for, and returns false if there is none.
     template <class Help>
     void close(const Help& help)
     {
@@ -144,11 +146,12 @@ public:
 
     // ---- how it goes
 
-    // It has failed on some rank, as far as this one knows. After close(): the last one had.
+    // Whether the frame has failed on some rank, as far as this one knows. After close(): whether the last frame had
+    // failed.
     bool failed() const noexcept { return failed_.load(std::memory_order_relaxed); }
-    // A message was damaged, here or where the frame failed first: it may be one that the verdict needs.
+    // Whether a message was damaged, here or where the frame failed first. It may be one that the verdict needs.
     bool isDamaged() const noexcept { return damaged_; }
-    // The first thing that went wrong as far as this rank knows, also if the frame goes on without it.
+    // The first error that this rank knows of, also if the frame goes on in spite of it.
     std::optional<ErrorInfo> reason() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -157,20 +160,20 @@ public:
 
     // ---- the tiles of this rank
 
-    // So many more are to be finished.
+    // `count` more tiles are to be finished.
     void expectTiles(std::int64_t count)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         tilesLeft_ += count;
     }
-    // One of them is. True if that was the last of all.
+    // One tile has been finished. Returns whether it was the last of all.
     bool tileFinished()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         --tilesLeft_;
         return finishesTiles();
     }
-    // There are no more than have been expected. True if none is left.
+    // No more tiles will be expected. Returns whether none is left.
     bool expectNoMore()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -179,15 +182,15 @@ public:
     }
     bool areTilesKnown() const noexcept { return areTilesKnown_; }
     bool areTilesFinished() const noexcept { return areTilesFinished_; }
-    // Call it when the work that the last of them leaves is done, before vote().
+    // Call it before vote(), when the work that follows the last finished tile is done.
     void setTilesFinished() noexcept { areTilesFinished_ = true; }
 
     // ---- entering and leaving
 
     enum class Entry : std::uint8_t {
-        Inside, // it may be worked on now; leave() must follow
-        Kept,   // it belongs to the frame to come
-        Late,   // it is of no use any more, and has been counted
+        Inside, // the message may be worked on now; leave() must follow
+        Kept,   // it belongs to the next frame
+        Late,   // it is of no use any more; counted if it has pixels
         Absurd  // no rank can be so far ahead: a frame ends only when all ranks have begun it
     };
 
@@ -201,7 +204,7 @@ public:
             return Entry::Kept;
         }
         if (header.number < number_ || state_ == FrameState::Closed) {
-            // Of control messages a late one is no sign of anything.
+            // A late control message is no sign of anything.
             late_ += header.kind == MessageKind::Fragment || header.kind == MessageKind::FinishedTiles;
             return Entry::Late;
         }
@@ -219,10 +222,10 @@ public:
     struct Leave {
         void operator()(OpenFrame* frame) const { frame->leave(); }
     };
-    // Somebody who has entered, and leaves at the end of this; null: nobody.
+    // Somebody who has entered, and who leaves when this is destroyed. Null: nobody.
     using Inside = std::unique_ptr<OpenFrame, Leave>;
 
-    // For work that is no message. Null: it may not go on.
+    // Enters for work that is not a message. Null: frame `number` is not open, so the work must not go on.
     Inside enter(std::int64_t number)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -231,8 +234,8 @@ public:
         return Inside(isOpen ? this : nullptr);
     }
 
-    // Enters once more from inside, for work that goes on after the caller has left: close() waits for that, too, also
-    // if it has begun to wait already.
+    // Enters once more from inside, for work that goes on after the caller has left. close() waits for that work too,
+    // even if it has begun to wait already.
     Inside enterAgain()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -240,9 +243,9 @@ public:
         return Inside(this);
     }
 
-    // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So this rank
-    // does not vote while a task reads inputs, once the frame has one that `isInPlace`. False if the frame has failed:
-    // then inputs must not be read. Else endReading() must follow.
+    // Inputs that are read in place lie in memory that their renderers use again when the frame has ended. So once the
+    // frame has an input that `isInPlace`, this rank does not vote while a task reads inputs. Returns false if the
+    // frame has failed: then inputs must not be read. Otherwise endReading() must follow.
     bool beginReading(bool isInPlace = false)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -250,7 +253,7 @@ public:
         readers_ += !failed_;
         return !failed_;
     }
-    // Returns whether vote() has to be tried, as the frame has failed meanwhile.
+    // Returns whether vote() has to be tried, because the frame has failed meanwhile.
     bool endReading()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -261,16 +264,16 @@ public:
     std::int64_t takeLateCount() noexcept { return late_.exchange(0); }
 
 private:
-    // Under mutex_, as are the next ones.
+    // Call this and the next two under mutex_.
     bool isBeforeVote() const noexcept
     {
         return state_ == FrameState::Rendering || state_ == FrameState::Finishing || state_ == FrameState::Failed;
     }
-    // True if this rank's vote will say so.
+    // Returns whether this rank's vote will say so.
     bool failNow(const ErrorInfo& info)
     {
         damaged_ = damaged_ || info.kind == ErrorKind::MalformedMessage;
-        if (!error_) // else one that the frame could bear, or the reason of an earlier call
+        if (!error_) // else an error that the frame could bear, or the first reason, stays
             error_ = info;
         failed_ = true;
         const bool inTime = isBeforeVote();
@@ -289,7 +292,7 @@ private:
     std::atomic<bool> areTilesKnown_{false}, areTilesFinished_{false};
     // Under mutex_:
     std::optional<ErrorInfo> error_;
-    bool isTold_ = false; // to all ranks, by this one or another: the frame has failed
+    bool isTold_ = false; // some rank has told all others that the frame has failed
     std::int64_t tilesLeft_ = 0;
     int inside_ = 0, readers_ = 0;
     bool hasInPlace_ = false;

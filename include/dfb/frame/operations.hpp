@@ -56,17 +56,17 @@ public:
     virtual TileReport report() const = 0;
 };
 
-// Both operations of one frame at a time.
+// The tile operation and the pixel operation, for one frame at a time.
 class Operations {
 public:
     virtual ~Operations() = default;
 
     const OperationTraits& traits() const noexcept { return traits_; }
 
-    // Must not live longer than this object.
+    // The result must not live longer than this object.
     virtual std::unique_ptr<TileStage> makeTile() const = 0;
     virtual bool opaqueHides(const TileInfo& info) const = 0;
-    // From several threads at once.
+    // Several threads may call it at once.
     virtual void process(PixelTile& tile) const = 0;
 
 protected:

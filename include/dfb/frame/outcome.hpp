@@ -22,21 +22,24 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Members may be called from any thread, but for newFrame() and conclude().
+// Any thread may call the members, except newFrame(), beginEnd(), isConcluded() and conclude(): they are for the thread
+// that begins and ends frames.
 class FrameOutcome {
 public:
     using Clock = std::chrono::steady_clock;
     using Bytes = ReductionTable::Bytes;
-    // Its reductions.
+    // The kinds of its reductions.
     enum Scope : std::uint32_t { AllDeclared = Mailbox::ownScope + 1, FrameVerdict, Quiet = Mailbox::quietScope };
 
-    // `addFigures(verdict)` adds what this rank has counted in the frame to its vote. All must live as long as this.
+    // `addFigures(verdict)` adds this rank's counts of the frame to its vote. All arguments must live as long as this
+    // object.
     FrameOutcome(Mailbox& mailbox, OpenFrame& frame, TilePipeline& tiles, std::function<void(Verdict&)> addFigures)
         : mailbox_(mailbox), frame_(frame), tiles_(tiles), addFigures_(std::move(addFigures))
     {
     }
 
-    // Before the frame is opened. `quiet`: until the first look whether anything is under way.
+    // Call it before the frame is opened. `quiet`: how long end() waits before it first looks whether any message is
+    // under way.
     void newFrame(const FrameTerms& terms, std::chrono::milliseconds quiet)
     {
         terms_ = terms;
@@ -47,14 +50,15 @@ public:
         quiescence_.newFrame(quiet);
     }
 
-    // The frame has failed on some rank, or the transport has.
+    // Whether the frame has failed on some rank, or the transport has failed.
     bool failed() const noexcept { return frame_.failed() || mailbox_.failed(); }
-    // The last frame did not end well.
+    // Whether the last frame has ended with an error.
     bool lastFailed() const noexcept { return lastFailed_; }
 
     // ---- failure
 
-    // Runs `body`; an exception makes the frame fail. `where` says which place is known by then. False if it did throw.
+    // Runs `body`. If it throws, calls fail() and returns false. `where`: the place of the error, as far as it is known
+    // when `body` throws.
     bool guarded(FunctionRef<void()> body, const ErrorInfo& where = {})
     {
         try {
@@ -66,8 +70,8 @@ public:
         }
     }
 
-    // Something went wrong here: the frame fails, or goes on without it if it may be partial. False if this rank has
-    // voted already, so that its vote does not say it.
+    // Reports that something went wrong on this rank. The frame fails, or goes on without the lost part if it may be
+    // partial. Returns false if this rank has voted already, so that its vote does not contain the error.
     bool fail(const std::exception_ptr& reason, const ErrorInfo& where = {})
     {
         return fail(errorInfoOf(reason, where));
@@ -79,11 +83,11 @@ public:
             return failWhole(info);
         const bool inTime = frame_.note(info);
         if (!inTime && !failed())
-            frame_.countLate(); // the verdict will not say it
+            frame_.countLate(); // the verdict will not contain it
         return inTime;
     }
 
-    // Fails the frame, also if it may be partial, because it cannot go on.
+    // Fails the frame even if it may be partial, because it cannot go on. Returns what fail() does.
     bool failWhole(const ErrorInfo& reason)
     {
         const OpenFrame::Failure failure = frame_.fail(placed(reason));
@@ -96,14 +100,15 @@ public:
         return failure.inTime;
     }
 
-    // The frame has failed: messages that have not left count no more, unless finished tiles are wanted.
+    // Called when the frame has failed: drops the messages that have not left, except finished tiles if the frame may
+    // be partial.
     void dropRest(ErrorKind why)
     {
         const bool isPartial = terms_.allowPartial;
         const auto matters = [isPartial](const Buffer& message) {
             return isPartial && FinalGather::isFinishedTile(loadAs<MessageHeader>(message.data()).kind);
         };
-        // Where something is missing, credit may be missing, too: nobody waits for it then.
+        // If something is missing, it may be credit. Then nobody waits for credit.
         if (isMissing(why))
             isCreditInDoubt_ = true;
         mailbox_.flow().drop(matters, isPartial && !isMissing(why));
@@ -113,7 +118,8 @@ public:
 
     // ---- messages
 
-    // Takes a message about how the frame goes: Abort and reductions. False if it is none.
+    // Takes a message about the outcome of the frame: an abort or a part of a reduction. Returns false for any other
+    // message.
     bool receive(int source, const MessageHeader& header, const Buffer& message)
     {
         switch (header.kind) {
@@ -126,7 +132,8 @@ public:
 
     // ---- the vote
 
-    // Enters the frame's verdict when all is done here, or the frame has failed somewhere.
+    // Enters the reduction of the frame's verdict when this rank has nothing left to do, or the frame has failed
+    // somewhere.
     void tryVote()
     {
         if (mailbox_.failed() || !frame_.vote([this] { return isDone(); }, [this] { return mayVote(); }))
@@ -148,8 +155,7 @@ public:
         });
     }
 
-    // This rank has set its last tile: from now on it votes as soon as it can. Of the thread that is in end(), as the
-    // next two.
+    // Called when this rank has set its last tile: from now on it votes as soon as it can.
     void beginEnd()
     {
         if (endedAt_)
@@ -162,9 +168,9 @@ public:
         tryVote();
     }
 
-    // Whether conclude() need not wait for the verdict any more: it is here, or will not come. Does the work of a rank
-    // that waits for it: looks now and then whether anything is under way, and makes the frame fail when its time is
-    // up.
+    // Whether conclude() need not wait for the verdict any longer, because it is here or will not come. Also does the
+    // work of a rank that waits: it looks now and then whether any message is under way, and makes the frame fail when
+    // its time is up.
     bool isConcluded()
     {
         if (isDecided() || mailbox_.failed())
@@ -188,7 +194,7 @@ public:
         Verdict verdict;
         try {
             beginEnd();
-            do { // at least once: with Progress::Caller wait() sends on what other ranks need
+            do { // at least once: with Progress::Caller, wait() moves messages that others need
                 mailbox_.wait([this] { return isDecided() || isVerdictInDoubt(); }, nextEvent());
             } while (!isConcluded());
             if (!isDecided())
@@ -196,9 +202,9 @@ public:
             verdict = *verdict_;
             if (!verdict.error)
                 verdict.error = verdict.strayInputs();
-            if (verdict.error && verdict.error->frame < 0) // found where verdicts were combined
+            if (verdict.error && verdict.error->frame < 0) // an error that was found when verdicts were combined
                 verdict.error->frame = frame_.number();
-            if (isPartial(verdict)) // not from ranks that send none
+            if (isPartial(verdict)) // only then do all ranks send theirs
                 waitForFinishedTiles();
         } catch (const TransportError&) {
             transportError = std::current_exception();
@@ -219,7 +225,7 @@ public:
         return verdict;
     }
 
-    // The frame has an image although something is missing.
+    // Whether the frame has an image although something is missing.
     bool isPartial(const Verdict& verdict) const
     {
         return terms_.allowPartial && verdict.error && verdict.error->kind != ErrorKind::Disagreement;
@@ -240,7 +246,7 @@ private:
     {
         return terms_.allowPartial && !isMissing(kind) && kind != ErrorKind::Cancelled
                && kind != ErrorKind::Disagreement
-               && (kind != ErrorKind::MalformedMessage || terms_.timeoutMs > 0); // its content is waited for
+               && (kind != ErrorKind::MalformedMessage || terms_.timeoutMs > 0); // it is waited for until the time-out
     }
 
     void tellOthers(const ErrorInfo& info)
@@ -261,7 +267,7 @@ private:
         if (isMissing(info.kind)) {
             if (!failed())
                 mine = missing(info.kind);  // this rank's part of the text
-            info.tile = info.expected = -1; // it must not pass for the list of the rank that it came from
+            info.tile = info.expected = -1; // weighs less than the list in its sender's own vote
         }
         frame_.failElsewhere(mine && Verdict::weight(*mine) > Verdict::weight(info) ? *mine : info);
         dropRest(info.kind);
@@ -269,7 +275,8 @@ private:
     }
 
     // Ranks that were given different parameters may wait for different things, so that none of them would ever be
-    // done: a partial result from below in the tree shows it, as it was sent without waiting for this rank.
+    // done. A partial result from below in the tree shows the difference, because it was sent without waiting for this
+    // rank.
     void receiveReduction(int source, const MessageHeader& header, const Buffer& message)
     {
         const std::uint32_t scope = mailbox_.scopeOf(message);
@@ -295,18 +302,18 @@ private:
                 fail(Verdict::disagreement());
             mailbox_.receiveReduction(source, header, message);
         } catch (const Error& e) {
-            // Without this message there would never be a result.
+            // Without this message the reduction would never have a result.
             mailbox_.giveUp(source, e.info());
         }
     }
 
-    // This rank waits for nothing but the others.
+    // Whether this rank has nothing left to do and only waits for other ranks.
     bool isDone() const { return frame_.areTilesFinished() && tiles_.table().isSaid() && tiles_.gather().complete(); }
 
-    // Where only end() moves messages, all that others have sent must have been taken before any rank may leave: who
-    // polls no more takes nothing, and its sender would wait in end() for it to go. In a frame that may be partial
-    // credit must not be waited for after that, either: who has left gives none. But credit that may be lost must not
-    // hold up the vote: then finished tiles still have as long as waitForFinishedTiles() takes.
+    // If only end() moves messages, every message must have been taken before any rank may leave: a rank that polls no
+    // more takes nothing, and the sender would wait in end() for its message to go. In a frame that may be partial, a
+    // rank must not wait for credit after its vote either, as ranks that have left give none. But credit that may be
+    // lost must not hold up the vote: then finished tiles still have the time that waitForFinishedTiles() waits.
     bool mayVote() const
     {
         const bool needsCaller = mailbox_.connection().needsCaller();
@@ -319,14 +326,15 @@ private:
     bool isDecided() const noexcept { return frame_.state() == FrameState::Decided; }
     bool hasTimeout() const noexcept { return terms_.timeoutMs > 0; }
 
-    // A damaged message was noticed, which may have been part of the verdict, and there is no time-out: from now on the
-    // verdict is waited for no longer than for a rank of which nothing is heard.
+    // Whether a damaged message was noticed that may have been part of the verdict, while no end of the wait is set
+    // yet. isConcluded() then sets one: the wait for the verdict is as long as that for a rank of which nothing is
+    // heard.
     bool isVerdictInDoubt() const
     {
         return !givesUpAt_ && frame_.isDamaged() && mailbox_.connection().config().peerTimeout.count() > 0;
     }
 
-    // When isConcluded() has something to do.
+    // The time at which isConcluded() next has something to do.
     Clock::time_point nextEvent() const
     {
         auto next = nextLook_;
@@ -335,7 +343,7 @@ private:
         return givesUpAt_ ? std::min(next, *givesUpAt_) : next;
     }
 
-    // Of a frame that failed and may be partial: those that other ranks have finished may still be on their way.
+    // If a frame failed and may be partial, tiles that other ranks have finished may still be on their way.
     void waitForFinishedTiles()
     {
         const auto areThere = [this] { return tiles_.gather().complete() && mailbox_.flow().allSent(); };
@@ -371,7 +379,7 @@ private:
         }
     };
 
-    // Enters a round, if this rank rests, and the last one has come to its end. By the thread that is in end().
+    // Enters a round if this rank is at rest and the last round is over. Only the thread that is in end() calls it.
     void look()
     {
         tryVote();
@@ -415,7 +423,8 @@ private:
         return placed(std::move(info));
     }
 
-    // Says whose part of a reduction this rank waits for, and in `from`, if there is only one that it can be.
+    // Adds to the message which ranks' parts of a reduction this rank waits for. Sets `from` if it can only be one
+    // rank.
     void addWaitedFor(ErrorInfo& info, const ReductionKey& key)
     {
         const auto missing = mailbox_.reductions().missing(key);
@@ -458,10 +467,10 @@ private:
     std::optional<Verdict> verdict_;           // set once, before the frame is Decided
     std::optional<TraceSpan> verdictSpan_;     // from this rank's vote on
     Quiescence quiescence_;
-    // Of the thread that is in end():
-    std::optional<Clock::time_point> endedAt_;   // beginEnd() was called
-    Clock::time_point nextLook_;                 // whether anything is under way; from then on
-    std::optional<Clock::time_point> givesUpAt_; // waiting for the verdict
+    // Only for the thread that is in end():
+    std::optional<Clock::time_point> endedAt_;   // when beginEnd() was called
+    Clock::time_point nextLook_;                 // when to call look() next
+    std::optional<Clock::time_point> givesUpAt_; // when to stop waiting for the verdict
 };
 
 } // namespace detail

@@ -29,8 +29,8 @@ namespace detail {
 
 class TilePipeline {
 public:
-    // `config` and `operations` must live as long as this. `hasFarRanks`: there are ranks that share no memory with
-    // this one. Throws InvalidArgument for a configuration that cannot be.
+    // `config` and `operations` must live as long as this. `hasFarRanks`: whether there are ranks that share no memory
+    // with this one. Throws InvalidArgument for an impossible configuration.
     TilePipeline(std::shared_ptr<MemoryPool> pool, const FrameBufferConfig& config, Operations& operations, int rank,
                  int rankCount, bool hasFarRanks, std::uint32_t address, FinalGather::Send sendToDisplay,
                  FinalGather::Fail fail)
@@ -50,8 +50,8 @@ public:
     {
         return static_cast<ChannelMask>(config.image.aux | (config.image.depth ? depthChannel : 0));
     }
-    // Returns the channels of a tile that somebody reads: the operation, the image, or the search for the nearest of
-    // several passes, which gives position and ids. `isOrdered`: the operation does without depth.
+    // Returns the channels of an input that somebody reads: the operation, the image, or the search for the nearest of
+    // several passes, which gives position and ids (`comparesPasses`). `isOrdered`: the operation does without depth.
     static ChannelMask travelling(const OperationTraits& traits, const FrameBufferConfig& config,
                                   bool comparesPasses = true, bool isOrdered = false)
     {
@@ -62,7 +62,7 @@ public:
                                         & (needed | imageChannels(config) | (comparesDepths ? depthChannel : 0)));
     }
 
-    // The most that one message with pixels can have.
+    // The most bytes that one message with pixels can have.
     static std::size_t largestMessage(const OperationTraits& traits, const FrameBufferConfig& config)
     {
         const int width = traits.tileWidth, height = traits.tileHeight;
@@ -74,7 +74,7 @@ public:
     TileTable& table() noexcept { return table_; }
     FinalGather& gather() noexcept { return gather_; }
 
-    // No other member may be running. `params` must live until the next one. `haveMoved`: what
+    // No other member may be running. `params` must live until the next newFrame(). `haveMoved`: what
     // table().prepare(params.owners) has returned. `compresses`: whether finished tiles are compressed.
     void newFrame(std::int64_t frame, const FrameConfig& params, Accumulation::Start start, bool haveMoved,
                   bool compresses)
@@ -110,8 +110,8 @@ public:
 
     ChannelMask sent() const noexcept { return sent_; } // of the inputs of this frame
 
-    // Throws InvalidArgument for a tile that a renderer cannot have meant for this frame, and if it has a colour but
-    // not another channel that must travel.
+    // Throws InvalidArgument if a tile does not fit this frame, or if it has a colour but lacks another channel that
+    // must travel.
     void check(const InputPixels& tile) const
     {
         const TileInfo& frame = table_.frameInfo();
@@ -155,7 +155,7 @@ public:
         info.source = input.source;
     }
 
-    // Whether inputs of a tile are hidden by an opaque one.
+    // Whether an opaque input of a tile hides those behind it.
     bool opaqueHides(int tile) const
     {
         TileInfo info = table_.frameInfo();
@@ -181,8 +181,8 @@ public:
         return header;
     }
 
-    // The message for a tile that has been checked. `codec` may be null. `isFar`: to a rank that shares no memory with
-    // this one.
+    // Returns the message for a tile that has passed check(). `codec` may be null. `isFar`: whether it goes to a rank
+    // that shares no memory with this one.
     Buffer encode(const InputPixels& tile, const Codec* codec, bool isFar)
     {
         const FloatEnvironment floatEnvironment;
@@ -200,15 +200,15 @@ public:
                && (sent_ & ~(colorChannel | depthChannel)) == 0 && tile.planes.at[Color] && !tile.valid.empty();
     }
 
-    // The message for such a tile of another owner. `offsetOf(address)`: from the start of the memory that the owner
-    // sees, or -1. Empty if the pixels do not lie in it.
+    // Returns the message for such a tile if another rank owns it. `offsetOf(address)`: the offset from the start of
+    // the memory that the owner sees, or -1. The message is empty if the pixels do not lie in that memory.
     template <class OffsetOf>
     Buffer encodePlace(const InputPixels& tile, const OffsetOf& offsetOf)
     {
         return encodeInPlace(*pool_, tile, inPlace(tile), sent_ | colorChannel, address_, offsetOf);
     }
 
-    // Returns such an input of this rank's own.
+    // Returns the input for such a tile if this rank owns it.
     Fragment inputOf(const InputPixels& tile)
     {
         Fragment::Parts parts;
@@ -220,14 +220,14 @@ public:
         return Fragment(tile, Buffer(), parts);
     }
 
-    // Remembers the pixels of a tile that are to stay as they are. From several threads.
+    // Remembers the checksum of a tile whose pixels must stay as they are. Several threads may call it.
     void notePromise(const InputPixels& tile)
     {
         const std::uint32_t sum = checksumOf(tile);
         const std::lock_guard<std::mutex> lock(reportsMutex_);
         promises_.push_back({tile, sum});
     }
-    // Returns a tile whose pixels have not stayed as they were, or -1.
+    // Returns a tile whose pixels have changed since notePromise(), or -1.
     int brokenPromise()
     {
         const std::lock_guard<std::mutex> lock(reportsMutex_);
@@ -270,8 +270,8 @@ public:
     void finish(int tile)
     {
         if (table_.isSpoilt(tile))
-            return; // why has been said
-        // The display rank knows how the background looks.
+            return; // the reason has been reported
+        // Nothing is sent: the display rank knows how the background looks.
         if (traits().emptyIsBackground && traits().pixelOpIsPointwise && !table_.hasPixels(tile)) {
             table_.setFinished(tile);
             return;
@@ -287,8 +287,8 @@ public:
         }
     }
 
-    // No pixel has more inputs than `maxLayers` in a pass; 0: not known. Picks the format of what is encoded from now
-    // on.
+    // Picks the colour format of what is encoded from now on. `maxLayers`: the most inputs that any pixel has in a
+    // pass; 0: not known.
     void setLayers(int maxLayers)
     {
         const double largest = largestBackground();
@@ -325,13 +325,13 @@ public:
         gather_.fillBackground(background_, [this](int tile) { return table_.samples(tile).count == 0; });
     }
 
-    // The frame has ended without these tiles; see FinalGather.
+    // Called when the frame has ended without these tiles; see FinalGather.
     void setIncomplete(std::vector<std::int32_t>& tiles)
     {
         gather_.setIncomplete(tiles, [this](int tile) { return !backgroundIsFine_ && table_.samples(tile).count > 0; });
     }
 
-    // Of the inputs of this frame that this rank has copied or read in place.
+    // The faults in the inputs of this frame that this rank has copied or read in place.
     const FaultCounts& faults() const noexcept { return faults_; }
 
     // The operation's reports on this rank's tiles, up to now.
@@ -349,7 +349,7 @@ public:
 private:
     const OperationTraits& traits() const noexcept { return operations_.traits(); }
 
-    // The tile operation writes straight to where the tile belongs. False if the frame is over.
+    // The tile operation writes straight to where the tile belongs. Returns false if the frame is over.
     bool finishIntoPlace(int tile)
     {
         const Region region = table_.layout().region(tile);
@@ -357,15 +357,15 @@ private:
         auto place = gather_.reserve(tile);
         background.newFrame(region.width(), region.height(), place.imageEpoch);
         FinishedTile out(region, config_.image.format, place.planes, place.stride, config_.image.dither, &background);
-        if (place.own.empty()) // in the image
+        if (place.own.empty()) // the place is in the image
             out.storePastCache();
         table_.finish(tile, out);
         storesAreDone();
         return gather_.commit(tile, std::move(place), out.writtenPixels());
     }
 
-    // The tile operation writes floats, the pixel operation changes them, then they are converted. False if the frame
-    // is over.
+    // The tile operation writes floats, the pixel operation changes them, then they are converted. Returns false if the
+    // frame is over.
     bool finishThroughPixelOp(int tile)
     {
         const Region region = table_.layout().region(tile);
@@ -405,12 +405,12 @@ private:
         return config_.precision.color != WireFormat::Float32 || budget_ > 0 || config_.minTransmittance > 0;
     }
 
-    // The error that colours may have on the way, 0: none, or not by a budget.
+    // The error that colours may get on the way; 0: none, or it is not set by a budget.
     static double budgetOf(const FrameBufferConfig& config, bool hasFarRanks)
     {
         if (!config.precision.isHalfLevel)
             return config.precision.budget;
-        const double level = 1.0 / 255, steepest = 12.92; // of the sRGB curve
+        const double level = 1.0 / 255, steepest = 12.92; // steepest: of the sRGB curve
         const bool isBytes = config.image.format == OutputFormat::RGBA8 || config.image.format == OutputFormat::SRGBA8;
         if (!hasFarRanks || !isBytes)
             return 0;
@@ -454,8 +454,8 @@ private:
         std::uint32_t checksum;
     };
     std::mutex reportsMutex_;
-    Reports reports_;               // under reportsMutex_, as the next one
-    std::vector<Promise> promises_; // of TileView::staysUntilEnd, if they are checked
+    Reports reports_;               // under reportsMutex_, as is promises_
+    std::vector<Promise> promises_; // see notePromise()
 };
 
 } // namespace detail

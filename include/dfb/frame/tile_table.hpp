@@ -30,7 +30,7 @@ namespace detail {
 // arrive() and declare() may be called from any thread, for one frame at a time.
 class TileTable {
 public:
-    // `operations` must live as long as this. Throws InvalidArgument for owners that there are not, and OutOfMemory.
+    // `operations` must live as long as this. Throws InvalidArgument for owners that do not exist, and OutOfMemory.
     TileTable(const TileLayout& layout, const OwnerMap& ownerMap, int rank, int rankCount, const Operations& operations)
     try : operations_(operations), layout_(layout), rank_(rank), rankCount_(rankCount),
         slots_(static_cast<std::size_t>(layout.tileCount())),
@@ -51,15 +51,15 @@ public:
 
     const TileLayout& layout() const noexcept { return layout_; }
 
-    // Of this frame, and by the owner map alone.
+    // The owners of this frame, and those by the owner map alone.
     int owner(int tile) const noexcept { return (*owners_)[static_cast<std::size_t>(tile)]; }
     const std::vector<int>& owned() const noexcept { return owned_; }
     const std::vector<int>& ownersByMap() const noexcept { return *byMap_; }
     const std::vector<int>& ownedByMap() const noexcept { return ownedByMap_; }
 
     bool isMine(int tile) const noexcept { return tile >= 0 && tile < layout_.tileCount() && owner(tile) == rank_; }
-    // Makes room for the owners that newFrame() will get. Returns whether they are others than before. Throws
-    // InvalidArgument if they cannot be: `who` gives them.
+    // Makes room for the owners that newFrame() will get. Returns whether they differ from the present ones. Throws
+    // InvalidArgument if they are not valid; the text names `who` as their source.
     bool prepare(const TileOwners& owners, const char* who = "FrameConfig::owners")
     {
         const std::vector<int>& next = *(owners ? owners : byMap_);
@@ -76,8 +76,8 @@ public:
     }
     const TileInfo& frameInfo() const noexcept { return info_; }
 
-    // `info` is common to all tiles, and gets this rank; `owners`: see prepare(), which was called with them. No other
-    // member may be running.
+    // `info` is common to all tiles; its `rank` is set here. prepare() was called with these `owners` and has returned
+    // `haveMoved`. No other member may be running.
     void newFrame(const TileInfo& info, const SamplePlan& plan, const TileOwners& owners, bool haveMoved)
     {
         if (haveMoved)
@@ -95,14 +95,16 @@ public:
                 series.next = s.first + s.count;
             }
     }
-    // Call it once the error of a spoilt tile has been reported. A frame may end only when isSaid(): all have been.
+    // Call it once the error of a spoilt tile has been reported. A frame may end only when isSaid(): all of them have
+    // been.
     void saidWhy() { --unsaid_; }
     bool isSaid() const noexcept { return unsaid_ == 0; }
 
-    // How many inputs have come to tiles of this rank that nothing was wrong with. Where all tiles are complete, there
-    // were as many as all ranks have sent; else one too many has come before one that was meant.
+    // The number of inputs that have come to tiles of this rank and with which nothing was wrong. If all tiles are
+    // complete, the numbers of all ranks add up to the number of inputs sent. If they do not, one input too many has
+    // come before one that was meant.
     std::int64_t arrivedCount() const noexcept { return arrived_; }
-    // How many tiles needed no more although more was to come.
+    // The number of tiles that needed no more inputs although more were to come.
     std::int64_t endedEarlyCount() const noexcept { return endedEarly_; }
 
     // Returns the samples that a tile gets in this frame.
@@ -113,11 +115,11 @@ public:
 
     struct Arrival {
         bool ready = false;  // the tile's inputs are now complete: call finish() once
-        bool spoilt = false; // the tile is: call saidWhy() when it is known why
+        bool spoilt = false; // the tile is spoilt: call saidWhy() when its error has been reported
     };
 
-    // Hands an input of rank `from` to its tile. Throws the exceptions of the tracker and of the op: then the tile is
-    // spoilt, and no more is waited for, so that both may be set in `arrival`.
+    // Hands an input of rank `from` to its tile. Throws the exceptions of the tracker and of the operation. Then the
+    // tile is spoilt and waits for no more inputs, so both members of `arrival` may be set.
     void arrive(Fragment&& fragment, int from, Arrival& arrival)
     {
         const TileHeader h = fragment.header();
@@ -190,7 +192,7 @@ public:
             std::rethrow_exception(failure);
     }
 
-    // Something was wrong with its inputs: it is not to be finished. The tile must be complete.
+    // Whether something was wrong with the tile's inputs, so that it must not be finished. The tile must be complete.
     bool isSpoilt(int tile)
     {
         const std::lock_guard<std::mutex> lock(mutexOf(tile));
@@ -203,18 +205,18 @@ public:
     // The tile must be complete. Nothing else touches its op any more.
     void finish(int tile, FinishedTile& out) { slotFor(tile).op->finish(out); }
 
-    // Of the tile's place in the image; for the thread that finishes it.
+    // The background pixels at the tile's place in the image. For the thread that finishes the tile.
     BackgroundPixels& backgroundPixels(int tile) { return slotFor(tile).background; }
 
-    // A complete tile has been finished, and is on its way.
+    // Called when a complete tile has been finished and is on its way.
     void setFinished(int tile)
     {
         const std::lock_guard<std::mutex> lock(mutexOf(tile));
         slotFor(tile).finished = true;
     }
 
-    // The tiles of this rank that are to be finished in this frame and are not, or are spoilt. `declared`: see
-    // missing().
+    // The tiles of this rank that should be finished in this frame but are not, and those that are spoilt. `declared`:
+    // see missing().
     std::vector<std::int32_t> unfinished(bool declared)
     {
         std::vector<std::int32_t> tiles;
@@ -233,8 +235,8 @@ public:
     // Returns the operation's report on a finished tile.
     TileReport report(int tile) { return slotFor(tile).op->report(); }
 
-    // Returns the inputs that incomplete tiles wait for: the first tile in numbers, all of them in words. With
-    // `declared`, a tile that nobody named waits for nothing.
+    // Returns the inputs that incomplete tiles wait for: those of the first tile in numbers, those of all tiles in
+    // words. With `declared`, a tile that nobody named waits for nothing.
     std::optional<ErrorInfo> missing(bool declared)
     {
         constexpr int mostTiles = 8; // in the text
@@ -299,8 +301,8 @@ private:
     struct Slot {
         std::int64_t frame = -1;
         bool ready = false, touched = false, declared = false, hasPixels = false, finished = false;
-        bool spoilt = false;  // an input has contradicted the others, or the op cannot do with it; also if finished
-        bool counted = false; // by declare()
+        bool spoilt = false;  // an input contradicted others, or the op refused it; even after `finished`
+        bool counted = false; // whether declare() has counted the tile
         std::vector<DependencyTracker> trees; // one per pass
         std::unique_ptr<TileStage> op;        // made with the slot
         BackgroundPixels background;
@@ -309,21 +311,21 @@ private:
     // The samples of a tile over several frames.
     struct Series {
         std::int64_t begin = 0; // the frame with sample 0
-        int next = 0;           // sample
-        bool goesOn = false;    // in this frame
+        int next = 0;           // the sample that comes next
+        bool goesOn = false;    // this frame's samples follow the earlier ones
     };
 
     std::mutex& mutexOf(int tile) { return mutexes_[static_cast<std::size_t>(tile) % mutexes_.size()]; }
 
     std::unique_ptr<Slot>& slotOf(int tile) { return slots_[static_cast<std::size_t>(tile)]; }
-    // Whether the slot is there, and of this frame.
+    // Whether the tile has a slot that is set up for this frame.
     bool isTouched(int tile)
     {
         const auto& slot = slotOf(tile);
         return slot && slot->frame == info_.frame;
     }
 
-    // After prepare(). Slots of tiles that this rank has no more are kept for others.
+    // Call it after prepare(). Slots of tiles that this rank no longer owns are kept for other tiles.
     void setOwners(const TileOwners& owners)
     {
         owners_ = owners;
@@ -347,7 +349,8 @@ private:
         return slot;
     }
 
-    // Of this frame. The first time, throws the exceptions of the op's newFrame(): then the tile is spoilt.
+    // Returns the slot, set up for this frame. The first call in a frame throws the exceptions of the op's newFrame():
+    // then the tile is spoilt.
     Slot& slotFor(int tile)
     {
         auto& slot = slotOf(tile);
@@ -387,7 +390,8 @@ private:
 
     // Whether the samples of this frame follow those of the tile in earlier ones.
     bool goesOn(int tile) const { return traits().keepsState && series_[static_cast<std::size_t>(tile)].goesOn; }
-    // Whether the operation has had any of those: then it gets this frame's, too, also if there is nothing in them.
+    // Whether the operation has had any of those earlier samples. Then it gets this frame's, too, even if they are
+    // empty.
     bool hasSamples(int tile)
     {
         const auto& slot = slotOf(tile);
@@ -436,15 +440,15 @@ private:
     int rank_, rankCount_;
     TileOwners byMap_, owners_; // owners_: of this frame
     std::vector<int> ownedByMap_, owned_;
-    std::vector<std::unique_ptr<Slot>> slots_; // of each tile; null for those of others
+    std::vector<std::unique_ptr<Slot>> slots_; // of each tile; null for tiles of other owners
     std::mutex spareMutex_;
     std::vector<std::unique_ptr<Slot>> spare_; // under spareMutex_
     std::vector<Series> series_;               // of each tile, with an operation that keeps state
     std::array<std::mutex, 64> mutexes_;
-    std::atomic<const ExpectedInputs*> expected_{nullptr}; // null as long as it is not known
+    std::atomic<const ExpectedInputs*> expected_{nullptr}; // null until declare()
     TileInfo info_;
     std::atomic<std::int64_t> arrived_{0}, endedEarly_{0};
-    std::atomic<int> unsaid_{0}; // spoilt tiles of which it is not known yet why
+    std::atomic<int> unsaid_{0}; // spoilt tiles whose errors have not been reported yet
     SamplePlan plan_;            // null: all tiles as info_ says
 };
 

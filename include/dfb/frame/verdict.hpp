@@ -57,7 +57,7 @@ inline bool isMissing(ErrorKind kind) noexcept
     return kind == ErrorKind::TimedOut || kind == ErrorKind::MissingInput;
 }
 
-// The fields of FrameConfig; travels with each verdict as it is.
+// The fields of FrameConfig. Travels as it is with each verdict.
 struct FrameTerms {
     std::uint64_t samplesHash = 0; // 0: there is no plan
     std::int64_t sampleCount = 0;  // of all tiles in the plan
@@ -67,7 +67,7 @@ struct FrameTerms {
     std::array<std::uint32_t, 4> background{}; // bits: so that a NaN equals itself
     std::int32_t passes = 1, maxLayers = 0, timeoutMs = 0;
     std::int32_t declared = 0, allowPartial = 0;
-    std::int32_t rank = 0; // whose; the lowest of those that are alike
+    std::int32_t rank = 0; // the lowest rank with these terms
 
     // Throws InvalidArgument.
     static void check(const FrameConfig& p, const OperationTraits& operations)
@@ -154,7 +154,7 @@ struct Verdict {
     FrameTerms terms;      // the parameters of begin(), which should be the same on all ranks
     std::string differing; // which of them differ, in words
     struct Sums : FrameSums {
-        std::int64_t inputsLeft = 0;      // sent, less those that have come
+        std::int64_t inputsLeft = 0;      // inputs sent, less inputs that have come
         std::int64_t tilesEndedEarly = 0; // finished before all their inputs had come
     };
     enum Maximum { PeakMemoryBytes, RenderNs, PeakInboxBytes, TotalNs, maximumCount };
@@ -271,8 +271,9 @@ struct Verdict {
                                                                : what + ": it must be the same on all ranks");
     }
 
-    // The error of inputs that came when their tiles were finished: another input may have been taken in their place.
-    // Nothing can be said if a tile was finished early, since its inputs may be late, too.
+    // Returns an error if inputs came after their tiles had been finished: other inputs may have been taken in their
+    // place. If a tile was finished before all its inputs had come, nothing can be said, since those inputs may be
+    // late, too.
     std::optional<ErrorInfo> strayInputs() const
     {
         const std::int64_t count = sums.tilesEndedEarly == 0 ? sums.inputsLeft : 0;
@@ -295,8 +296,8 @@ struct Verdict {
         return !isMissing(e.kind) ? 4 : e.tile >= 0 ? 3 : e.expected >= 0 ? 2 : 1;
     }
 
-    // Picks the error that all ranks report: the one that says most; of equal ones one that says which rank is waited
-    // for; then that of the lowest rank. Texts about missing inputs are joined.
+    // Picks the error that all ranks report: the one with the greatest weight(); among equals, one that says which rank
+    // is waited for; then that of the lowest rank. Joins the texts about missing inputs.
     static ErrorInfo chosen(const ErrorInfo& a, const ErrorInfo& b)
     {
         constexpr std::size_t mostText = 2000;
@@ -320,7 +321,8 @@ struct Verdict {
             a.error = a.error ? chosen(*a.error, *b.error) : *b.error;
         if (a.differing.empty())
             a.differing = !b.differing.empty() ? b.differing : a.terms.difference(b.terms);
-        // Other errors follow from it. But a camera that throws on one rank is why its FrameConfig::order is missing.
+        // Other errors follow from different parameters. But if a camera throws on one rank, that is why its
+        // FrameConfig::order is missing.
         const bool isCause = a.error && a.error->kind == ErrorKind::UserCode && a.terms.allowPartial == 0;
         if (!a.differing.empty() && !isCause)
             a.error = disagreement(a.differing);
@@ -358,7 +360,7 @@ public:
         figures_.push_back({key, value});
     }
 
-    // An input of that tile may be off by so much.
+    // An input of that tile may be off by `bound`.
     void addMergeError(int tile, double bound)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
