@@ -1,5 +1,5 @@
-// FinalGather: finished tiles to the display rank. The owner writes them straight into the image, if it sees that, else
-// into a message of several tiles; background tiles do not travel.
+// FinalGather: brings finished tiles to the display rank. The owner writes a tile straight into the image if it sees
+// the image's memory, otherwise into a message of several tiles. Background tiles do not travel.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -28,26 +28,27 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// One object per rank and framebuffer. newFrame() apart, members may be called from any thread.
+// One object per rank and framebuffer. Any thread may call the members, except newFrame().
 class FinalGather {
 public:
-    // To the display rank. `raw`: the bytes that it had before a codec was to make it smaller; else 0.
+    // Sends a message to the display rank. `raw`: its size before a codec was to make it smaller; 0: there was no
+    // codec.
     using Send = std::function<void(Buffer&&, std::size_t raw)>;
     using OwnerOf = std::function<int(int tile)>;
-    // Is told what the codec or the program's onTile has thrown; of onTile with the tile, else -1.
+    // Gets what the codec or the program's onTile has thrown. `tile`: that of onTile; -1 for the codec.
     using Fail = std::function<void(const std::exception_ptr&, int tile)>;
 
     // Where a finished tile goes.
     struct Place : FinishedPlanes {
-        Buffer own;               // of the planes, if they are to be sent
+        Buffer own;               // the memory of the planes, if they are to be sent
         ImageGate::Writer writer; // into the image of another rank
-        // In the image: see BackgroundPixels. Else 0.
+        // If the tile goes into the image, see BackgroundPixels; otherwise 0.
         std::int64_t imageEpoch = 0;
     };
 
-    // `config` must live as long as this. `channels`: of the image, beside the colour; `address`: of the framebuffer.
-    // `ownerOf(tile)`: the rank that has it when it is finished. `send`: to the display rank, batches and the count of
-    // tiles. `fail`: fails the frame; no tile is lost with it.
+    // `config` must live as long as this. `channels`: those of the image beside colour. `address`: that of the
+    // framebuffer. `ownerOf(tile)`: the rank that finishes the tile. `send`: sends batches and the count of tiles to
+    // the display rank. `fail`: fails the frame; no tile is lost by that.
     FinalGather(std::shared_ptr<MemoryPool> pool, const TileLayout& layout, const FrameBufferConfig& config,
                 ChannelMask channels, std::uint32_t address, int rank, int rankCount, OwnerOf ownerOf, Send send,
                 Fail fail)
@@ -66,7 +67,7 @@ public:
                 spareBatches_.push_back(std::make_shared<Batch>());
     }
 
-    // Valid only while imageFrame() >= 0, which is the frame that it shows.
+    // The image is valid only while imageFrame() >= 0; then imageFrame() is the frame that it shows.
     const Image& image() const noexcept { return image_; }
     std::int64_t imageFrame() const noexcept { return imageFrame_; }
     bool enabled() const noexcept { return config_.image.format != OutputFormat::None; }
@@ -113,7 +114,8 @@ public:
 
     // ---- an image that other ranks see
 
-    // On the display rank. `placeOf(block)`: where a block lies for others, or -1. Empty if they do not see all of it.
+    // On the display rank: makes the gate and returns where it and the image lie. `placeOf(block)`: where a block lies
+    // for other ranks, or -1. Empty if they do not see all of the image.
     template <class PlaceOf>
     std::optional<ImagePlaces> shareImage(const PlaceOf& placeOf)
     {
@@ -136,8 +138,8 @@ public:
         return places;
     }
 
-    // On another rank, with the places that shareImage() has told rank `source`. `blockAt(place, byteCount)`: what lies
-    // there, or null. Throws Error (MalformedMessage).
+    // On another rank: takes the places that shareImage() has returned on rank `source`. `blockAt(place, byteCount)`:
+    // what lies there, or null. Throws Error (MalformedMessage).
     template <class BlockAt>
     void receivePlaces(int source, const ImagePlaces& places, const BlockAt& blockAt)
     {
@@ -161,19 +163,19 @@ public:
         remote_ = image;
     }
 
-    // Bytes that this rank has written into the image of another in this frame.
+    // Bytes that this rank has written into another rank's image in this frame.
     std::int64_t placedBytes() const
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         return placedPixels_ * static_cast<std::int64_t>(record_.pixelBytes());
     }
 
-    // The frame is over: nobody writes into the image any more.
+    // Called when the frame is over: makes sure that nobody writes into the image any more.
     void closeImage()
     {
         if (!imageGate_ || imageGate_->close(std::chrono::seconds(1)))
             return;
-        // Somebody is still at it, or has died there: the memory is left to it, and the other tiles are in a copy.
+        // A writer is still inside, or has died there. The memory is left to it, and the image continues in a copy.
         Image copy(*pool_, layout_.width(), layout_.height(), config_.image.format, channels_);
         const Planes from = image_.planesAt(0), to = copy.planesAt(0);
         for (std::size_t c = 0; c < channelCount; ++c)
@@ -187,13 +189,13 @@ public:
         ++imageEpoch_;
     }
 
-    // The most that a message to the display rank can have.
+    // The most bytes that a message to the display rank can have.
     static std::size_t largestMessage(std::size_t tilePixels, OutputFormat format, ChannelMask channels)
     {
         return std::max(batchBytes, prefix + FinishedRecord(format, channels).mostBytes(tilePixels));
     }
 
-    // Room for a finished tile. Write it, then commit().
+    // Returns room for a finished tile. Write the tile there, then call commit().
     Place reserve(int tile)
     {
         Place place;
@@ -215,7 +217,8 @@ public:
         return place;
     }
 
-    // `writtenPixels`: the other pixels of the image have not changed. False if it comes too late, after flush().
+    // `writtenPixels`: how many pixels of the tile were written, as the others have not changed in the image. Returns
+    // false if the tile comes too late, after flush().
     bool commit(int tile, Place&& place, std::int64_t writtenPixels)
     {
         if (!enabled())
@@ -232,7 +235,7 @@ public:
             placed_.push_back(tile);
             placedPixels_ += writtenPixels;
             ++sent_.tiles;
-            return true; // and with `place` the writer leaves
+            return true; // the writer leaves when `place` is destroyed
         }
         static thread_local FinishedRecord::Plan plan;
         record_.plan(tile, layout_.region(tile), place, compresses_, plan);
@@ -273,8 +276,8 @@ public:
         return true;
     }
 
-    // All tiles of this rank are committed, or the others come too late: sends the rest, and how many there were. Only
-    // the first call does anything.
+    // Call it when all tiles of this rank are committed, or those that are not come too late. Sends the rest, and how
+    // many tiles there were. Only the first call does anything.
     void flush()
     {
         if (!enabled() || !isSender(static_cast<std::size_t>(rank_)))
@@ -303,7 +306,8 @@ public:
         return kind == MessageKind::FinishedTiles || kind == MessageKind::TilesDone;
     }
 
-    // The display rank's side of one of these. Throws Error (MalformedMessage), OutOfMemory, and what the codec throws.
+    // On the display rank: takes one of these messages. Throws Error (MalformedMessage), OutOfMemory, and what the
+    // codec throws.
     void receive(int source, const MessageHeader& header, Buffer&& message)
     {
         if (!displays())
@@ -318,10 +322,10 @@ public:
             throw;
         }
     }
-    // Some of these have come but could not be taken in: they do not come again.
+    // Whether some of these messages have come but could not be taken in. They do not come again.
     bool hasLost() const noexcept { return hasLost_; }
 
-    // All tiles of the other ranks are in the image.
+    // Whether all tiles of the other ranks are in the image.
     bool complete() const { return !displays() || ranksComplete_ == senderCount_; }
 
     // Names the ranks whose tiles have not come; `expected` and `got` count ranks.
@@ -344,9 +348,9 @@ public:
         return info;
     }
 
-    // Gives the pixels that no tile has covered the background colour: `rgba` as it is to be stored. Pixels that were
-    // background before, of the same colour, are left alone, as are tiles of an earlier frame that are `kept(tile)`.
-    // With that the image is this frame's.
+    // Fills the tiles that have not come with the background colour `rgba`, as it is to be stored. Leaves alone tiles
+    // that already show this background, and tiles of an earlier frame for which `kept(tile)` is true. After that the
+    // image is this frame's.
     template <class Kept>
     void fillBackground(const std::array<float, 4>& rgba, const Kept& kept)
     {
@@ -360,7 +364,7 @@ public:
             if (s == TileState::Received || (s == TileState::Background && same))
                 continue;
             if (s != TileState::Undefined && kept(tile)) {
-                s = TileState::Old; // of another background
+                s = TileState::Old; // if it was background, then of another colour
                 continue;
             }
             const Region region = layout_.region(tile);
@@ -376,8 +380,8 @@ public:
         imageFrame_ = frame_;
     }
 
-    // The frame is over without these tiles. On the display rank adds those that have not come, and those of the
-    // background that are `lost(tile)`; and hides them all.
+    // Called when the frame is over without these tiles. On the display rank, adds the tiles that have not come, and
+    // background tiles for which `lost(tile)` is true. Then isComplete() is false for all of them.
     template <class Lost>
     void setIncomplete(std::vector<std::int32_t>& tiles, const Lost& lost)
     {
@@ -430,8 +434,8 @@ private:
     // Under mutex_.
     bool isMissing(std::size_t r) const { return isSender(r) && !tilesOf_[r].isComplete(); }
 
-    // Under mutex_. These have come as well. With a rank's last message its tiles must be as many as it has counted:
-    // thus a wrong count never ends a frame too early. Throws Error (MalformedMessage).
+    // Adds the tiles and messages that have come now; under mutex_. With a rank's last message its tiles must be as
+    // many as it has announced: thus a wrong count never ends a frame too early. Throws Error (MalformedMessage).
     void addReceived(TilesOf& its, const SentCount& here)
     {
         its.received.tiles += here.tiles;
@@ -462,7 +466,7 @@ private:
     static constexpr std::size_t batchBytes = std::size_t{256} << 10;
 
     bool isDisplay() const noexcept { return rank_ == config_.image.displayRank; }
-    // `planes`: of the whole image.
+    // `planes`: those of the whole image.
     Place inImage(const Planes& planes, const Region& region) const
     {
         Place place;
@@ -566,11 +570,11 @@ private:
         try {
             config_.onTile(tile, layout_.region(tile), image_);
         } catch (...) {
-            fail_(std::current_exception(), tile); // others of the same message are still to be counted
+            fail_(std::current_exception(), tile); // other tiles of the same message are still to be counted
         }
     }
 
-    // Under mutex_. Returns it to be sent, or null if somebody still writes: the last of these sends it.
+    // Under mutex_. Returns the batch to be sent, or null if somebody still writes to it: the last writer sends it.
     std::shared_ptr<Batch> closeBatch()
     {
         batch_->closed = true;
@@ -588,7 +592,7 @@ private:
         return batch;
     }
 
-    // Nobody else may have the batch any more.
+    // Nobody else may use the batch any more.
     void sendBatch(std::shared_ptr<Batch> batch)
     {
         BatchHeader h;
@@ -610,8 +614,8 @@ private:
                     message = std::move(packed);
                     h.codec = config_.messages.codec->id();
                 }
-            } catch (const OutOfMemory&) { // as it is, then: it has been counted
-            } catch (...) {                // this too
+            } catch (const OutOfMemory&) { // sent uncompressed: the batch has been counted
+            } catch (...) {                // so is this one
                 fail_(std::current_exception(), -1);
             }
         }
@@ -633,12 +637,12 @@ private:
     bool compresses_ = false;
 
     mutable std::mutex mutex_;
-    std::shared_ptr<Batch> batch_; // under mutex_, as are the next ones
+    std::shared_ptr<Batch> batch_; // under mutex_, as is all down to placedPixels_
     std::vector<std::shared_ptr<Batch>> spareBatches_;
     bool flushed_ = false;
     SentCount sent_;
     SharedImage remote_;               // of the display rank, if this one sees it
-    std::vector<std::int32_t> placed_; // tiles that are in it
+    std::vector<std::int32_t> placed_; // tiles that this rank has put there
     std::int64_t placedPixels_ = 0;
 
     Image image_;

@@ -1,5 +1,5 @@
-// ImageGate: lets other processes write finished tiles straight into the image of the display rank, where they see its
-// memory: while the frame is open there, and never into an image that a user may be looking at.
+// ImageGate: lets other processes write finished tiles straight into the image of the display rank, if they see its
+// memory. They may do so only while the frame is open there, and never in an image that a user may be looking at.
 #pragma once
 
 #include <dfb/buffer.hpp>
@@ -16,15 +16,15 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Lies in shared memory. A writer says that it is there and then looks whether the gate is open; who closes it closes
-// it and then looks whether anybody is there: one of them sees the other.
+// Lies in shared memory. A writer first counts itself in and then looks whether the gate is open. close() first closes
+// the gate and then looks whether a writer is inside. So at least one of the two sees the other.
 class ImageGate {
     struct Leave {
         void operator()(ImageGate* gate) const noexcept { gate->writers_.fetch_sub(1); }
     };
 
 public:
-    // Somebody who is inside; null: nobody.
+    // A writer that is inside until this is destroyed. Null: it was not let in.
     using Writer = std::unique_ptr<ImageGate, Leave>;
 
     Writer enter(std::int64_t frame) noexcept
@@ -34,8 +34,8 @@ public:
         return frame_.load() == frame ? std::move(writer) : nullptr;
     }
 
-    void open(std::int64_t frame) noexcept { frame_.store(frame); } // not 0
-    // False if a writer does not leave in time; it may have died.
+    void open(std::int64_t frame) noexcept { frame_.store(frame); } // `frame` is not 0
+    // Returns false if a writer does not leave in time; it may have died.
     bool close(std::chrono::milliseconds limit) noexcept
     {
         frame_.store(0);
@@ -54,8 +54,8 @@ private:
 };
 static_assert(std::atomic<std::int64_t>::is_always_lock_free && std::atomic<std::int32_t>::is_always_lock_free);
 
-// Where the gate and the planes of an image lie in its rank's shared memory, as that counts places; -1: nowhere. The
-// display rank tells it to the ranks that see its memory.
+// Where the gate and the planes of an image lie in the shared memory of its rank: places as Connection::placeOf() gives
+// them; -1: nowhere. The display rank sends this to the ranks that see its memory.
 struct ImagePlaces {
     std::int32_t gate = -1;
     std::array<std::int32_t, channelCount> planes{};

@@ -1,4 +1,5 @@
-// Wall: the inside of a DisplayWall: parts of finished tiles go to the ranks that drive displays, and become pictures.
+// Wall: the implementation of DisplayWall. Parts of finished tiles go to the ranks that drive displays, which join them
+// into pictures.
 #pragma once
 
 #include <dfb/comm/mailbox.hpp>
@@ -46,7 +47,7 @@ public:
             return Agreement{true, describe(), mailbox_->rank()};
         });
     }
-    ~Wall() { mailbox_->stop(); } // before mailbox_ is null: its tasks use it
+    ~Wall() { mailbox_->stop(); } // while mailbox_ is not null yet: its tasks use it
 
     void finish(std::int64_t frame, std::chrono::milliseconds timeout)
     {
@@ -62,11 +63,11 @@ public:
         std::optional<std::chrono::steady_clock::time_point> deadline;
         if (timeout.count() > 0)
             deadline = std::chrono::steady_clock::now() + std::min(timeout, longestTimeout);
-        mailbox_->enterEpoch(frame); // as who has left sends no word of what it has sent
+        mailbox_->enterEpoch(frame); // gives up if a neighbour has left: it does not tell what it has sent
         tellSent(frame);
         mailbox_->wait([&] { return isOver(frame); }, deadline);
         const std::optional<ErrorInfo> mine = whatIsMissing(frame);
-        ByteWriter missing; // empty if nothing is
+        ByteWriter missing; // empty if nothing is missing
         if (mine)
             detail::put(missing, *mine);
         const Bytes all =
@@ -137,8 +138,8 @@ private:
     };
     static constexpr std::size_t prefix = sizeof(MessageHeader) + sizeof(PartHeader);
 
-    // The others may be so many frames ahead of this rank: those in flight, and some that have failed. A message of a
-    // later frame is not believed, as each frame takes the memory of its pictures.
+    // How many frames other ranks may be ahead of this one: those in flight, and some that have failed. A message of a
+    // later frame is refused, as each frame takes the memory of its pictures.
     static constexpr std::int64_t framesAhead = 16;
     static constexpr std::size_t framesKept = 16;
 
@@ -147,7 +148,7 @@ private:
     struct Picture {
         Image image;
         std::int64_t pixelsLeft = 0;
-        std::vector<std::uint64_t> covered{}; // a bit for each pixel, each row from a word on
+        std::vector<std::uint64_t> covered{}; // a bit for each pixel; each row begins with a new word
     };
     using Pictures = std::map<int, Picture>; // by display
     using Bytes = ReductionTable::Bytes;
@@ -189,8 +190,8 @@ private:
                 failArgument("a display of the wall is driven by rank %d of %d", rank, mailbox_->size());
     }
 
-    // The displays of this rank, with nothing to show, and memory for the images that each of them will have, which it
-    // leaves in the pool.
+    // Makes the displays of this rank, with nothing to show. Takes memory for the images that each of them will have,
+    // and leaves it in the pool.
     void takeMemory()
     {
         std::vector<Image> images;
@@ -226,7 +227,7 @@ private:
                 refuse(source, e.info(), header.number);
             else // it may have been one that finish() waits for
                 mailbox_->giveUp(source, e.info());
-        } catch (const std::bad_alloc& e) { // for more frames than one
+        } catch (const std::bad_alloc& e) { // the pool has memory for one frame only
             mailbox_->giveUp(source, errorInfo(ErrorKind::Transport, e.what()));
         }
     }
@@ -237,8 +238,8 @@ private:
         refuse(error.from, error, 0);
     }
 
-    // Some frame misses a part now: the next that ends, or one that has begun by now. `frame`: the one that the message
-    // names.
+    // Notes that some frame misses a part now: the next one that ends, or one that has begun already. `frame`: the
+    // frame that the message names.
     void refuse(int source, const ErrorInfo& error, std::int64_t frame)
     {
         {
@@ -262,7 +263,7 @@ private:
                           rowBytes = static_cast<std::size_t>(part.width()) * pixelBytes;
         if (message.size() != prefix + rowBytes * static_cast<std::size_t>(part.height()))
             failMalformed("a part of a display has the wrong size");
-        std::shared_ptr<Pictures> pictures; // finish() may drop those of a frame that failed
+        std::shared_ptr<Pictures> pictures; // shared, as finish() may drop those of a failed frame
         {
             const std::lock_guard<std::mutex> lock(mutex_);
             if (frame <= std::max(last_, dropped_))
@@ -314,14 +315,14 @@ private:
     // Under mutex_.
     std::int64_t lastPossible() const { return std::max(last_, newest_) + framesAhead; }
 
-    // This rank has begun it.
+    // Notes that this rank has begun a frame.
     void noteFrame(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         newest_ = std::max(newest_, frame);
     }
 
-    // Of all displays of this rank; under mutex_.
+    // The pictures of all displays of this rank; under mutex_.
     std::shared_ptr<Pictures> picturesOf(std::int64_t frame)
     {
         std::shared_ptr<Pictures>& pictures = coming_[frame];
@@ -345,7 +346,7 @@ private:
         sent[static_cast<std::size_t>(display)] += pixels;
     }
 
-    // This rank has sent all of its frame. Waits for nothing.
+    // Called when this rank has sent all of its frame: tells the other ranks how much that was. Waits for nothing.
     void tellSent(std::int64_t frame)
     {
         std::vector<std::int64_t> mine;
@@ -357,7 +358,7 @@ private:
         const auto* first = reinterpret_cast<const std::byte*>(mine.data());
         mailbox_->reductions().enter(
             {SentPixels, frame}, Bytes(first, first + mine.size() * sizeof mine[0]),
-            [](const Bytes& a, const Bytes& b) { // equally long: receiveSent()
+            [](const Bytes& a, const Bytes& b) { // of equal length, see receiveSent()
                 ByteReader x(a), y(b);
                 ByteWriter sums;
                 while (x.left() > 0)
@@ -390,7 +391,7 @@ private:
         mailbox_->receiveReduction(source, header, message);
     }
 
-    // Under mutex_: the parts that have not come to a display of this rank, and whether no more will.
+    // Under mutex_: how many pixels have not come to a display of this rank, and whether no more will come.
     std::int64_t pixelsLeft(std::int64_t frame, int display) { return picturesOf(frame)->at(display).pixelsLeft; }
     bool hasAllSent(std::int64_t frame, int display)
     {
@@ -399,7 +400,7 @@ private:
                && found->second[static_cast<std::size_t>(display)] == pixelsOfDisplay() - pixelsLeft(frame, display);
     }
 
-    // No display of this rank has to wait any more, or a part could not be read.
+    // Whether no display of this rank has to wait any longer, or a part was lost.
     bool isOver(std::int64_t frame)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -431,17 +432,17 @@ private:
     WallLayout layout_;
     OutputFormat format_;
     std::shared_ptr<MemoryPool> pool_;
-    std::map<int, Image> shown_; // of this rank's displays; changed in finish(), as the next
+    std::map<int, Image> shown_; // of this rank's displays; only finish() changes it and shownFrame_
     std::int64_t shownFrame_ = -1;
 
     std::mutex mutex_;
-    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, but for the pixels
+    std::map<std::int64_t, std::shared_ptr<Pictures>> coming_;         // by frame; under mutex_, except the pixels
     std::map<std::int64_t, std::vector<std::int64_t>> sent_, allSent_; // pixels by frame and display; under mutex_
-    std::int64_t last_ = 0;                                            // finished; under mutex_
-    std::int64_t dropped_ = 0;    // the newest of which parts were dropped, for want of room; under mutex_
-    std::int64_t newest_ = 0;     // of which this rank has put() a tile; under mutex_
+    std::int64_t last_ = 0;                                            // the last finished frame; under mutex_
+    std::int64_t dropped_ = 0;    // the newest frame dropped for want of room; under mutex_
+    std::int64_t newest_ = 0;     // the newest frame that this rank has begun; under mutex_
     std::string error_;           // under mutex_
-    std::int64_t errorFrame_ = 0; // the last that error_ may be about; under mutex_
+    std::int64_t errorFrame_ = 0; // the last frame that error_ may be about; under mutex_
 
     std::unique_ptr<Mailbox> mailbox_; // last: its tasks use the others
 };
