@@ -15,9 +15,9 @@ DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
-// By how much M2, the sum over 4 channels of squared deviations from the mean, grows when `sample` joins `n` samples
-// that have this sum: the pairwise formula of Chan, Golub and LeVeque (1979), which is free of cancellation, however
-// large the mean is beside the spread.
+// Returns by how much M2 (the sum over 4 channels of squared deviations from the mean) grows when `sample` joins `n`
+// samples that have this sum. This is the pairwise formula of Chan, Golub and LeVeque (1979), which is free of
+// cancellation, however large the mean is beside the spread.
 inline double growthOfM2(std::int64_t n, const double* sum, const double* sample) noexcept
 {
     if (n == 0)
@@ -68,7 +68,7 @@ public:
             samples_ = info.emptySamples;
             sums_.reset(pixelCount(), info.wanted);
             sums_.addBackground(info.emptySamples, info.background);
-            m2_.assign(pixelCount(), 0.0); // also of those, which are all alike
+            m2_.assign(pixelCount(), 0.0); // right for the empty samples too, as they are all alike
         }
         if (info.passes > 0 && info.firstSample != samples_)
             detail::failArgument("the tile has accumulated %lld samples, the frame gives it those from %d on",

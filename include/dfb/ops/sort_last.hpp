@@ -23,7 +23,7 @@ namespace detail {
 // Sums over passes of composited pixels, and their mean.
 class PixelSums {
 public:
-    // `wanted`: of the auxiliary channels.
+    // `wanted`: those of the auxiliary channels that are wanted.
     void reset(std::size_t pixels, ChannelMask wanted)
     {
         rgba_.assign(4 * pixels, 0.0);
@@ -44,7 +44,7 @@ public:
         sum(aux_.weight, row.aux.weight, first);
         for (std::size_t i = 0; i < row.depth.size(); ++i)
             depth_[first + i] = std::min(depth_[first + i], row.depth[i]);
-        const auto nearest = [first](auto& to, const auto& from) { // of equal ones the first
+        const auto nearest = [first](auto& to, const auto& from) { // the first of those that are equally near
             for (std::size_t i = 0; !to.empty() && i < from.size(); ++i)
                 if (from[i].isThere() && (!to[first + i].isThere() || from[i].depth < to[first + i].depth))
                     to[first + i] = from[i];
@@ -54,7 +54,8 @@ public:
         nearest(aux_.instanceId, row.aux.instanceId);
     }
 
-    // Adds `count` rows of nothing to all pixels, as if one by one: sums of so many equal floats are exact.
+    // Adds `count` samples without an input to all pixels. That equals adding them one by one, as sums of so many equal
+    // floats are exact.
     void addBackground(std::int64_t count, const std::array<float, 4>& background)
     {
         for (std::size_t i = 0; count > 0 && i < rgba_.size(); ++i)
@@ -106,13 +107,13 @@ private:
     std::vector<double> rgba_; // 4 a pixel
     std::vector<float> depth_; // the nearest
     AuxPixels aux_;
-    std::vector<double> row_; // the rest: scratch of write()
+    std::vector<double> row_; // this and the rest: scratch of write()
     std::vector<float> normal_, albedo_, position_;
     std::vector<std::uint32_t> primitiveId_, instanceId_;
 };
 
-// The inputs of one tile, kept until they are all there; then composited pass by pass over the background, and
-// the passes averaged, in double.
+// Keeps the inputs of one tile until all of them are there. Then composites them pass by pass over the background, and
+// averages the passes, in double.
 class FragmentStore {
 public:
     explicit FragmentStore(BlendRule rule) noexcept : rule_(rule) {}
@@ -148,7 +149,7 @@ public:
     // Writes the mean of the passes.
     void finish(FinishedTile& out);
 
-    // Pixels in which inputs of the last finished frame overlapped in depth.
+    // The number of pixels in which inputs of the last finished frame overlapped in depth.
     std::int64_t undefinedPixels() const noexcept { return undefinedPixels_; }
 
 private:
@@ -167,7 +168,7 @@ private:
         FragmentCompositor compositor;
     };
 
-    // One of each thread, so that a frame after the first allocates nothing.
+    // One object per thread, so that a frame after the first allocates nothing.
     template <class Which>
     static Which& scratch()
     {
@@ -199,7 +200,7 @@ private:
 
     BlendRule rule() const noexcept { return info_.order ? BlendRule::InOrder : rule_; }
 
-    BlendRule rule_; // without an order
+    BlendRule rule_; // if the frame has no order
     TileInfo info_;
     ChannelMask tracked_ = 0;
     std::vector<Fragment> fragments_;
@@ -233,9 +234,9 @@ protected:
 
 // Sorts the inputs of each pixel by (depth, source, part). Accepts any tree. Empty inputs (a background tile that only
 // announces children, "nothing here") count for the tree and cost nothing. Accuracy: see compositing.hpp; the mean over
-// n passes adds at most n * 2^-53 relative. With farChannel, inputs that overlap in depth are counted, as pixels whose
-// order is undefined. Channels beside colour, depth and farChannel travel only if the image has them. With
-// FrameConfig::order it blends in that order, without a sort; not with farChannel.
+// n passes adds at most n * 2^-53 relative. With farChannel, pixels in which inputs overlap in depth are counted, since
+// their order is undefined. Channels beside colour, depth and farChannel travel only if the image has them. With
+// FrameConfig::order, inputs are blended in that order, without a sort; not with farChannel.
 template <int TileSize = 64, ChannelMask Channels = colorChannel | depthChannel>
 class BasicAlphaBlend : public detail::SortLast<BlendRule::SortByDepth, TileSize, Channels> {
     static_assert((Channels & depthChannel) != 0, "dfb: AlphaBlend sorts by depth");
@@ -276,8 +277,9 @@ public:
                                  fragment.header().children);
         const int generation = fragment.header().generation;
         const bool hides = opaqueHides(this->store_.info());
-        // Where no input hides others, the dependency tracker reports this at the end; here the tile may be finished
-        // before. Of generation 1 there can be several, all declared: then generation 0 never comes.
+        // If no input hides others, the dependency tracker reports this error at the end. Here it is checked early, as
+        // the tile may be finished before that. Several declared inputs may be of generation 1: then generation 0 never
+        // comes.
         if (hides && generation != 1 && has(generation))
             detail::failArgument("inputs in order form a list: there cannot be two of generation %d", generation);
         generations_.push_back(generation);
@@ -290,7 +292,7 @@ public:
         this->store_.add(std::move(fragment));
     }
 
-    // Whether all is there that can be seen, because of an opaque input.
+    // Whether an opaque input and all inputs in front of it have come.
     bool isComplete() const
     {
         return opaque_ == 0
@@ -306,8 +308,8 @@ private:
     }
 
     static constexpr int none = std::numeric_limits<int>::max();
-    std::vector<int> generations_; // that have come
-    int opaque_ = none;            // the first that is
+    std::vector<int> generations_; // of all inputs that have come
+    int opaque_ = none;            // the first generation with an opaque input
 };
 
 // Keeps the nearest input of each pixel, by (depth, source, part); for opaque geometry. A pixel is active if its depth
@@ -350,7 +352,7 @@ DFB_COMPILED_ONCE void FragmentStore::compositePasses(const PassDone& passDone)
     for (int y = 0; y < info_.region.height(); ++y) {
         std::fill(scratch.isUndefined.begin(), scratch.isUndefined.end(), std::uint8_t{0});
         for (std::size_t pass = 0; pass < passes; ++pass) {
-            if (tracked_ != 0) // of colour and depth nothing stays from the last row
+            if (tracked_ != 0) // in colour and depth nothing stays from the last row
                 scratch.row.resize(width, tracked_);
             scratch.compositors[pass].nextRow(scratch.row);
             overBackground(scratch.row, 0, width, info_.background.data());
@@ -433,7 +435,7 @@ inline std::array<std::byte, 16> storedBackground(const FinishedTile& out, const
     return stored;
 }
 
-// Calls f(x, count) for each run of pixels of row y that bitsOf(x, count) has, of up to 64, and fills in the
+// Calls f(x, count) for each run of up to 64 pixels of row y whose bits are set in bitsOf(x, count), and fills in the
 // background between them.
 template <class BitsOf, class F>
 void forEachRunOfRow(FinishedTile& out, int y, const std::array<std::byte, 16>& background, const BitsOf& bitsOf,
@@ -450,13 +452,13 @@ void forEachRunOfRow(FinishedTile& out, int y, const std::array<std::byte, 16>& 
     out.fillPixels(end, y, out.width() - end, background.data());
 }
 
-// One pass, and no more than colour and depth: pixels without an input are not composited.
+// For one pass, and no more channels than colour and depth. Pixels without an input are not composited.
 DFB_COMPILED_ONCE void FragmentStore::finishRuns(FinishedTile& out)
 {
     Scratch& scratch = start();
     CompositeRow& row = scratch.row;
     row.wantsGaps = false;
-    row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are the output
+    row.wantsSingles = row.wantsDepth || info_.background != std::array<float, 4>{}; // else they are output as they are
     const auto background = storedBackground(out, info_.background);
     for (int y = 0; y < out.height(); ++y) {
         scratch.compositors.front().nextRow(row);
@@ -487,8 +489,8 @@ inline bool areOpaque(const std::byte* rgba, int count)
     return all == std::byte{255};
 }
 
-// Does so for the nearest of pixels of 8 bits a channel, which 8 bits of the image get as they are where no background
-// shows through.
+// The same for DepthComposite with inputs of 8 bits a channel. An image of 8 bits gets their pixels as they are where
+// no background shows through.
 DFB_COMPILED_ONCE void FragmentStore::finishBytes(FinishedTile& out)
 {
     Scratch& scratch = start();
@@ -528,7 +530,7 @@ DFB_COMPILED_ONCE bool FragmentStore::hasExactLevels(OutputFormat format) const
            && info_.minTransmittance == 0.0f;
 }
 
-// Two inputs of 8 bits a channel, one under the other and over nothing, become 8 bits: integers are exact.
+// Blends up to two inputs of 8 bits a channel over an empty background to 8 bits. Integers are exact for that.
 DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
 {
     Scratch& scratch = start();
@@ -544,7 +546,8 @@ DFB_COMPILED_ONCE void FragmentStore::finishLevels(FinishedTile& out)
     fragments_.clear();
 }
 
-// Where double does not tell which 8-bit level is nearer, finds out. `farthest`: of setRow().
+// Rounds a row again where double does not tell which 8-bit level is nearer. `farthest`: the result of setRow() or
+// setPixels().
 DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, double farthest)
 {
     // 3 roundings for each layer and pass.
@@ -552,7 +555,7 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     if (farthest < 0.5 - 255 * 0x1p-53 * (4 * layers + 8) || fragments_.empty())
         return;
     const std::vector<DoubleDouble>& exact = exactRow(y);
-    const int step = out.isDithered() ? 4 : 1; // then of alpha alone
+    const int step = out.isDithered() ? 4 : 1; // with dithering, only alpha is rounded again
     for (int i = step - 1; i < 4 * out.width(); i += step) {
         const DoubleDouble& value = exact[static_cast<std::size_t>(i)];
         if (std::isfinite(value.high)) // twice the precision makes NaN of infinities
@@ -560,7 +563,8 @@ DFB_COMPILED_ONCE void FragmentStore::roundExactly(FinishedTile& out, int y, dou
     }
 }
 
-// Row y in twice the precision, the mean of the passes. After start(). Holds until the thread's next call.
+// Returns row y in twice the precision, as the mean of the passes. Call it after start(). The result is valid until
+// this thread's next call.
 DFB_COMPILED_ONCE const std::vector<DoubleDouble>& FragmentStore::exactRow(int y)
 {
     const int width = info_.region.width();
