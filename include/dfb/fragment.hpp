@@ -1,5 +1,6 @@
-// Fragment: one input of a tile: who it is, and per channel the active row spans. It owns the message that brought it
-// and is read there, or it is a view of pixels that lie in the memory of a renderer (TileView::staysUntilEnd).
+// Fragment: one input of a tile: its header and, per channel, the active row spans. It either owns the message that
+// brought it, and its pixels are read there, or it is a view of pixels that lie in the memory of a renderer
+// (TileView::staysUntilEnd).
 #pragma once
 
 #include <dfb/tile.hpp>
@@ -15,14 +16,14 @@
 
 DFB_NAMESPACE_BEGIN
 
-// The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its
-// colour at color + 4 * k and its depth at depth + k. What did not travel is null.
+// The active pixels of one row. Pixel k of the row's active pixels (over all its spans, left to right) has its colour
+// at color + 4 * k and its depth at depth + k. Channels that did not travel are null.
 struct FragmentRow {
     const Span* spans = nullptr;
     int spanCount = 0;
     const float* color = nullptr;
     const float* depth = nullptr;
-    detail::ConstPlanes aux; // all but colour and depth
+    detail::ConstPlanes aux; // all channels but colour and depth
 
     const float* normal() const noexcept { return detail::floatsOf(aux.at[detail::Normal]); }     // 3 a pixel
     const float* albedo() const noexcept { return detail::floatsOf(aux.at[detail::Albedo]); }     // 3 a pixel
@@ -37,28 +38,28 @@ enum class FragmentEncoding : std::uint8_t {
     Empty,    // no active pixel: "nothing here"
     Sparse,   // row spans
     Dense,    // every pixel of the region, no spans
-    Constant, // every pixel of the region alike: one pixel is stored
-    InPlace   // read in the memory of its renderer; which pixels are active shows row by row
+    Constant, // all pixels of the region are equal: one is stored
+    InPlace   // read in the memory of its renderer; active pixels are found row by row
 };
 
 class Fragment {
 public:
-    // The parts of a decoded message; made by detail::decodeFragment, which has checked them.
+    // The parts of a decoded message. They are made and checked by detail::decodeFragment.
     struct Parts {
         FragmentEncoding encoding = FragmentEncoding::Empty;
-        int rowBegin = 0, rowEnd = 0;                 // rows that have active pixels, counted in the region
-        std::uint32_t activePixels = 0;               // that contribute, also where fewer are stored
+        int rowBegin = 0, rowEnd = 0;                 // the range of rows with active pixels, from the region's top
+        std::uint32_t activePixels = 0;               // all that contribute, even if fewer are stored
         const std::uint16_t* rowSpanCounts = nullptr; // Sparse: one per row in [rowBegin, rowEnd)
-        const Span* spans = nullptr;                  // Sparse: all spans, row by row; else one full-width span
+        const Span* spans = nullptr;                  // Sparse: all spans, row by row; else null
         ChannelMask channels = colorChannel;
-        WireFormat colorFormat = WireFormat::Float32; // that it came in
+        WireFormat colorFormat = WireFormat::Float32; // in which the colour travelled
         const float* color = nullptr;
-        const std::byte* bytes = nullptr; // in place of `color`: 4 a pixel
+        const std::byte* bytes = nullptr; // instead of `color`: 4 bytes a pixel
         const float* depth = nullptr;
-        detail::ConstPlanes aux;               // all but colour and depth
+        detail::ConstPlanes aux;               // all channels but colour and depth
         Span fullRow;                          // Dense and Constant
         detail::PixelsInPlace inPlace;         // InPlace
-        detail::FaultCounts* faults = nullptr; // InPlace: of all inputs of the rank
+        detail::FaultCounts* faults = nullptr; // InPlace: the counts of all inputs of the rank
     };
 
     Fragment() = default;
@@ -71,27 +72,27 @@ public:
 
     const TileHeader& header() const noexcept { return header_; }
     bool empty() const noexcept { return parts_.encoding == FragmentEncoding::Empty; }
-    std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: not known, 0
-    // Whether the pixels have 8 bits a channel: FragmentCursor::nextBytes() may be called then.
+    std::uint32_t activePixels() const noexcept { return parts_.activePixels; } // InPlace: 0, as it is not known
+    // Whether the pixels have 8 bits a channel. FragmentCursor::nextBytes() may be called only then.
     bool keepsBytes() const noexcept { return parts_.bytes || parts_.inPlace.activity.hasBytes; }
     // Whether FragmentCursor has to convert or copy each row before it can return it.
     bool isMadeByRow() const noexcept { return parts_.bytes || parts_.encoding == FragmentEncoding::InPlace; }
     bool hasDepth() const noexcept { return parts_.depth != nullptr || parts_.inPlace.depth != nullptr; }
-    ChannelMask channels() const noexcept { return parts_.channels; } // that travelled
+    ChannelMask channels() const noexcept { return parts_.channels; } // those that travelled
     FragmentEncoding encoding() const noexcept { return parts_.encoding; }
-    WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // that it came in
+    WireFormat colorFormat() const noexcept { return parts_.colorFormat; } // in which the colour travelled
 
     // The colours of the storedPixels() pixels: the active ones, or with FragmentEncoding::Constant one row of equal
-    // pixels. Null with FragmentEncoding::InPlace; and, in an operation with readsInPlace, if the pixels came as bytes.
-    // forEachPixel() and FragmentCursor read those, too.
+    // pixels. Null with FragmentEncoding::InPlace, and if the pixels came as bytes in an operation with readsInPlace.
+    // forEachPixel() and FragmentCursor can read all of these.
     const float* color() const noexcept { return parts_.color; }
     std::size_t storedPixels() const noexcept
     {
         return parts_.encoding == FragmentEncoding::Constant ? parts_.fullRow.count : parts_.activePixels;
     }
 
-    // Whether nothing behind it can be seen: alpha is 1 in all pixels of the region. Looks at no more of them than it
-    // must.
+    // Whether nothing behind the fragment can be seen: alpha is 1 in all pixels of the region. Stops at the first pixel
+    // that is not opaque.
     bool isOpaque() const noexcept
     {
         if (parts_.encoding == FragmentEncoding::InPlace)
@@ -103,8 +104,8 @@ public:
     }
 
     // Calls f(x, y, rgba, depth) for each active pixel, row by row. x and y count from the tile's upper left corner,
-    // `rgba` points to 4 floats, and depth is +infinity if none travelled. For other channels f may take two arguments
-    // more: the FragmentRow, and the pixel's index k in it, as in row.normal() + 3 * k.
+    // `rgba` points to 4 floats, and depth is +infinity if no depth travelled. To read other channels, f may take two
+    // more arguments: the FragmentRow, and the pixel's index k in it, as in row.normal() + 3 * k.
     template <class F>
     void forEachPixel(const F& f) const;
 
@@ -115,19 +116,20 @@ private:
     Parts parts_;
 };
 
-// Pixels of a row with 8 bits a channel, where they lie: as FragmentRow, with `bytes` in place of colours. Some may not
-// be active: those whose depth is not below the limit, or that are 0.
+// The pixels of a row with 8 bits a channel, read where they lie. Like FragmentRow, with `bytes` instead of colours.
+// Some of the pixels may not be active: those whose depth is not below the limit, and those that are 0.
 struct ByteRow : FragmentRow {
     const std::byte* bytes = nullptr;
     float depthLimit = std::numeric_limits<float>::infinity();
-    Span valid; // in which all pixels of a fragment in place are
+    Span valid; // the one span of a fragment in place
 };
 
-// Walks the rows of a fragment from top to bottom. Must not outlive the fragment.
+// Walks the rows of a fragment from top to bottom. The fragment must outlive it.
 class FragmentCursor {
 public:
-    // `row` is scratch memory for a fragment that isMadeByRow(); null: the cursor has its own. `countsFaults`: whether
-    // faults of pixels in place, such as NaN, are added to FrameReport; true for one walk of a fragment only.
+    // `row` is scratch memory for a fragment that isMadeByRow(); if it is null, the cursor allocates its own.
+    // `countsFaults`: whether faults of pixels in place, such as NaN, are added to FrameReport. Set it for only one
+    // walk of a fragment.
     explicit FragmentCursor(const Fragment& fragment, detail::RowPixels* row = nullptr, bool countsFaults = false)
         : parts_(&fragment.parts_), span_(fragment.parts_.spans), color_(fragment.parts_.color),
           bytes_(fragment.parts_.bytes), depth_(fragment.parts_.depth), aux_(fragment.parts_.aux),
@@ -140,8 +142,8 @@ public:
         }
     }
 
-    // The active pixels of the next row of the region, starting with row 0; a row may have none. Of a fragment that
-    // isMadeByRow() they hold until the next call.
+    // The active pixels of the next row of the region, starting with row 0; a row may have none. If the fragment
+    // isMadeByRow(), they are valid until the next call.
     FragmentRow next()
     {
         FragmentRow row;
@@ -151,7 +153,7 @@ public:
         return row;
     }
 
-    // Goes to the next row, and sets its colour and depth in `result`, but no other channel. Returns false if the row
+    // Goes to the next row, and sets the colour and depth of `result`, but no other channel. Returns false if the row
     // has no pixels. advance(row) must follow.
     bool next(FragmentRow& result)
     {
@@ -164,8 +166,8 @@ public:
         result.color = bytes_ ? decodeRow(result) : color_;
         return true;
     }
-    // As next(result), but sets bytes in place of colours; only for a fragment that keepsBytes(). Pixels in place are
-    // not checked: some may be empty.
+    // Like next(result), but sets bytes instead of colours. Only for a fragment that keepsBytes(). Pixels in place are
+    // not checked, and some may be empty.
     bool nextBytes(ByteRow& result)
     {
         const int row = row_++;
@@ -186,16 +188,16 @@ public:
         result.depthLimit = pixels.activity.depthLimit;
         return true;
     }
-    // Adds NaN depths that the caller of nextBytes() has found to the frame's counts.
+    // Adds `count` NaN depths that the caller of nextBytes() has found to the frame's counts.
     void countNanDepths(std::uint64_t count)
     {
         if (count > 0 && countsFaults_ && parts_->faults)
             parts_->faults->add({count, 0});
     }
-    const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() gave
+    const detail::ConstPlanes& aux() const noexcept { return aux_; } // of the row that next() returned
 
-    // Says where the next row of pixels in place is, without a step to it; skip(1) makes the step. Returns false if the
-    // row has no pixels, is not in place, or must be converted.
+    // Sets `row` to the place of the next row of pixels in place, without moving on; skip(1) moves on. Returns false if
+    // the row has no pixels, is not in place, or must be converted.
     bool findInPlace(detail::RowInPlace& row) const
     {
         detail::RowPlace first, ahead;
@@ -239,8 +241,8 @@ private:
         return pixels;
     }
 
-    // Of pixels in place: which of a row there are, where the first lies, and where that of the row to load meanwhile
-    // does. False if there are none.
+    // For pixels in place: sets `span` to the pixels that row `row` has, `first` to the place of the first of them, and
+    // `ahead` to that of the first pixel of the row to prefetch meanwhile. False if the row has no pixels.
     bool findPlaces(int row, Span& span, detail::RowPlace& first, detail::RowPlace& ahead) const
     {
         const detail::PixelsInPlace& pixels = parts_->inPlace;
@@ -253,7 +255,7 @@ private:
         return true;
     }
 
-    // All but the colour, of pixels that are not in place.
+    // Sets all but the colour and the auxiliary channels, for pixels that are not in place. False if the row has none.
     bool findRow(int row, FragmentRow& result) const
     {
         if (parts_->encoding == FragmentEncoding::Empty || row < parts_->rowBegin || row >= parts_->rowEnd)
@@ -306,7 +308,7 @@ private:
     detail::ConstPlanes aux_;
     bool hasAux_, countsFaults_;
     int row_ = 0;
-    detail::RowPixels* rowPixels_; // of the row that next() gave
+    detail::RowPixels* rowPixels_; // of the row that next() returned
     std::unique_ptr<detail::RowPixels> ownRow_;
 };
 

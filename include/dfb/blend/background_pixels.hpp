@@ -1,5 +1,5 @@
-// BackgroundPixels: which pixels of a tile already are, where the image lies, as the background is stored. They need
-// not be written again.
+// BackgroundPixels: which pixels of a tile already hold the background in the image's memory, so that they need not be
+// written again.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -16,7 +16,7 @@ namespace detail {
 class BackgroundPixels {
 public:
     // Call it for each frame in which the tile is written. While `epoch` stays the same, the pixels of the last frame
-    // are still there, and the background is stored alike. 0: the pixels may be anything.
+    // are still there, and the background is stored as the same value. With epoch 0 the pixels may hold anything.
     void newFrame(int width, int height, std::int64_t epoch)
     {
         if (epoch != 0 && epoch == epoch_)
@@ -26,7 +26,7 @@ public:
         bits_.assign(epoch == 0 ? 0 : wordsPerRow_ * static_cast<std::size_t>(height), 0);
     }
 
-    // Pixels [x, x + count) of row y become something else.
+    // Pixels [x, x + count) of row y are overwritten by something other than background.
     void remove(int x, int y, int count)
     {
         if (bits_.empty())
@@ -34,7 +34,8 @@ public:
         forEachWord(x, y, count, [](std::uint64_t& known, std::uint64_t range, int) { known &= ~range; });
     }
 
-    // They become the background: calls write(x, count) for each run of those that are not yet.
+    // Pixels [x, x + count) of row y become the background. Calls write(x, count) for each run of those that are not
+    // background yet.
     template <class Write>
     void add(int x, int y, int count, const Write& write)
     {
@@ -75,7 +76,7 @@ private:
 
     std::int64_t epoch_ = 0;
     std::size_t wordsPerRow_ = 0;
-    std::vector<std::uint64_t> bits_; // row by row, or empty: nothing is known
+    std::vector<std::uint64_t> bits_; // row by row; empty: nothing is known
 };
 
 } // namespace detail

@@ -1,12 +1,13 @@
-// Compositing: the pure functions on spans of pixels that tile operations are made of: over, and
-// sort-and-blend, both accumulated in double.
+// Compositing: the pure functions on spans of pixels from which tile operations are made: `over`, sort-and-blend and
+// nearest, all accumulated in double.
 //
-// The fold (one for all ops, so that arrival order, threads and ranks cannot show): per pixel, front to back
-// in (depth, position in the list of layers), colour and alpha accumulate as A += T * a, and T *= 1 - a is
-// carried by itself. For colour and alpha that are finite floats, alpha in [0, 1], colour non-negative, and up
-// to 65536 layers the accumulated double is within 2^-36 (relative) of the exact sum, so rounding it to float is
-// within 1 ulp of exact. Where that is not enough to tell which of two 8-bit levels is nearer, the row is composited
-// again in twice the precision. Pixels are premultiplied: colour is added as it stands, also where alpha is 0.
+// The fold is one for all operations, so that the image does not depend on arrival order, threads or ranks. Per pixel,
+// layers are blended front to back in (depth, position in the list of layers): colour and alpha accumulate as A += T *
+// a, and the transmittance T is a variable of its own, updated by T *= 1 - a. If colour and alpha are finite floats,
+// alpha is in [0, 1], colour is non-negative, and there are up to 65536 layers, the accumulated double is within 2^-36
+// (relative) of the exact sum, so rounding it to float is within 1 ulp of exact. Where that is not enough to tell which
+// of two 8-bit levels is nearer, the row is composited again in twice the precision. Pixels are premultiplied: colour
+// is added as it stands, also where alpha is 0.
 #pragma once
 
 #include <dfb/base/double_double.hpp>
@@ -23,7 +24,7 @@
 
 DFB_NAMESPACE_BEGIN
 
-// An id, and the depth of the layer that it comes from; 0 where layers have none.
+// An id, and the depth of the layer that it comes from. The depth is 0 if layers have none.
 struct FrontId {
     std::uint32_t id = noId;
     float depth = 0;
@@ -31,7 +32,8 @@ struct FrontId {
     bool isThere() const noexcept { return id != noId; }
 };
 
-// The position of the nearest layer, and its depth; NaN before the first. No layer has a depth of NaN.
+// The position of the nearest layer, and its depth. The depth is NaN until there is a layer; no layer has a depth of
+// NaN.
 struct FrontPosition {
     float at[3] = {0, 0, 0};
     float depth = std::numeric_limits<float>::quiet_NaN();
@@ -39,10 +41,10 @@ struct FrontPosition {
     bool isThere() const noexcept { return depth == depth; }
 };
 
-// The auxiliary channels of a row of pixels, or of a tile's pixels; of each only if it is wanted. See channels.hpp.
+// The auxiliary channels of a row or a tile of pixels. Those that are not wanted are empty. See channels.hpp.
 struct AuxPixels {
     std::vector<double> normal, albedo; // 3 a pixel, premultiplied
-    std::vector<double> weight;         // of those two: the alpha without the background
+    std::vector<double> weight;         // of normal and albedo: the alpha without the background
     std::vector<FrontPosition> position;
     std::vector<FrontId> primitiveId, instanceId;
 
@@ -58,24 +60,26 @@ struct AuxPixels {
     }
 };
 
-// One row of pixels being composited: `width` pixels.
+// One row of pixels being composited.
 struct CompositeRow {
     std::vector<double> rgba;          // 4 * width, premultiplied
     std::vector<double> transmittance; // width
-    std::vector<float> depth;          // width: of the nearest layer with alpha > 0, else +infinity
-    // The low words of the first two, for sums in double-double. Of the same sizes, or empty if not computed.
+    std::vector<float> depth;          // width: that of the nearest layer with alpha > 0, or +infinity
+    // The low words of `rgba` and `transmittance`, for sums in double-double. They have the same sizes, or are empty if
+    // not computed.
     std::vector<double> rgbaLow, transmittanceLow;
     AuxPixels aux;
-    // Of layers that say how far they reach, the farthest with alpha > 0 so far; and whether another began before that.
+    // For layers that have a far depth: how far back those with alpha > 0 reach so far, and whether any layer began
+    // before the reach of one in front of it.
     std::vector<float> reach;              // width, or empty
     std::vector<std::uint8_t> isUndefined; // width, or empty
     double minTransmittance = 0;           // a pixel that lets less through counts as opaque
-    bool wantsDepth = true;                // else `depth` is empty
-    bool wantsGaps = true;                 // else pixels under no layer need not be cleared
-    bool wantsSingles = true;              // else pixels under one layer need not be there
+    bool wantsDepth = true;                // if false, `depth` is empty
+    bool wantsGaps = true;                 // if false, pixels that no layer covers need not be cleared
+    bool wantsSingles = true;              // if false, pixels that one layer covers need not be set
 
-    // Sizes it for `width` pixels, of which nothing is known then. `wanted`: of the auxiliary channels. `exactly`: in
-    // twice the precision of double.
+    // Sizes it for `width` pixels, whose colour, transmittance and depth are undefined afterwards. `wanted`: auxiliary
+    // channels. `exactly`: compute in twice the precision of double.
     void resize(int width, ChannelMask wanted = 0, bool exactly = false)
     {
         const auto pixels = static_cast<std::size_t>(width);
@@ -89,7 +93,7 @@ struct CompositeRow {
         isUndefined.assign(wanted & farChannel ? pixels : 0, 0);
     }
 
-    // Pixels [x, x + count): nothing yet.
+    // Resets pixels [x, x + count) to no layers.
     void clear(int x, int count)
     {
         const auto first = static_cast<std::ptrdiff_t>(x);
@@ -100,11 +104,11 @@ struct CompositeRow {
     }
 };
 
-// A run of pixels of one layer; depth may be null, which counts as equal depth everywhere.
+// A run of pixels of one layer. If depth is null, all pixels count as equally deep.
 struct Layer {
     const float* color = nullptr;
     const float* depth = nullptr;
-    const detail::ConstPlanes* aux = nullptr; // null: there is nothing else, or it is not wanted
+    const detail::ConstPlanes* aux = nullptr; // null: no auxiliary channels, or not wanted
 
     Layer from(int pixel) const
     {
@@ -152,7 +156,7 @@ inline void over(CompositeRow& row, int x, int count, const Layer& layer)
         detail::takeNearestPlain(row.depth.data() + x, count, layer.color, layer.depth); // often one pixel
 }
 
-// Makes those of `count` pixels from x on opaque that count as opaque.
+// Makes those pixels in [x, x + count) opaque that count as opaque: their transmittance is below minTransmittance.
 inline void closeOpaque(CompositeRow& row, int x, int count)
 {
     double* t = row.transmittance.data() + x;
@@ -165,8 +169,8 @@ inline void closeOpaque(CompositeRow& row, int x, int count)
         }
 }
 
-// Blends the auxiliary channels that `row` has. Call it before over(), since it needs the alpha from before. `aux`: of
-// the first pixel. `anyAlpha`: pixels with alpha 0 have position and ids as well.
+// Blends the auxiliary channels that `row` has. Call it before over(), since it needs the transmittance in front of
+// this layer. `aux`: the planes at the first pixel. `anyAlpha`: pixels with alpha 0 give position and ids as well.
 inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, const detail::ConstPlanes& aux,
                     bool anyAlpha = false)
 {
@@ -214,7 +218,8 @@ inline void overAux(CompositeRow& row, int x, int count, const Layer& layer, con
     }
 }
 
-// Composites a constant premultiplied RGBA colour under pixels [begin, begin + count): the background, after all else.
+// Composites a constant premultiplied RGBA colour under pixels [begin, begin + count). This is the background: call it
+// after all layers.
 inline void overBackground(CompositeRow& row, int begin, int count, const float* rgba)
 {
     const auto first = static_cast<std::size_t>(begin), end = first + static_cast<std::size_t>(count);
@@ -230,7 +235,8 @@ inline void overBackground(CompositeRow& row, int begin, int count, const float*
 
 namespace detail {
 
-// Composites pixels [begin, end) of layers, in this order, into the row from x + begin on.
+// Composites pixels [begin, end) of the layers, in this order, into the row. Pixel i of a layer is pixel x + i of the
+// row, here and below.
 inline void blendColors(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                         const std::vector<int>& order)
 {
@@ -252,7 +258,7 @@ inline void blendColors(CompositeRow& row, int x, int begin, int end, const std:
     }
 }
 
-// The nearest depths of pixels [begin, end), if they are wanted.
+// Sets the depths of pixels [begin, end) to the nearest ones, if depth is wanted.
 inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers)
 {
     if (!row.wantsDepth)
@@ -264,7 +270,7 @@ inline void takeDepths(CompositeRow& row, int x, int begin, int end, const std::
             takeNearest(nearest, end - begin, l.color, l.depth);
 }
 
-// Blends all channels that a row may have.
+// Blends all channels that the row has.
 inline void blendFully(CompositeRow& row, int x, int begin, int end, const std::vector<Layer>& layers,
                        const std::vector<int>& order)
 {
@@ -303,11 +309,12 @@ inline int firstOutOfOrder(const std::vector<Layer>& layers, const std::vector<i
     return end;
 }
 
-// Puts the layers into the order that they have at a pixel.
+// Sorts `order` by the layers' (depth, index) at a pixel.
 inline void sortAt(int pixel, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     const auto depthOf = [&](int layer) { return layers[static_cast<std::size_t>(layer)].depth[pixel]; };
-    // Insertion sort: the order of the last pixel is nearly always nearly right. Where it is not, it gives up.
+    // Insertion sort, as the order of the last pixel is nearly always nearly right. If that takes too many moves,
+    // std::sort() takes over.
     std::size_t movesLeft = 8 * order.size();
     for (std::size_t i = 1; i < order.size(); ++i) {
         if (movesLeft < i) {
@@ -332,7 +339,7 @@ inline void sortAt(int pixel, const std::vector<Layer>& layers, std::vector<int>
     }
 }
 
-// Sorts and blends four pixels, each for itself; `order` becomes that of the last one. For up to
+// Sorts and blends four pixels, each with an order of its own. `order` becomes that of the last pixel. For up to
 // SortNetwork::mostLayers layers.
 inline void sortAndBlendFour(CompositeRow& row, int x, int begin, const std::vector<Layer>& layers,
                              std::vector<int>& order)
@@ -368,18 +375,18 @@ inline void resetOrder(std::vector<int>& order, std::size_t count)
 
 } // namespace detail
 
-// Composites `count` pixels of layers into `row` at [x, x + count), in their order, whatever their depth. `order` is
-// scratch space. There is a layer at least, here and below.
+// Composites `count` pixels of the layers into `row` at [x, x + count), in the order of `layers`, whatever their depth.
+// `order` is scratch space. There must be at least one layer, here and below.
 inline void blendInOrder(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     detail::resetOrder(order, layers.size());
     detail::blend(row, x, 0, count, layers, order);
 }
 
-// Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to
-// back by (depth, index in `layers`). NaN in a depth must have been replaced (the wire does: farthest). A layer
-// without depth makes all depths count as equal. `order` is scratch space, empty or as the last call left it: it begins
-// with that order, and the better that is, the sooner it is done.
+// Sorts and blends: composites `count` pixels of several layers into `row` at [x, x + count), each pixel front to back
+// by (depth, index in `layers`). No depth may be NaN (the wire replaces NaN by +infinity). If any layer has no depth,
+// all depths count as equal. `order` is scratch space, either empty or as the last call left it: sorting starts from
+// that order, and is faster the better it fits.
 inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<Layer>& layers, std::vector<int>& order)
 {
     if (layers.size() == 1 || !detail::haveDepths(layers)) {
@@ -388,10 +395,10 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
     }
     if (order.size() != layers.size())
         detail::resetOrder(order, layers.size());
-    detail::sortAt(0, layers, order); // where inputs are infinite, pixels would show which order was before
+    detail::sortAt(0, layers, order); // else the result for infinite inputs would depend on the old order
     const bool inFours = count >= 4 && layers.size() <= static_cast<std::size_t>(detail::SortNetwork::mostLayers)
                          && !layers.front().aux && row.rgbaLow.empty();
-    // The order is constant over most neighbouring pixels. Where it is not, four are sorted at once.
+    // The order is constant over most neighbouring pixels. Where it is not, four pixels are sorted at once.
     for (int begin = 0; begin < count;) {
         int end = detail::firstOutOfOrder(layers, order, begin, count);
         if (inFours && end < count && end < begin + 4) {
@@ -411,7 +418,7 @@ inline void sortAndBlend(CompositeRow& row, int x, int count, const std::vector<
 
 namespace detail {
 
-// Does what keepNearest() does, for layers of colour and depth alone.
+// keepNearest() for layers of colour and depth alone.
 inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     const auto first = static_cast<std::size_t>(x);
@@ -434,9 +441,9 @@ inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vec
 
 } // namespace detail
 
-// Keeps of `count` pixels of several layers the nearest, by (depth, index in `layers`), and puts it into `row` at
-// [x, x + count): for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids: something is
-// there.
+// For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at [x, x +
+// count). This is for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids, as something
+// is there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     const auto isPlain = [](const Layer& layer) { return layer.depth && !layer.aux; };
