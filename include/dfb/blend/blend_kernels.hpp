@@ -1,10 +1,10 @@
-// The kernels of blending: layers under pixels, in double, and two layers of levels in integers. Each is there in plain
-// C++ and, for processors that have it, for AVX2, mostly by hand; the two give the same bits, as products and sums are
-// the same and rounded one by one.
+// The kernels of blending: layers under pixels, in double, and two layers of 8-bit levels, in integers. Each kernel
+// exists in plain C++ and, for processors that have it, for AVX2, mostly by hand. Both give the same bits, as they
+// compute the same products and sums and round each of them.
 //
-// A pixel that nothing comes through any more is blended like the others, unless its whole block is opaque: then the
-// layers behind are left out. That is checked after the first layer and every fourth from there. So an infinity or a
-// NaN of a layer behind may show in an opaque pixel, or not. A finite value never does.
+// A pixel that is opaque already is blended like the others, unless its whole block is opaque: then the layers behind
+// are left out. That is checked after the first layer and then after every fourth. So an infinity or a NaN of a layer
+// behind may or may not show in an opaque pixel. A finite value never does.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -16,23 +16,24 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// Layers to be composited at once under a run of pixels, front to back. Few, as a processor follows few streams of
-// memory, and each is read for the whole run before the next layers are.
+// Layers to be composited together under a run of pixels, front to back. A group has few layers, as a processor follows
+// few streams of memory at a time. Each group is read for the whole run before the next one.
 struct BlendGroup {
     static constexpr int mostLayers = 8;
 
     const float* colors[mostLayers]; // RGBA of the run's first pixel
     int layers = 0;
-    bool isFirst = true;         // the layers, one at least, are in front of all others: the old pixels do not count
+    bool isFirst = true;         // these layers, at least one, are the front ones: old pixel values are ignored
     double minTransmittance = 0; // a pixel that lets less through counts as opaque
 };
 
-// Up to which layer, of `layers`, to go on after k of them before it is looked whether the pixels are opaque.
+// When k of `layers` layers are blended: up to which layer to go on before it is checked again whether the pixels are
+// opaque.
 constexpr int nextLook(int k, int layers) noexcept { return std::min(layers, k == 0 ? 1 : k + 4); }
 
 // ---- plain
 
-// A single layer: its values, in double.
+// Takes the values of a single layer, in double.
 inline void takeLayerPlain(double* rgba, double* transmittance, int count, const float* color, double minTransmittance)
 {
     for (int i = 0; i < 4 * count; ++i)
@@ -43,7 +44,7 @@ inline void takeLayerPlain(double* rgba, double* transmittance, int count, const
     }
 }
 
-// Composites the k-th layer, for k in [first, last), under one pixel. Under nothing, -0 becomes 0.
+// Composites the k-th layer, for k in [first, last), under one pixel. Where the pixel was 0, -0 becomes 0.
 template <bool HasLeast, class ColorOf>
 void blendPixel(double* rgba, double& transmittance, double minTransmittance, int first, int last,
                 const ColorOf& colorOf)
@@ -67,8 +68,8 @@ inline bool isOpaque(const double* transmittance, int count)
     return std::all_of(transmittance, transmittance + count, [](double t) { return t == 0.0; });
 }
 
-// Composites layers under `count` pixels, which are a block; colorOf(k, p): of the k-th layer at pixel p. False if
-// nothing behind them can be seen; so below.
+// Composites layers under `count` pixels, which are a block. colorOf(k, p) is the colour of the k-th layer at pixel p.
+// Returns false if all pixels are opaque, so that nothing behind them can be seen; so do the functions below.
 template <bool HasLeast, class ColorOf>
 bool blendBlock(double* rgba, double* transmittance, int count, bool isFirst, int layers, double minTransmittance,
                 const ColorOf& colorOf)
@@ -87,7 +88,7 @@ bool blendBlock(double* rgba, double* transmittance, int count, bool isFirst, in
     return !isOpaque(transmittance, count);
 }
 
-// Does so with a group's pixels from `pixel` on. `rgba` and `transmittance` are of the group's first pixel.
+// The same for a group, from `pixel` on. `rgba` and `transmittance` are those of the group's first pixel.
 template <bool HasLeast>
 bool blendBlock(double* rgba, double* transmittance, std::ptrdiff_t pixel, int count, const BlendGroup& group)
 {
@@ -108,8 +109,8 @@ inline bool blendGroupPlain(double* rgba, double* transmittance, int count, cons
     return isSeen;
 }
 
-// Four pixels, each with an order of its own. `colors`: of the first of them, by layer. `orders[k][p]`: which layer is
-// the k-th, seen from the front, at pixel p.
+// Composites layers under four pixels, each with an order of its own. `colors`: those of the first pixel, by layer.
+// `orders[k][p]`: which layer is the k-th from the front at pixel p.
 template <bool HasLeast>
 void blendFourPlain(double* rgba, double* transmittance, const float* const* colors, const std::uint32_t (*orders)[4],
                     int layers, double minTransmittance)
@@ -118,7 +119,7 @@ void blendFourPlain(double* rgba, double* transmittance, const float* const* col
                          [&](int k, int p) { return colors[orders[k][p]] + 4 * p; });
 }
 
-// One colour under all pixels, and nothing behind it any more.
+// Composites one colour under all pixels. Nothing may follow behind it, as transmittances stay as they are.
 inline void blendConstantPlain(double* rgba, const double* transmittance, int count, const float* color)
 {
     for (int i = 0; i < count; ++i)
@@ -126,7 +127,7 @@ inline void blendConstantPlain(double* rgba, const double* transmittance, int co
             rgba[4 * i + c] += transmittance[i] * static_cast<double>(color[c]);
 }
 
-// The depths of a layer where its alpha counts, if they are nearer.
+// Takes the depths of a layer where they are nearer and its alpha is above 0.
 DFB_INLINE void takeNearestPlain(float* nearest, int count, const float* color, const float* depth)
 {
     for (int i = 0; i < count; ++i) {
@@ -135,8 +136,9 @@ DFB_INLINE void takeNearestPlain(float* nearest, int count, const float* color, 
     }
 }
 
-// `levels` and a layer under them, both 8 bits a channel, become the nearest levels of what is seen, up to 255. That is
-// exact if `levels` are those of one layer, or of none: another layer behind would need the fractions.
+// Composites a layer under `levels`, both with 8 bits a channel. The result is rounded to the nearest level, at most
+// 255. That is exact if `levels` holds one layer or none; another layer behind would need the fractions that are
+// rounded away.
 inline void blendLevelsPlain(std::uint8_t* levels, int count, const std::uint8_t* layer)
 {
     for (int i = 0; i < 4 * count; i += 4) {
@@ -184,12 +186,12 @@ DFB_AVX2 inline void blendConstantAvx2(double* rgba, const double* transmittance
     }
 }
 
-// A pixel is one register. Its transmittance is another, four times.
+// A pixel in one register, and its transmittance, four times, in another.
 template <bool HasLeast>
 struct Avx2Pixel {
     __m256d sum, through;
 
-    // The first layer, added to 0; -0 becomes 0.
+    // Takes the first layer. It is added to 0, so that -0 becomes 0.
     DFB_AVX2 DFB_INLINE void take(__m128 color, double minTransmittance)
     {
         const __m256d v = _mm256_cvtps_pd(color);
@@ -230,8 +232,8 @@ struct Avx2Pixel {
 struct Avx2Colors {
     __m128 a, b, c, d;
 
-    // That lie side by side. Also loads what is the next row in a full tile: no processor foresees streams that jump
-    // from layer to layer.
+    // Loads four neighbouring pixels. Also prefetches the pixels 64 further on, which are the next row in a full tile
+    // 64 pixels wide: no processor predicts streams that jump from layer to layer.
     DFB_AVX2 DFB_INLINE void load(const float* color)
     {
         _mm_prefetch(reinterpret_cast<const char*>(color + 256), _MM_HINT_T0);
@@ -241,7 +243,7 @@ struct Avx2Colors {
     {
         a = _mm_loadu_ps(color), b = _mm_loadu_ps(color + 4), c = _mm_loadu_ps(color + 8), d = _mm_loadu_ps(color + 12);
     }
-    // Each of its own layer, of which `colors` are those of the first pixel.
+    // Loads each pixel from a layer of its own. `colors`: those of the first pixel, by layer.
     DFB_AVX2 DFB_INLINE void load(const float* const* colors, const std::uint32_t (&layers)[4])
     {
         a = _mm_loadu_ps(colors[layers[0]]), b = _mm_loadu_ps(colors[layers[1]] + 4);
@@ -249,7 +251,7 @@ struct Avx2Colors {
     }
 };
 
-// Four of them, each in registers of its own: as an array they would go through memory where loops are not unrolled.
+// Four pixels, each in registers of its own: as an array they would go through memory where loops are not unrolled.
 template <bool HasLeast>
 struct Avx2Block {
     Avx2Pixel<HasLeast> a, b, c, d;

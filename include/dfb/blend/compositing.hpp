@@ -1,9 +1,9 @@
 // Compositing: the pure functions on spans of pixels from which tile operations are made: `over`, sort-and-blend and
 // nearest, all accumulated in double.
 //
-// The fold is one for all operations, so that the image does not depend on arrival order, threads or ranks. Per pixel,
-// layers are blended front to back in (depth, position in the list of layers): colour and alpha accumulate as A += T *
-// a, and the transmittance T is a variable of its own, updated by T *= 1 - a. If colour and alpha are finite floats,
+// All operations use one fold, so that the image does not depend on arrival order, threads or ranks. Per pixel, layers
+// are blended front to back in (depth, position in the list of layers): colour and alpha accumulate as `A += T * a`,
+// and the transmittance T is a variable of its own, updated by `T *= 1 - a`. If colour and alpha are finite floats,
 // alpha is in [0, 1], colour is non-negative, and there are up to 65536 layers, the accumulated double is within 2^-36
 // (relative) of the exact sum, so rounding it to float is within 1 ulp of exact. Where that is not enough to tell which
 // of two 8-bit levels is nearer, the row is composited again in twice the precision. Pixels are premultiplied: colour
@@ -441,9 +441,9 @@ inline void keepNearestPlain(CompositeRow& row, int x, int count, const std::vec
 
 } // namespace detail
 
-// For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at [x, x +
-// count). This is for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids, as something
-// is there.
+// For each of `count` pixels, keeps the nearest layer, by (depth, index in `layers`), and puts it into `row` at
+// [x, x + count). This is for opaque inputs. Pixels with alpha 0 count as well, also for depth, position and ids, as
+// something is there.
 inline void keepNearest(CompositeRow& row, int x, int count, const std::vector<Layer>& layers)
 {
     const auto isPlain = [](const Layer& layer) { return layer.depth && !layer.aux; };

@@ -1,4 +1,5 @@
-// FragmentCompositor: walks the rows of a tile's fragments, and composites each run of pixels that the same ones cover.
+// FragmentCompositor: walks the rows of a tile's fragments, and composites each run of pixels that the same fragments
+// cover.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -22,12 +23,12 @@ enum class BlendRule {
     Nearest      // keepNearest
 };
 
-// Composites the fragments of one tile and pass, row by row. The fragments' order decides between equal depths:
-// sort them by (source, part) first.
+// Composites the fragments of one tile and pass, row by row. Where depths are equal, the fragments' order decides: sort
+// them by (source, part) first.
 class FragmentCompositor {
 public:
     // `begin` to `end` are iterators of pointers to fragments, which must outlive this. `isFirst`: nobody else has
-    // walked them, so faults of pixels are counted.
+    // walked the fragments yet, so this walk counts the faults of pixels.
     template <class Iterator>
     void start(BlendRule rule, Iterator begin, Iterator end, bool isFirst = true)
     {
@@ -48,8 +49,8 @@ public:
             cursor.skip(count);
     }
 
-    // Composites the next row of all fragments into `row`, which has been sized for the region's width. With
-    // row.wantsGaps or row.wantsSingles false only the pixels that runs() names are there then.
+    // Composites the next row of all fragments into `row`, which has been sized for the region's width. If
+    // row.wantsGaps or row.wantsSingles is false, other pixels than those of runs() are undefined afterwards.
     void nextRow(CompositeRow& row)
     {
         runs_.clear();
@@ -82,8 +83,8 @@ public:
         }
     }
 
-    // Keeps the nearest pixels of the next row of all fragments, which keep their bytes and have a depth. Where there
-    // is nothing the depth is +infinity.
+    // Keeps the nearest pixels of the next row of all fragments. All fragments must keep their bytes and have a depth.
+    // Where there is no pixel, the depth is +infinity.
     void nextRow(detail::NearestBytes& row, int width)
     {
         row.reset(width);
@@ -93,8 +94,8 @@ public:
         });
     }
 
-    // Blends the next row of all fragments, of which there are two at most, and which keep their bytes, into `levels`,
-    // which are 0.
+    // Blends the next row of all fragments into `levels`, which must be 0. There may be two fragments at most, and both
+    // must keep their bytes.
     void nextRow(std::uint8_t* levels)
     {
         forEachByteSpan([&](const Span& span, const detail::ByteLayer& layer) {
@@ -103,18 +104,19 @@ public:
         });
     }
 
-    // Where there is anything in a row.
+    // A run of pixels that have anything.
     struct Run {
         int x = 0, count = 0;
-        const float* color = nullptr; // of a single layer, and not in the row; or null
+        const float* color = nullptr; // not null: the colours of a single layer, which are not in the row
     };
-    // Of the last row: in order, not overlapping. Narrow gaps, and up to 3 empty pixels at either end, belong to them.
+    // The runs of the last row: in order, not overlapping. They include narrow gaps, and up to 3 empty pixels at either
+    // end.
     const std::vector<Run>& runs() const noexcept { return runs_; }
 
 private:
-    static constexpr int narrowGap = 32;  // to composite nothing costs less than to begin a run
-    static constexpr int wideSingle = 16; // and so it is with layers that could be taken as they are
-    static constexpr int shortRun = 32;   // than this, on average: then layers are blended one after the other
+    static constexpr int narrowGap = 32;  // compositing a gap narrower than this costs less than a new run
+    static constexpr int wideSingle = 16; // the same holds for a single layer, which could be taken as it is
+    static constexpr int shortRun = 32;   // if runs are shorter on average, layers are blended one by one
 
     detail::RowPixels* rowPixels(std::size_t cursor)
     {
@@ -123,8 +125,8 @@ private:
         return rowPixels_[cursor].get();
     }
 
-    // Calls f(span, layer) for each span of the next row of all fragments, which keep their bytes; it returns how many
-    // depths are NaN.
+    // Calls f(span, layer) for each span of the next row of all fragments, which must keep their bytes. f returns how
+    // many depths are NaN.
     template <class F>
     void forEachByteSpan(const F& f)
     {
@@ -150,7 +152,8 @@ private:
             row.clear(begin, end - begin);
     }
 
-    // The rows of the fragments that have one. True if each is one run of pixels, the same in all.
+    // Sets active_ to the next row of each fragment that has pixels there. Returns true if each of these rows is a
+    // single span, the same in all.
     bool takeRows(bool wantsAux)
     {
         bool isOneRun = true;
@@ -171,8 +174,8 @@ private:
         return isOneRun;
     }
 
-    // Composites the next row if all inputs lie in place and may have anything in the same pixels: then each colour is
-    // read once, and not copied. Returns false if it must be composited otherwise.
+    // Composites the next row if all inputs lie in place and cover the same pixels: then each colour is read once, and
+    // not copied. Returns false if the row must be composited otherwise.
     bool compositeInPlace([[maybe_unused]] CompositeRow& row)
     {
 #if defined(DFB_HAS_AVX2_CLONES)
@@ -191,7 +194,7 @@ private:
     }
 
 #if defined(DFB_HAS_AVX2_CLONES)
-    // Blends rows_. False if nothing is known of the row then.
+    // Blends rows_. Returns false if `row` is undefined afterwards.
     template <bool HasLeast>
     bool blendInPlace(CompositeRow& row)
     {
@@ -225,7 +228,7 @@ private:
     }
 #endif
 
-    // Sets rows_, of all inputs, and layers_. False if they do not cover the same pixels.
+    // Sets rows_ and layers_ for all inputs. Returns false if they do not cover the same pixels.
     bool findInPlace()
     {
         if (cursors_.size() < 2 || cursors_.size() > rows_.size())
@@ -242,14 +245,16 @@ private:
         return true;
     }
 
-    // Sets order_ to the order of layers_. False if that changes within their `count` pixels, or a depth is NaN.
+    // Sets order_ to the order of layers_. Returns false if the order changes within their `count` pixels, or a depth
+    // is NaN. `isTold`: the order is that of the inputs.
     bool haveOneOrder(int count, bool isTold)
     {
         if (isTold || order_.size() != layers_.size())
             detail::resetOrder(order_, layers_.size());
         if (isTold || detail::firstOutOfOrder(layers_, order_, 0, count) == count)
             return true;
-        // Of copies: another process may change a depth while it is sorted, or it may be a NaN, and no sort bears that.
+        // Sorts copies: another process may change a depth meanwhile, or a depth may be NaN, and no sort can cope with
+        // that.
         float depths[detail::mostInPlace];
         firsts_.resize(layers_.size());
         for (std::size_t k = 0; k < firsts_.size(); ++k) {
@@ -260,7 +265,7 @@ private:
         return detail::firstOutOfOrder(layers_, order_, 0, count) == count;
     }
 
-    // Of the only fragment that has something in this row.
+    // Composites the row `r` of the only fragment that has pixels there.
     void compositeSpans(CompositeRow& row, const FragmentRow& r)
     {
         Layer layer{r.color, r.depth, nullptr};
@@ -280,8 +285,8 @@ private:
         return edges_[edgeCount_ - 1] - edges_.front() < shortRun * static_cast<int>(edgeCount_ - 1);
     }
 
-    // Of fragments in order: one after the other, each under what is there. Begins as many runs as there are spans,
-    // where compositeRuns() begins one at each edge of any.
+    // For fragments in order: blends one after the other, each under what is there. That begins one run per span, where
+    // compositeRuns() begins one at every edge of a span.
     void compositeLayers(CompositeRow& row)
     {
         const int width = static_cast<int>(row.transmittance.size());
@@ -310,7 +315,7 @@ private:
         }
     }
 
-    // The runs of pixels that any fragment covers, with the narrow gaps between them.
+    // Sets runs_ to the pixels that any fragment covers, including narrow gaps between them.
     void findRuns(int width)
     {
         std::vector<std::uint64_t>& isCovered = marks_;
@@ -327,7 +332,7 @@ private:
                                [&](int at, int count) { joinRun(static_cast<int>(64 * word) + at, count); });
     }
 
-    // After findEdges().
+    // Composites the row between each two edges. Call findEdges() first.
     void compositeRuns(CompositeRow& row, bool wantsAux)
     {
         clearGap(row, 0, edges_.front());
@@ -362,7 +367,7 @@ private:
         }
     }
 
-    // Of layers_, which have `count` pixels each.
+    // Composites layers_, which have `count` pixels each, and adds the run.
     void addRun(CompositeRow& row, int x, int count)
     {
         if (!row.wantsSingles && layers_.size() == 1 && count >= wideSingle) {
@@ -400,7 +405,7 @@ private:
         edgeCount_ = static_cast<std::size_t>(next - edges_.data());
     }
 
-    // layers_, which are `count` pixels each.
+    // Composites layers_, which have `count` pixels each, by the rule.
     void composite(CompositeRow& row, int x, int count)
     {
         switch (rule_) {
@@ -412,14 +417,14 @@ private:
 
     BlendRule rule_ = BlendRule::SortByDepth;
     std::array<detail::RowInPlace, detail::mostInPlace> rows_,
-        ordered_;         // of inputs; and in their order. Not cleared for a row
+        ordered_;         // of all inputs, and the same in blending order; kept from row to row
     bool isFull_ = false; // rows in place had one order and no gaps so far
     std::vector<FragmentCursor> cursors_;
-    std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of those that need it
+    std::vector<std::unique_ptr<detail::RowPixels>> rowPixels_; // of the cursors that need scratch memory
     std::vector<FragmentRow> active_;
     std::vector<detail::ConstPlanes> aux_; // of layers_
     std::vector<std::uint64_t> marks_;     // a bit for each pixel of a row
-    std::vector<int> edges_;               // the first edgeCount_
+    std::vector<int> edges_;               // only the first edgeCount_ are valid
     std::size_t edgeCount_ = 0;
     std::vector<Run> runs_;
     std::vector<Layer> layers_, firsts_;

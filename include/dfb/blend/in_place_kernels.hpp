@@ -1,5 +1,6 @@
-// The kernels of rows in place: all inputs of a tile are blended as they are read, if they have the same bounds. By
-// hand for AVX2 alone: without it such rows are searched, copied and blended like others, to the same bits.
+// The kernels for rows in place: if all inputs of a tile have the same bounds, they are blended as they are read. They
+// exist for AVX2 alone. Without it, such rows are searched, copied and blended like others, with the same bits as the
+// result.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -14,10 +15,10 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-inline constexpr int mostInPlace = 32; // so many inputs in place at most are blended as they are read
+inline constexpr int mostInPlace = 32; // the most inputs in place that are blended as they are read
 
 #if defined(DFB_HAS_AVX2_CLONES)
-// Reads four pixels of a row in place, each value once, and checks them. False if all are 0.
+// Reads four pixels of a row in place, each value once, and adds them to `check`. Returns false if all are 0.
 DFB_AVX2 DFB_INLINE bool read(const RowInPlace& row, std::ptrdiff_t pixel, Avx2Colors& colors, Avx2ColorCheck& check)
 {
     prefetch(reinterpret_cast<const std::byte*>(row.colorAhead + 4 * pixel), 64);
@@ -29,8 +30,9 @@ DFB_AVX2 DFB_INLINE bool read(const RowInPlace& row, std::ptrdiff_t pixel, Avx2C
     return _mm256_testz_si256(_mm256_castps_si256(_mm256_or_ps(ab, cd)), withoutSign) == 0;
 }
 
-// Blends rows of 4 pixels or more, the front one first, to what blendGroup() makes of them. False if that is not so: a
-// value is not finite, an alpha not within [0, 1], or four neighbours have nothing in any row.
+// Blends rows of 4 pixels or more, the front one first, with the same result as blendGroup(). Returns false if the
+// result is not to be used: a value is not finite, an alpha is not within [0, 1], or four neighbours are empty in all
+// rows.
 template <bool HasLeast>
 DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTransmittance, double* rgba,
                                 double* transmittance)
@@ -40,7 +42,7 @@ DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTr
     check.clear();
     bool hasGap = false;
     for (std::ptrdiff_t begin = 0; begin < count; begin += 4) {
-        const std::ptrdiff_t i = std::min(begin, count - 4); // some may be blended twice
+        const std::ptrdiff_t i = std::min(begin, count - 4); // the last four may overlap those before
         Avx2Colors colors;
         Avx2Block<HasLeast> block;
         read(rows[0], i, colors, check);
@@ -55,7 +57,7 @@ DFB_AVX2 bool blendFullRowsAvx2(const RowInPlace* rows, int layers, double minTr
     return !hasGap && check.isGood();
 }
 
-// Four pixels of the rows that have anything there, to be sorted.
+// Four pixels of each row that has anything in them, to be sorted.
 struct SparseFour {
     alignas(16) float colors[mostInPlace][16];
     alignas(16) float depths[mostInPlace][4];
@@ -68,7 +70,7 @@ struct SparseFour {
         _mm_store_ps(to + 8, four.c), _mm_store_ps(to + 12, four.d);
         _mm_store_ps(depths[layers++], depth);
     }
-    // Whether each pixel of a layer is before that of the next.
+    // Whether the layers are in order at all four pixels: none is behind the next.
     DFB_AVX2 DFB_INLINE bool areSorted() const
     {
         __m128 wrong = _mm_setzero_ps();
@@ -88,9 +90,10 @@ struct SparseFour {
     }
 };
 
-// Does so for pixels [begin, begin + 256) of rows that may have gaps, and returns a bit for each four that have
-// anything in any row. With Sorts pixels are sorted by (depth, row). Sets `isGood` to false where a value is not
-// finite, an alpha not within [0, 1], or a depth that counts is NaN.
+// Blends pixels [begin, begin + 256) of rows that may have gaps. Returns a bit for each four pixels, set if they have
+// anything in any row. With `Sorts`, each pixel's layers are sorted by (depth, row); else the front row comes first.
+// Sets `isGood` to false if a value is not finite, an alpha is not within [0, 1], or a depth is NaN where the row has
+// anything in the four pixels.
 template <bool HasLeast, bool Sorts>
 DFB_AVX2 std::uint64_t blendSparseRowsAvx2(const RowInPlace* rows, int layers, int begin, double minTransmittance,
                                            double* rgba, double* transmittance, bool& isGood)

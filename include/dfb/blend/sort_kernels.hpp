@@ -1,6 +1,6 @@
-// The kernels of sorting layers by depth, (depth, index) ascending: how far an order holds along a row, sorting four
-// pixels at once, and the nearest of pixels of 8 bits a channel. Each is there in plain C++ and, for processors that
-// have it, by hand for AVX2.
+// The kernels of sorting layers by (depth, index), ascending: how far an order holds along a row, sorting four pixels
+// at once, and keeping the nearest of pixels with 8 bits a channel. Each kernel exists in plain C++ and, for processors
+// that have it, by hand for AVX2.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -23,7 +23,7 @@ struct OrderedDepths {
     static constexpr int mostLayers = 16;
 
     const float* depths[mostLayers];
-    std::int32_t losesTies[mostLayers]; // between this layer and the next equal depths are wrong: -1, else 0
+    std::int32_t losesTies[mostLayers]; // -1 if equal depths of this layer and the next are out of order, else 0
     int layers = 0;
 };
 
@@ -55,7 +55,7 @@ inline int firstOutOfOrderPlain(const OrderedDepths& order, int begin, int end)
 
 #if defined(DFB_HAS_AVX2_CLONES)
 
-// All layers of eight pixels, then the next eight: each depth is loaded once.
+// Compares all layers of eight pixels, then of the next eight, so that each depth is loaded once.
 DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, int end)
 {
     constexpr int chunk = 8;
@@ -68,7 +68,7 @@ DFB_AVX2 inline int firstOutOfOrderAvx2(const OrderedDepths& order, int begin, i
         for (int k = 0; k + 1 < order.layers; ++k) {
             const __m256 back = _mm256_maskload_ps(depths[k + 1] + x, lanes);
             _mm_prefetch(reinterpret_cast<const char*>(depths[k + 1] + x + 128), _MM_HINT_T0); // rows to come
-            // Without a branch, as the winner is random where depths are.
+            // Without a branch: it would be unpredictable where depths are random.
             const __m256 losesTies = _mm256_castsi256_ps(_mm256_set1_epi32(order.losesTies[k]));
             wrong = _mm256_or_ps(wrong, _mm256_cmp_ps(front, back, _CMP_NLE_UQ));
             wrong = _mm256_or_ps(wrong, _mm256_and_ps(losesTies, _mm256_cmp_ps(front, back, _CMP_EQ_OQ)));
@@ -90,9 +90,9 @@ inline int firstOutOfOrder(const OrderedDepths& order, int begin, int end)
 
 // ---- sorting four pixels at once
 
-// Batcher's odd-even merge sort (1968): which two places to compare and exchange, one after the other, whatever is in
-// them. Of the network for the next power of 2, the places beyond the layers would hold the largest already and are
-// left out.
+// Batcher's odd-even merge sort (1968): the pairs of places to compare and exchange, one after the other, whatever
+// their contents. It is the network for the next power of 2, without the places beyond the layers: those would hold the
+// largest values already.
 class SortNetwork {
 public:
     static constexpr int mostLayers = 128;
@@ -109,7 +109,7 @@ public:
                         exchanges_.push_back({static_cast<std::uint8_t>(i), static_cast<std::uint8_t>(i + step)});
     }
 
-    // The one for so many layers, of this thread: made when it is first needed.
+    // This thread's network for so many layers, made when it is first needed.
     static const SortNetwork& of(int layers)
     {
         static thread_local std::array<std::vector<SortNetwork>, mostLayers + 1> made;
@@ -128,13 +128,13 @@ private:
     std::vector<Exchange> exchanges_;
 };
 
-// Which layer is in which place at each of four pixels.
+// [place][pixel]: which layer is in this place of the order, at each of four pixels.
 using FourOrders = std::uint32_t[SortNetwork::mostLayers][4];
 
-// Sorting moves one number for a layer: its depth as a double, whose last 29 bits are 0, with its index in there. That
-// orders by depth, then index: among negative numbers more bits are less, so that the index is complemented there.
-// Infinities become numbers, as with more bits they were NaN; both zeros become the same one, which is less than all
-// that is above 0; a NaN counts as infinity.
+// Sorting moves one number for each layer: its depth as a double, whose last 29 bits are 0, with the layer's index in
+// the last bits. That orders by depth, then index. A negative number is less the more bits are set, so there the index
+// is complemented. Infinities are replaced by finite numbers, as an infinity with more bits would be a NaN. Both zeros
+// become one number, which is less than all floats above 0. A NaN counts as +infinity.
 constexpr double infinityKey = 0x1p200, zeroKey = 0x1p-200;
 constexpr std::int64_t layerBits = SortNetwork::mostLayers - 1;
 
@@ -158,7 +158,7 @@ inline std::uint32_t layerOf(double key)
     return static_cast<std::uint32_t>((bits < 0 ? ~bits : bits) & layerBits);
 }
 
-// `depths`: of the first of four pixels, for each layer of the network.
+// `depths`: for each layer of the network, the depth of the first of four pixels.
 inline void sortFourPlain(const float* const* depths, const SortNetwork& network, FourOrders& orders)
 {
     double keys[SortNetwork::mostLayers][4];
@@ -187,7 +187,7 @@ DFB_AVX2 inline void sortFourAvx2(const float* const* depths, const SortNetwork&
     for (int k = 0; k < network.layers(); ++k) {
         __m256d key = _mm256_cvtps_pd(_mm_loadu_ps(depths[k]));
         key = _mm256_blendv_pd(key, tiny, _mm256_cmp_pd(key, _mm256_setzero_pd(), _CMP_EQ_OQ));
-        key = _mm256_max_pd(_mm256_min_pd(key, most), least); // of a NaN and a number these take the second
+        key = _mm256_max_pd(_mm256_min_pd(key, most), least); // if either is NaN, these return the second
         const __m256i isNegative = _mm256_cmpgt_epi64(zero, _mm256_castpd_si256(key));
         const __m256i layer = _mm256_xor_si256(_mm256_set1_epi64x(k), _mm256_and_si256(isNegative, all));
         _mm256_store_pd(keys[k], _mm256_or_pd(key, _mm256_castsi256_pd(layer)));
@@ -215,7 +215,7 @@ inline void sortFour(const float* const* depths, const SortNetwork& network, Fou
 
 // ---- the nearest
 
-// A row of pixels of which the nearest are kept: at first of depth +infinity.
+// A row in which the nearest pixels are kept. At first all depths are +infinity.
 struct NearestBytes {
     std::vector<float> depth;
     std::vector<std::byte> bytes; // 4 a pixel
@@ -227,15 +227,15 @@ struct NearestBytes {
     }
 };
 
-// Pixels of a layer, where they lie.
+// Pixels of a layer, read where they lie.
 struct ByteLayer {
     const std::byte* bytes;
     const float* depth;
     float depthLimit; // at this depth or beyond a pixel is empty
 };
 
-// Takes pixels of a layer where they are nearer, as they are; a depth of -0 becomes 0. `depth` and `bytes` are of the
-// nearest so far. Returns how many depths are NaN: these pixels are empty.
+// Takes those pixels of a layer that are nearer than `depth`, with their bytes unchanged; a depth of -0 becomes 0.
+// `depth` and `bytes` are those of the nearest pixels so far. Returns how many depths are NaN: these pixels are empty.
 inline std::uint64_t keepBytesPlain(float* depth, std::byte* bytes, int count, const ByteLayer& layer)
 {
     std::uint64_t nan = 0;
