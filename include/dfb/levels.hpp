@@ -1,5 +1,5 @@
-// Levels: rows of linear values become 8-bit levels, linear or sRGB, correctly rounded; and how near any value came to
-// a tie, so that the caller can decide it with more digits.
+// Levels: converts rows of linear values to 8-bit levels, linear or sRGB, correctly rounded. Also returns how near any
+// value came to a tie, so that the caller can decide that value with more digits.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -19,18 +19,21 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// 255 * value to the nearest integer, ties to even, for value in [0, 1]; clamped outside; NaN gives 0. The product is
-// rounded to double first, which brings values that should be ties, such as a mean of 1/6, back to them.
+// Rounds 255 * value to the nearest integer, ties to even, for a value in [0, 1]. Values outside are clamped, and NaN
+// gives 0. The product is rounded to double first, so that values that should be ties, such as a mean of 1/6, become
+// ties again.
 inline std::uint8_t toUnorm8(double value) noexcept
 {
     // No branches, so that it can be vectorized. The order of the comparisons makes NaN 0.
     const double notBelow = value > 0.0 ? value : 0.0, clamped = notBelow < 1.0 ? notBelow : 1.0;
-    // 2^52 leaves no bit below one, so the addition rounds as the default mode does: to even.
+    // A double of 2^52 or more has no bits below one, so the addition rounds to an integer in the default mode: ties to
+    // even.
     const double shift = 4503599627370496.0;
     return static_cast<std::uint8_t>(static_cast<int>((clamped * 255.0 + shift) - shift));
 }
 
-// Rounds a value that is known to about 100 bits. A value that is nearer to a tie than that counts as the tie.
+// Rounds a value that is known to about 100 bits. A value that is too near to a tie to be told from it counts as the
+// tie.
 inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
 {
     if (!(value.high > 0.0))
@@ -45,7 +48,7 @@ inline std::uint8_t toUnorm8(const DoubleDouble& value) noexcept
     return static_cast<std::uint8_t>(below + (overTie.high > 0 ? 1 : 0));
 }
 
-// The linear value of so many half levels, to about 100 bits.
+// The linear value at which sRGB reaches so many half levels, to about 100 bits.
 inline DoubleDouble srgbInverse(int halves) noexcept
 {
     const DoubleDouble s = DoubleDouble{static_cast<double>(halves), 0} / 510;
@@ -53,35 +56,36 @@ inline DoubleDouble srgbInverse(int halves) noexcept
         return s * DoubleDouble{100, 0} / 1292;
     const DoubleDouble base = (s * DoubleDouble{1000, 0} + DoubleDouble{55, 0}) / 1055;
     const DoubleDouble base3 = base * base * base, base12 = base3 * base3 * base3 * base3;
-    // t^5 = base^12: one step of Newton's from a double doubles the digits.
+    // Solves t^5 = base^12: one step of Newton's method, from a double, doubles the number of digits.
     const DoubleDouble t{std::pow(base.high, 2.4), 0}, t2 = t * t, t4 = t2 * t2, t5 = t4 * t;
     const DoubleDouble excess = t5 + DoubleDouble{-base12.high, -base12.low};
     return t + DoubleDouble{-(excess.high / (5 * t4.high)), 0};
 }
 
-// Where level k ends and the next begins.
+// The linear value where level k ends and the next begins.
 inline DoubleDouble srgbBoundary(int k) noexcept { return srgbInverse(2 * k + 1); }
 
-// The thresholds as a table by the upper bits of the value: the exponent from 2^-13 on and 7 bits of the mantissa give
-// one of 13 * 128 + 1 cells. No cell has more than one threshold, and none is near a cell's edge. So one comparison
-// decides, and a value can be near to the threshold of its own cell only.
+// A table of the thresholds, indexed by the upper bits of a float. The exponent from 2^-13 on and 7 bits of the
+// mantissa select one of 13 * 128 + 1 cells. No cell has more than one threshold, and none is near a cell's edge. So
+// one comparison decides, and a value can only be near to the threshold of its own cell.
 class SrgbCells {
 public:
     static constexpr std::uint32_t first = 114u << 7;  // the upper 16 bits of 2^-13, below the first threshold
-    static constexpr std::size_t count = 13 * 128 + 1; // the last one is that of 1
+    static constexpr std::size_t count = 13 * 128 + 1; // the last cell is that of the value 1
 
-    // A cell is one word, so that vector code can gather it: the level at its start, plus 1, times 2^17; and the lower
-    // 16 bits of the least float of the next level, or `none` where that level begins in a later cell.
+    // A cell is one word, so that vector code can gather it. It is the sum of two numbers: the level at the cell's
+    // start, plus 1, times 2^17; and the lower 16 bits of the least float of the next level, or `none` if that level
+    // begins in a later cell.
     static constexpr std::uint32_t none = 0x18000;
 
     SrgbCells()
     {
-        for (int k = 0; k < 255; ++k) { // the least double of the level after k: so a comparison decides
+        for (int k = 0; k < 255; ++k) { // the least double of level k + 1, so that a comparison decides
             const DoubleDouble boundary = srgbBoundary(k);
             thresholds_[static_cast<std::size_t>(k)] =
                 boundary.low > 0 ? std::nextafter(boundary.high, 2.0) : boundary.high;
         }
-        thresholds_.back() = 2; // never reached nor near
+        thresholds_.back() = 2; // no value reaches it or comes near
         std::size_t level = 0;
         for (std::size_t cell = 0; cell < count; ++cell) {
             cells_[cell] = static_cast<std::uint32_t>(level + 1) << 17 | none;
@@ -90,7 +94,7 @@ public:
                 least = std::nextafter(least, 3.0f);
             std::uint32_t bits = 0;
             std::memcpy(&bits, &least, sizeof bits);
-            assert(bits >> 16 >= first + cell); // not two in the cell before
+            assert(bits >> 16 >= first + cell); // the cell before has no second threshold
             if (bits >> 16 != first + cell)
                 continue;
             assert((bits & 0xffff) >= edge && (bits & 0xffff) <= 0x10000 - edge);
@@ -100,7 +104,8 @@ public:
         assert(level == 255);
     }
 
-    // The level, and whether a value with an error of 2^-35 of itself could have another.
+    // Returns the level. Sets `isNear` to whether the level could be another one if the value has a relative error of
+    // 2^-35.
     std::uint8_t levelOf(double linear, bool& isNear) const noexcept
     {
         // The order of the comparisons makes NaN 2^-13, whose level is 0.
@@ -149,11 +154,11 @@ inline std::uint8_t toSrgb8(const DoubleDouble& linear) noexcept
     return static_cast<std::uint8_t>(level);
 }
 
-// toUnorm8() of `count` values. Returns how far the farthest of 255 * value was from an integer, up to 1/2, which is a
-// tie.
+// Does toUnorm8() for `count` values. Returns the largest distance of any 255 * value from an integer: at most 1/2,
+// which is a tie.
 inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexcept
 {
-    const double shift = 4503599627370496.0; // as above
+    const double shift = 4503599627370496.0; // 2^52, as above
     double farthest = 0;
     int i = 0;
 #if defined(__SSE2__) // compilers do not vectorize comparisons that could trap
@@ -184,7 +189,7 @@ inline double toUnorm8(const double* values, int count, std::uint8_t* out) noexc
     return farthest;
 }
 
-// Rounds floats.
+// Does the same for floats.
 inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexcept
 {
     constexpr int block = 64;
@@ -198,8 +203,8 @@ inline double toUnorm8(const float* values, int count, std::uint8_t* out) noexce
     return farthest;
 }
 
-// Makes sRGB levels of the colours of `count` pixels, and linear ones of their alpha. A colour that is near a threshold
-// counts as a tie.
+// Converts the colours of `count` pixels to sRGB levels, and their alpha to linear ones. A colour that is near a
+// threshold counts as a tie.
 template <class Real>
 double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
 {
@@ -227,7 +232,7 @@ double toSrgb8(const Real* rgba, int count, std::uint8_t* out) noexcept
     return farthest;
 }
 
-// Either, as the format asks for.
+// Converts `count` pixels to sRGB or linear levels.
 template <bool IsSrgb, class Real>
 double toLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
 {
@@ -244,18 +249,18 @@ DFB_AVX2 inline __m256 loadAsFloats(const double* values) noexcept
     return _mm256_set_m128(_mm256_cvtpd_ps(_mm256_loadu_pd(values + 4)), _mm256_cvtpd_ps(_mm256_loadu_pd(values)));
 }
 
-// Of as many pixels as there are whole eights, which it returns; the rest is for toLevels(). Rounds in float: the value
-// is off by half an ulp, and so is the product, by 255 * 2^-25 + 2^-17 < 2^-16 together. Where that comes near enough
-// to a tie to matter, or a colour within 2 floats of an sRGB threshold, all eight go through toLevels(). `farthest` is
-// no less than that of toLevels(), and a tie for the same pixels; a value that is no tie may count as up to 2^-15
-// farther.
+// Converts as many pixels as make up whole groups of eight, and returns their number. The rest is left to toLevels().
+// This rounds in float: the value is off by half an ulp, and so is the product, together by 255 * 2^-25 + 2^-17 <
+// 2^-16. If that is near enough to a tie to matter, or a colour is within 2 floats of an sRGB threshold, all eight
+// pixels go through toLevels(). `farthest` is no less than that of toLevels(), and a tie for the same pixels. If it is
+// no tie, it may be up to 2^-15 larger.
 template <bool IsSrgb, class Real>
 DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out, double& farthest) noexcept
 {
     const float off = 0x1p-16f;
     const __m256 zero = _mm256_setzero_ps(), one = _mm256_set1_ps(1.0f), scale = _mm256_set1_ps(255.0f);
     const __m256 limit = _mm256_set1_ps(0.5f - 2 * off), low = _mm256_set1_ps(0x1p-13f);
-    // Without the sign; of alpha alone if only that is linear.
+    // Keeps all bits but the sign; for sRGB only those of alpha, the only linear channel.
     const int noSign = 0x7fffffff, ofColor = IsSrgb ? 0 : noSign;
     const __m256 distanceBits =
         _mm256_castsi256_ps(_mm256_setr_epi32(ofColor, ofColor, ofColor, noSign, ofColor, ofColor, ofColor, noSign));
@@ -307,7 +312,8 @@ DFB_AVX2 inline int toLevelsAvx2(const Real* rgba, int count, std::uint8_t* out,
 }
 #endif
 
-// Levels of `count` premultiplied RGBA pixels, as fast as the processor can. Returns the same as convertPixels().
+// Converts `count` premultiplied RGBA pixels to levels in the fastest way that the processor has. Returns the same as
+// convertPixels().
 template <bool IsSrgb, class Real>
 double pixelsToLevels(const Real* rgba, int count, std::uint8_t* out) noexcept
 {

@@ -1,5 +1,5 @@
-// Cpu: loops that are compiled a second time for processors with AVX2, which is asked for at run time. Not for FMA: the
-// results are the same, bit for bit. DFB_AVX2_F16C and cpuHasF16c() are the same where halves are converted.
+// Cpu: compiles loops a second time for processors with AVX2, and picks at run time. FMA is not used, so that the
+// results are the same, bit for bit. DFB_AVX2_F16C and cpuHasF16c() do the same where half floats are converted.
 //
 //   DFB_INLINE void body(...) { ... }
 //   fastest<body>(...);
@@ -29,8 +29,8 @@
 #define DFB_AVX2_F16C __attribute__((target("avx2,f16c"), optimize("O3")))
 #endif
 #define DFB_INLINE inline __attribute__((always_inline))
-// Calls one of two functions with the same arguments: the second one where the processor has AVX2. It need not be there
-// for other processors.
+// Calls one of two functions with the same arguments: the second one where the processor has AVX2. On other
+// architectures the second one need not exist.
 #define DFB_FASTEST(plain, avx2, ...) (::dfb::detail::cpuHasAvx2() ? avx2(__VA_ARGS__) : plain(__VA_ARGS__))
 #include <cpuid.h>
 #else
@@ -64,7 +64,7 @@ inline bool cpuHasAvx2() noexcept
 #endif
 }
 
-// Calls Body, which is DFB_INLINE, as it is compiled for AVX2 where the processor has that.
+// fastest<Body>(...) calls Body, which is DFB_INLINE, in the version compiled for AVX2 if the processor has that.
 template <auto Body, class... Arguments>
 DFB_AVX2 inline auto withAvx2(Arguments... arguments) noexcept
 {
@@ -76,8 +76,8 @@ inline auto fastest(Arguments... arguments) noexcept
     return DFB_FASTEST(Body, withAvx2<Body>, arguments...);
 }
 
-// Whether there is AVX2, and F16C as well: conversion of halves, which all such processors have, but not all
-// hypervisors show.
+// Whether the processor has AVX2 and F16C, the conversion of half floats. All processors with AVX2 have F16C, but not
+// all hypervisors show it.
 inline bool cpuHasF16c() noexcept
 {
 #if defined(DFB_HAS_AVX2_CLONES)
@@ -91,7 +91,7 @@ inline bool cpuHasF16c() noexcept
 #endif
 }
 
-// How many bits are below the lowest that is set; there is one.
+// How many zeros are below the lowest bit that is set. At least one bit must be set.
 inline int zerosBelow(std::uint64_t bits) noexcept
 {
 #if defined(__GNUC__)
@@ -119,8 +119,8 @@ void forEachRun(std::uint64_t bits, const F& f)
     }
 }
 
-// FloatEnvironment: while it lives, the thread computes with denormals. Renderers turn flush-to-zero on for
-// their threads, and compositing may run on those.
+// FloatEnvironment: while it lives, its thread computes with denormals. Renderers turn flush-to-zero on for their
+// threads, and compositing may run on those.
 class FloatEnvironment {
 public:
     FloatEnvironment(const FloatEnvironment&) = delete;
@@ -132,7 +132,7 @@ public:
 private:
     static constexpr unsigned flushAndDenormalsZero = 0x8040;
     unsigned saved_;
-#elif defined(__aarch64__) && defined(__GNUC__) // Clang's, too
+#elif defined(__aarch64__) && defined(__GNUC__) // defined by Clang as well
     FloatEnvironment() : saved_(controlRegister()) { setControlRegister(saved_ & ~flushToZero); }
     ~FloatEnvironment() { setControlRegister(saved_); }
 
@@ -154,14 +154,14 @@ private:
 
 } // namespace detail
 
-// Processors: those that a thread may run on. A set, as plain bytes that can be sent. Those from `limit` on are left
-// out.
+// Processors: the set of processors that a thread may run on, as plain bytes that can be sent. Processors numbered
+// `limit` and above are left out.
 class Processors {
 public:
     static constexpr int limit = 1024;
 
-    // The CPU mask of the calling thread, which the threads that it starts inherit; where that cannot be asked for,
-    // all that the machine has. Never empty.
+    // The CPU mask of the calling thread, which the threads that it starts inherit. If the mask cannot be queried, this
+    // is the set of all processors of the machine. Never empty.
     static Processors ofThisThread() noexcept
     {
         Processors found;
@@ -183,7 +183,7 @@ public:
 
     int count() const noexcept { return static_cast<int>(set_.count()); }
 
-    // Whether any is in both.
+    // Whether any processor is in both sets.
     bool meets(const Processors& other) const noexcept { return (set_ & other.set_).any(); }
 
 private:
@@ -191,7 +191,7 @@ private:
 };
 static_assert(std::is_trivially_copyable_v<Processors> && sizeof(Processors) == Processors::limit / 8);
 
-// How many threads each of `ranks` should have that share so many processors: an equal part, at least 1.
+// How many threads each of `ranks` ranks should have if they share `processors` processors: an equal part, at least 1.
 inline int threadShare(int processors, int ranks) noexcept { return std::max(1, processors / std::max(1, ranks)); }
 
 DFB_NAMESPACE_END

@@ -1,4 +1,4 @@
-// Whether a type has a member: the traits of policies, a line each.
+// Detects whether a type has a member, to define the traits of policies in one line each.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -6,8 +6,8 @@
 #include <type_traits>
 #include <utility>
 
-// Defines name<T>: whether the expression, in which T stands for the type, can be compiled. For several of them, put
-// commas between.
+// Defines name<T>: whether the expression, in which T is the type, compiles. Several expressions are separated by
+// commas.
 #define DFB_DETECTS(name, ...)          \
     template <class T, class = void>    \
     inline constexpr bool name = false; \

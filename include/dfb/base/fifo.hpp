@@ -1,4 +1,4 @@
-// Fifo: a queue that keeps its memory, so that one that is filled and emptied again and again allocates no more.
+// Fifo: a queue that keeps its memory, so that filling and emptying it again and again allocates no more.
 #pragma once
 
 #include <dfb/version.hpp>
@@ -24,7 +24,7 @@ public:
         first_ = 0;
     }
 
-    // The oldest; there must be one.
+    // The oldest item. The queue must not be empty.
     T& front() noexcept { return items_[first_]; }
     T pop()
     {

@@ -1,5 +1,5 @@
-// FunctionRef: a callable that is only called during the call that it is an argument of. Two pointers, so what takes
-// one need be no template, of which each lambda would make another function.
+// FunctionRef: a reference to a callable, valid during the call to which it is an argument. It is two pointers, so a
+// function that takes one need not be a template, which would be instantiated for each lambda.
 #pragma once
 
 #include <dfb/version.hpp>
