@@ -1,5 +1,5 @@
-// Active pixels: which of a row travel, those with any colour channel that is not 0 or those with a depth; copying
-// them, with a check; and reading an input where it lies, row by row.
+// Active pixels: finds which pixels of a row travel (those with any colour channel that is not 0, or those with a
+// depth), copies and checks them, and reads an input where it lies, row by row.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -26,9 +26,9 @@ struct Span {
 
 namespace detail {
 
-// Loads a piece of a row into the second cache. No processor knows by itself where the next row begins. The first cache
-// is too small: rows of an image are often a multiple of 4 KiB apart, so those of several inputs take each other's
-// place. Inlined always, as GCC leaves out calls of functions that do nothing else.
+// Prefetches a piece of a row into the second-level cache, as no processor predicts where the next row begins. The
+// first-level cache is too small: rows of an image are often a multiple of 4 KiB apart, so that rows of several inputs
+// evict each other. Always inlined, as GCC removes calls of functions that do nothing else.
 DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
 {
 #if defined(__GNUC__)
@@ -38,16 +38,16 @@ DFB_INLINE void prefetch(const std::byte* from, std::size_t bytes)
     (void)from, (void)bytes;
 #endif
 }
-// The row to load while row y is read, of rows before `yEnd`; the last ones load themselves. 4 KiB of colours ahead
-// were best where it was measured. Load it in pieces, between the work on row y: all at once takes up to a quarter
-// longer.
+// The row to prefetch while row y is read. For the last rows before `yEnd` it is y itself. Prefetching 4 KiB of colours
+// ahead was fastest where it was measured. Prefetch the row in pieces, between the work on row y: all at once takes up
+// to a quarter longer.
 inline int rowAhead(int y, int yEnd, int width)
 {
     const int ahead = y + (width < 64 ? 1 : std::max(1, 256 / width));
     return ahead < yEnd ? ahead : y;
 }
 
-// Of up to 64 pixels, bit by bit: those with a colour channel that is not 0.
+// Returns a bit for each of up to 64 pixels, set if any of its colour channels is not 0.
 DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
 {
     std::uint64_t bits = 0;
@@ -59,7 +59,8 @@ DFB_INLINE std::uint64_t findActivePixels(const float* rgba, int count)
     return bits;
 }
 
-// Copies colours. False if one is not finite, or an alpha not within [0, 1]. No branches, so that it can be vectorized.
+// Copies colours. Returns false if one is not finite, or an alpha is not within [0, 1]. There are no branches, so that
+// it can be vectorized.
 inline bool copyAndCheckColors(const float* rgba, int count, float* out)
 {
     constexpr float most = std::numeric_limits<float>::max();
@@ -75,7 +76,7 @@ inline bool copyAndCheckColors(const float* rgba, int count, float* out)
 }
 
 #if defined(DFB_HAS_AVX2_CLONES)
-// Looks at colours as copyAndCheckColors() does.
+// Checks colours as copyAndCheckColors() does.
 struct Avx2ColorCheck {
     __m256 areInside;
 
@@ -91,7 +92,7 @@ struct Avx2ColorCheck {
     DFB_AVX2 DFB_INLINE bool isGood() const { return _mm256_movemask_ps(areInside) == 255; }
 };
 
-// With Copies, also does what copyAndCheckColors() does; `isGood` becomes false where that would be.
+// With `Copies`, also does what copyAndCheckColors() does, and sets `isGood` to false where that would return false.
 template <bool Copies>
 DFB_AVX2 std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
 {
@@ -111,7 +112,7 @@ DFB_AVX2 std::uint64_t findActivePixelsAvx2(const float* rgba, const float* ahea
             }
             isZero[k] = _mm256_cmpeq_epi32(_mm256_and_si256(_mm256_castps_si256(two), allButSign), zero);
         }
-        // A byte for each value, 4 for each pixel: of pixels 0 2 4 6 1 3 5 7.
+        // A byte for each value, 4 for each pixel. The pixels are in the order 0 2 4 6 1 3 5 7.
         __m256i bytes =
             _mm256_packs_epi16(_mm256_packs_epi32(isZero[0], isZero[1]), _mm256_packs_epi32(isZero[2], isZero[3]));
         bytes = _mm256_permutevar8x32_epi32(bytes, _mm256_setr_epi32(0, 4, 1, 5, 2, 6, 3, 7));
@@ -137,20 +138,20 @@ std::uint64_t findActivePixelsPlain(const float* rgba, const float* ahead, int c
     return findActivePixels(Copies ? out : rgba, count);
 }
 
-// `ahead`: where to load as many pixels from, meanwhile.
+// Calls findActivePixels() in its fastest version. `ahead`: as many pixels there are prefetched meanwhile.
 inline std::uint64_t activePixelBits(const float* rgba, const float* ahead, int count)
 {
     bool isGood = true;
     return DFB_FASTEST(findActivePixelsPlain<false>, findActivePixelsAvx2<false>, rgba, ahead, count, nullptr, isGood);
 }
 
-// Does so and copies them all, in one pass. Sets `isGood` to false where copyAndCheckColors() would return it.
+// Does the same and copies all pixels, in one pass. Sets `isGood` to false if copyAndCheckColors() would return false.
 inline std::uint64_t copyAndFindActivePixels(const float* rgba, const float* ahead, int count, float* out, bool& isGood)
 {
     return DFB_FASTEST(findActivePixelsPlain<true>, findActivePixelsAvx2<true>, rgba, ahead, count, out, isGood);
 }
 
-// Finds the active ones of pixels with 8 bits a channel.
+// Like findActivePixels(), for pixels with 8 bits a channel.
 DFB_INLINE std::uint64_t findActiveBytes(const std::byte* rgba, int count)
 {
     std::uint64_t bits = 0;
@@ -182,9 +183,9 @@ inline std::uint64_t activeByteBits(const std::byte* rgba, int count)
     return DFB_FASTEST(findActiveBytes, findActiveBytesAvx2, rgba, count);
 }
 
-// Of up to 64 pixels, bit by bit.
+// A bit for each of up to 64 pixels.
 struct DepthBits {
-    std::uint64_t active = 0; // below the limit
+    std::uint64_t active = 0; // the depth is below the limit
     std::uint64_t nan = 0;
 };
 
@@ -247,30 +248,31 @@ struct RowPlace {
     }
 };
 
-// A row of pixels in place, active where they have a colour. Others may still change them.
+// A row of pixels in place, active where they have a colour. The renderer may still change them.
 struct RowInPlace {
     Span span;
     const float* color = nullptr;
     const float* depth = nullptr; // null: not wanted
-    // Of a later row, to load into the cache meanwhile.
+    // The same of a later row, to be prefetched meanwhile.
     const float *colorAhead = nullptr, *depthAhead = nullptr;
 };
 
-// Which pixels of a row are active.
+// The rule by which pixels are active.
 struct Activity {
-    bool byDepth = false; // those with a depth; else those with a colour
+    bool byDepth = false; // pixels with a depth are active; else those with a colour
     bool hasBytes = false;
     float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty
 
     std::ptrdiff_t colorBytes() const noexcept { return hasBytes ? 4 : 4 * sizeof(float); } // of a pixel
-    // Whether only float colours say it.
+    // Whether float colours alone decide.
     bool byColorAlone() const noexcept
     {
         return !byDepth && !hasBytes && depthLimit == std::numeric_limits<float>::infinity();
     }
 
-    // Up to 64 pixels, bit by bit. Their depth may be null unless byDepth. Loads as many at `ahead` into the cache, for
-    // a later call. Counts NaNs that keep a pixel from being active.
+    // Returns a bit for each of up to 64 pixels, set if it is active. The depth may be null unless byDepth. Prefetches
+    // as many pixels at `ahead` for a later call. Adds to `nanDepths` the pixels that are not active because their
+    // depth is NaN.
     std::uint64_t bits(const RowPlace& pixels, const RowPlace& ahead, int count, std::uint64_t& nanDepths) const
     {
         const bool hasLimit = pixels.depth && depthLimit < std::numeric_limits<float>::infinity();
@@ -308,14 +310,14 @@ DFB_AVX2 inline bool copyAndCheckColorsAvx2(const float* rgba, int count, float*
     return isRestGood && areGood;
 }
 
-// Depth as it travels: NaN counts as farthest, and -0 as 0, so that comparing is enough to order.
+// A depth as it travels: NaN becomes +infinity, and -0 becomes 0, so that plain comparisons order depths.
 inline float canonicalDepth(float depth)
 {
     const std::uint32_t bits = bitsOf(depth), some = bits == 0x80000000u ? 0u : bits;
     return floatOf((bits & 0x7fffffffu) > 0x7f800000u ? 0x7f800000u : some); // integers, so that it can be vectorized
 }
 
-// Copies depths as they travel. False if any is NaN.
+// Copies depths in the form in which they travel. Returns false if any is NaN.
 DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
 {
     int isNan = 0;
@@ -326,8 +328,9 @@ DFB_INLINE bool copyAndCheckDepths(const float* depth, int count, float* out)
     return isNan == 0;
 }
 
-// Copies `count` pixels of a channel, from place `first` of its plane on, as they travel; `hasBytes`: the colour has 8
-// bits a channel. False if a colour is not finite, an alpha not within [0, 1], or a depth NaN.
+// Copies `count` pixels of a channel, from pixel `first` of its plane on, in the form in which they travel. `hasBytes`:
+// the colour has 8 bits a channel. Returns false if a colour is not finite, an alpha is not within [0, 1], or a depth
+// is NaN.
 inline bool copyAndCheck(const ConstPlanes& planes, bool hasBytes, std::size_t channel, std::ptrdiff_t first, int count,
                          std::byte* out)
 {
@@ -354,7 +357,7 @@ struct InputFaults {
     std::uint64_t alphaOutside = 0; // of the others, those whose alpha is not within [0, 1]
 };
 
-// The faults of all inputs of a rank in a frame. From any thread.
+// The faults of all inputs of a rank in a frame. Any thread may add to them.
 struct FaultCounts {
     std::atomic<std::int64_t> nonFinite{0}, alphaOutside{0};
 
@@ -368,7 +371,7 @@ struct FaultCounts {
     void reset() { nonFinite = alphaOutside = 0; }
 };
 
-// Either may be null.
+// Adds the faults of `count` pixels. `rgba` and `depth` may be null.
 inline void countFaults(const float* rgba, const float* depth, int count, InputFaults& faults)
 {
     for (int i = 0; i < count; ++i) {
@@ -380,9 +383,9 @@ inline void countFaults(const float* rgba, const float* depth, int count, InputF
     }
 }
 
-// Where the active pixels of a region are. Kept from tile to tile, as it has memory.
+// Where the active pixels of a region are. Reuse it from tile to tile, as it keeps its memory.
 struct ActiveSpans {
-    std::vector<std::uint16_t> rowCounts; // of spans, of rows [rowBegin, rowEnd)
+    std::vector<std::uint16_t> rowCounts; // the number of spans in each of the rows [rowBegin, rowEnd)
     std::vector<Span> spans;
     int rowBegin = 0, rowEnd = 0;
     std::uint32_t pixels = 0;
@@ -395,8 +398,9 @@ struct ActiveSpans {
         pixels = 0;
     }
 
-    // Of pixels [begin, end) of row y; `bitsOfSome(x, count)`: which of so many from x on, up to 64, are active. Calls
-    // f(span) for each that it has found. Rows come from top to bottom, then endRows().
+    // Adds the spans of active pixels among pixels [begin, end) of row y. `bitsOfSome(x, count)` returns a bit for each
+    // of `count` pixels from x on, up to 64, set if it is active. Calls f(span) for each span found. Call it for rows
+    // from top to bottom, then endRows().
     template <class BitsOfSome, class F>
     void findRow(int y, int begin, int end, const BitsOfSome& bitsOfSome, const F& f)
     {
@@ -406,7 +410,7 @@ struct ActiveSpans {
             forEachRun(bitsOfSome(x0, count), [&](int at, int run) {
                 const int x = x0 + at;
                 if (spans.size() > before && spans.back().x + spans.back().count == x)
-                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // over x0
+                    spans.back().count = static_cast<std::uint16_t>(spans.back().count + run); // goes on across x0
                 else
                     spans.push_back({static_cast<std::uint16_t>(x), static_cast<std::uint16_t>(run)});
             });
@@ -434,7 +438,7 @@ struct ActiveSpans {
         pixels = static_cast<std::uint32_t>(region.width() * region.height());
     }
 
-    // Calls f(first, count) for each span, with its first pixel's place in planes of this stride.
+    // Calls f(first, count) for each span. `first` is the index of its first pixel in planes with this stride.
     template <class F>
     void forEachSpan(std::ptrdiff_t stride, const F& f) const
     {
@@ -451,7 +455,7 @@ struct ActiveSpans {
 struct RowPixels {
     ActiveSpans active;
     std::vector<float> color, depth; // 4 and 1 a pixel
-    bool isFull = false;             // all that could be active are
+    bool isFull = false;             // all pixels that could be active are
 };
 
 // The pixels of an input that are read where they lie. Another process may write to them at any time: each value is
@@ -463,10 +467,10 @@ struct PixelsInPlace {
     Region valid{0, 0, 0, 0};         // counted from the region's first pixel
     Activity activity;
 
-    // Reads row y; `row` may still be another one. Adds to `faults`.
+    // Reads row y into `row`, which may hold the row that was read before. Adds to `faults`.
     void readRow(int y, RowPixels& row, InputFaults& faults) const;
 
-    // Of pixel x of row y.
+    // The place of pixel x of row y.
     RowPlace at(int x, int y) const noexcept
     {
         const std::ptrdiff_t pixel = y * stride + x;
@@ -494,7 +498,7 @@ inline void PixelsInPlace::readRow(int y, RowPixels& row, InputFaults& faults) c
     ConstPlanes planes;
     planes.at[Color] = color;
     planes.at[Depth] = reinterpret_cast<const std::byte*>(depth);
-    // A row below a full one is likely to be full: then its colours are copied as they are looked at.
+    // A row below a full one is likely to be full, so its colours are copied while active ones are searched.
     const bool copiesAll = row.isFull && activity.byColorAlone();
     bool areAllClean = true;
     row.isFull = false;

@@ -1,13 +1,14 @@
-// Sparse planes: which pixels of a region are active, as spans, and their values, as planes. All pixels travel so,
-// those of inputs and those of finished tiles. The two differ in which pixels are active, and in the bytes a pixel has.
+// Sparse planes: which pixels of a region are active, as spans, and their values, as planes. The pixels of inputs and
+// of finished tiles travel in this form. The two differ in which pixels are active, and in the bytes of a pixel.
 //
-// A SparseShape is in the header of the message, the body goes on with
+// The header of the message has a SparseShape, and the body has:
 //   Sparse:    planes | spans | uint16 span counts of the rows [rowBegin, rowEnd)
 //   Dense:     planes: all pixels of the region row by row
 //   Constant:  planes: one pixel
 //   Empty:     nothing
-// The planes are the channels in the order of their bits: the colour of all pixels, then the depth of all, ..., each
-// from a multiple of 4 on. A body that is split has its planes as splitPlane() leaves them.
+// There is a plane for each channel, in the order of the channels' bits: the colour of all pixels, then the depth of
+// all pixels, and so on. Each begins at a multiple of 4 bytes. In a split body, the planes are as splitPlane() leaves
+// them.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -30,8 +31,8 @@ namespace detail {
 inline std::size_t alignedTo16(std::size_t byteCount) { return (byteCount + 15) / 16 * 16; }
 
 struct SparseShape {
-    std::uint32_t pixels = 0;                          // that are active
-    std::uint16_t spans = 0, rowBegin = 0, rowEnd = 0; // Sparse
+    std::uint32_t pixels = 0;                          // the active ones
+    std::uint16_t spans = 0, rowBegin = 0, rowEnd = 0; // only for Sparse
     FragmentEncoding encoding = FragmentEncoding::Empty;
     std::uint8_t isSplit = 0;
 
@@ -42,7 +43,7 @@ struct SparseShape {
                    ? sizeof(Span) * spans + sizeof(std::uint16_t) * static_cast<std::size_t>(rowEnd - rowBegin)
                    : 0;
     }
-    // Throws Error (MalformedMessage) unless a region of this size may have it.
+    // Throws Error (MalformedMessage) unless a region of this size may have this shape.
     void check(const Region& region) const
     {
         const auto all = static_cast<std::uint32_t>(region.width() * region.height());
@@ -60,10 +61,10 @@ struct SparseShape {
 };
 static_assert(sizeof(SparseShape) == 12 && std::is_trivially_copyable_v<SparseShape>);
 
-// Makes a plane of pixels, of so many words each, easier to compress. Neighbouring pixels are alike in the upper bits
+// Makes a plane of pixels, of `words` words each, easier to compress. Neighbouring pixels are alike in the upper bits
 // of each word and rarely in the lower ones. Each word becomes its difference to the word of the pixel before, coded so
 // that small differences of either sign have zeros at the top. Then all first bytes are stored, then all second bytes,
-// and so on. A codec that looks for repetitions finds few in the plain bytes of floats.
+// and so on. Without this, a codec that looks for repetitions finds few in the bytes of floats.
 //
 // Works on blocks of pixels, with loops that compilers vectorize.
 template <class Word, std::size_t words>
@@ -91,7 +92,7 @@ DFB_INLINE void splitPlane(const std::byte* in, std::size_t pixels, std::byte* o
         }
     }
 }
-// The inverse.
+// The inverse of splitPlane().
 template <class Word, std::size_t words>
 DFB_INLINE void joinPlane(const std::byte* in, std::size_t pixels, std::byte* out)
 {
@@ -120,7 +121,7 @@ DFB_INLINE void joinPlane(const std::byte* in, std::size_t pixels, std::byte* ou
     }
 }
 
-// The bytes of a pixel in each channel; none in those that do not travel.
+// The bytes of a pixel in each channel; 0 in channels that do not travel.
 class PlaneFormat {
 public:
     PlaneFormat(ChannelMask channels, std::size_t colorWordBytes)
@@ -131,14 +132,15 @@ public:
                 pixelBytes_ += pixelBytes(c);
             }
     }
-    std::size_t pixelBytes() const noexcept { return pixelBytes_; } // a multiple of 4, as all are
+    std::size_t pixelBytes() const noexcept { return pixelBytes_; } // a multiple of 4, as in each channel
     std::size_t pixelBytes(std::size_t channel) const noexcept { return wordBytes_[channel] * channelWords[channel]; }
     std::size_t bodyBytes(const SparseShape& shape) const noexcept
     {
         return pixelBytes_ * shape.stored() + shape.tableBytes();
     }
 
-    // Calls f(channel, its place, its bytes) for each plane of so many pixels. Returns where the last ends.
+    // Calls f(channel, offset, bytes) for the plane of each channel, with `pixels` pixels. Returns the offset of the
+    // end.
     template <class F>
     std::size_t forEachPlane(std::size_t pixels, const F& f) const
     {
@@ -159,7 +161,7 @@ public:
         return planes;
     }
 
-    // splitPlane() or joinPlane() for each plane of a body. The table stays as it is.
+    // Does splitPlane() or joinPlane() for each plane of a body. The table of spans is copied as it is.
     void split(const SparseShape& shape, const std::byte* in, std::byte* out) const
     {
         transform(shape, in, out, false);
@@ -174,7 +176,7 @@ private:
 };
 
 #if DFB_HAS_BODIES
-// Of pixels of so many words.
+// Splits or joins a plane of pixels of `words` words each.
 template <class Word, std::size_t words>
 void transformPlane(const std::byte* in, std::size_t pixels, std::byte* out, bool joins)
 {
@@ -194,7 +196,7 @@ DFB_COMPILED_ONCE void PlaneFormat::transform(const SparseShape& shape, const st
                                                       : transformPlane<std::uint8_t, 4>;
         ofChannel(in + at, pixels, out + at, joins);
     });
-    std::copy_n(in + end, shape.tableBytes(), out + end); // of an empty body there may be no bytes at all
+    std::copy_n(in + end, shape.tableBytes(), out + end); // an empty body may have no bytes at all
 }
 #endif
 
@@ -214,7 +216,7 @@ inline SparseShape shapeOf(const ActiveSpans& active, const Region& region)
     return shape;
 }
 
-// Writes a body, not split: `write(channel, out, bytes)` writes a plane.
+// Writes a body that is not split. `write(channel, out, bytes)` writes a plane.
 template <class Write>
 void encodeSparse(const PlaneFormat& format, const SparseShape& shape, const ActiveSpans& active, std::byte* out,
                   const Write& write)
@@ -233,11 +235,11 @@ void encodeSparse(const PlaneFormat& format, const SparseShape& shape, const Act
 struct SparseBody {
     ConstPlanes planes;
     const Span* spans = nullptr;              // Sparse
-    const std::uint16_t* rowCounts = nullptr; // the same
+    const std::uint16_t* rowCounts = nullptr; // Sparse
 };
 
-// Reads a body that is not split, of a shape that has been checked and that has all its bytes, in place. Throws Error
-// (MalformedMessage).
+// Reads a body in place. The body must not be split and must have all its bytes, and its shape must have been checked.
+// Throws Error (MalformedMessage).
 inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& shape, int width, const std::byte* in)
 {
     SparseBody body;
@@ -264,7 +266,7 @@ inline SparseBody decodeSparse(const PlaneFormat& format, const SparseShape& sha
     return body;
 }
 
-// The pixels of a tile where they lie. `channels`: that travel, of colour and depth.
+// The pixels of a tile where they lie. `channels`: those of colour and depth that travel.
 inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels, bool byDepth)
 {
     PixelsInPlace p;
@@ -277,15 +279,15 @@ inline PixelsInPlace pixelsInPlace(const InputPixels& tile, ChannelMask channels
     return p;
 }
 
-// The active pixels of an input. One per thread, to be used again and again. A pixel of colour 0 and alpha 0
-// contributes nothing, whatever its depth; one with colour and alpha 0 is emission and does. By depth, a pixel
-// contributes if its depth is below +infinity, and only then.
+// The active pixels of an input. Keep one per thread, and use it again and again. A pixel of colour 0 and alpha 0
+// contributes nothing, whatever its depth. A pixel with a colour but alpha 0 is emission and contributes. By depth, a
+// pixel contributes if its depth is below InputPixels::depthLimit, and only then.
 class ActivePixels : public ActiveSpans {
 public:
-    // `channels` has colour, `byDepth` also depth, and the tile all of them. Copies the colours, as they travel, to
-    // `colors`, which has room for all pixels of the tile, depths to `depths`, if that is not null, and the rest to
-    // memory of its own; returns where they are. Each row is copied as soon as its spans are found: rows of a large
-    // image are far apart in memory, and so are read there once.
+    // `channels` must have colour, and depth if `byDepth`; the tile must have all of them. Copies the active pixels in
+    // the form in which they travel: colours to `colors`, which has room for all pixels of the tile, depths to
+    // `depths`, if that is not null, and the rest to memory of its own. Returns where they are. Each row is copied as
+    // soon as its spans are found, so that it is read from memory only once: rows of a large image are far apart.
     ConstPlanes gather(const InputPixels& tile, ChannelMask channels, bool byDepth, std::byte* colors,
                        float* depths = nullptr)
     {
@@ -325,7 +327,7 @@ public:
     std::uint64_t nanDepths() const noexcept { return nanDepths_; }
 
 private:
-    // Calls f(first, count) for each span as it is found: its first pixel's place in the planes.
+    // Calls f(first, count) for each span as it is found. `first` is the index of its first pixel in the planes.
     template <class F>
     void find(const InputPixels& tile, bool byDepth, const F& f)
     {
@@ -344,7 +346,7 @@ private:
         endRows();
     }
 
-    std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; those of ids are copied as such
+    std::array<std::vector<float>, channelCount> planes_; // words of 4 bytes; ids are copied bit for bit
     bool isClean_ = true;
     std::uint64_t nanDepths_ = 0;
 };
