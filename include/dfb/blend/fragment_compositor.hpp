@@ -104,7 +104,7 @@ public:
         });
     }
 
-    // A run of pixels that have anything.
+    // A run of pixels that fragments cover.
     struct Run {
         int x = 0, count = 0;
         const float* color = nullptr; // not null: the colours of a single layer, which are not in the row
