@@ -1,8 +1,8 @@
-// FinishedRecord: a finished tile in a message to the display rank, without the pixels that are all alike, as those of
-// the background are.
+// FinishedRecord: a finished tile in a message to the display rank. Pixels that all have the same value, such as those
+// of the background, are left out.
 //
-// After the header come one pixel, which fills the places of pixels that do not travel (none in Dense), and a body as
-// in sparse_planes.hpp: Empty, Sparse or Dense. A record has a multiple of 16 bytes.
+// The header is followed by one pixel, the filler, which fills the places of pixels that do not travel (Dense has
+// none), and by a body as in sparse_planes.hpp: Empty, Sparse or Dense. The size of a record is a multiple of 16 bytes.
 #pragma once
 
 #include <dfb/image.hpp>
@@ -34,21 +34,21 @@ public:
     };
     static_assert(sizeof(Header) == 16);
 
-    // `channels`: beside the colour.
+    // `channels`: those beside the colour.
     FinishedRecord(OutputFormat format, ChannelMask channels)
         : format_(static_cast<ChannelMask>(channels | colorChannel), bytesPerPixel(format) / 4)
     {
     }
 
-    // Of a pixel in a channel; 0 if the image does not have it.
+    // Bytes of a pixel in a channel; 0 if the image does not have the channel.
     std::size_t pixelBytes(std::size_t channel) const noexcept { return format_.pixelBytes(channel); }
     std::size_t pixelBytes() const noexcept { return format_.pixelBytes(); } // in all channels
-    // The planes of so many pixels that begin there.
+    // The planes of `pixels` pixels in memory that begins at `first`.
     Planes planesAt(std::byte* first, std::size_t pixels) const { return format_.planesAt(first, pixels); }
-    // Of a record with so many pixels, the most.
+    // The largest size of a record with so many pixels.
     std::size_t mostBytes(std::size_t pixels) const { return alignedTo16(sizeof(Header) + pixelBytes() * pixels); }
 
-    // The parts of a tile to be written, found by one pass over it. Kept from tile to tile for its memory.
+    // What is to be written of a tile, found by one pass over it. Reuse it from tile to tile, as it keeps its memory.
     class Plan {
     public:
         std::size_t bytes() const noexcept { return bytes_; }
@@ -57,9 +57,9 @@ public:
         friend class FinishedRecord;
         Header header_;
         FinishedPlanes from_;
-        std::size_t filler_ = 0; // place of the pixel
+        std::size_t filler_ = 0; // index of the filler pixel
         std::size_t bytes_ = 0;
-        ActiveSpans active_; // the pixels unlike it
+        ActiveSpans active_; // the pixels that differ from the filler
         std::vector<std::byte> body_;
     };
 
@@ -118,9 +118,9 @@ public:
             format_.split(h.shape, body, out);
     }
 
-    // Checks the record that begins at `in`, of which there are `left` bytes at most, calls `place(tile, region)` for
-    // where the pixels go to, a FinishedPlanes, and puts them there. Returns its bytes. Throws Error
-    // (MalformedMessage).
+    // Checks the record that begins at `in` and has at most `left` bytes. Then calls `place(tile, region)`, which
+    // returns the FinishedPlanes where the pixels go, and writes them there. Returns the size of the record in bytes.
+    // Throws Error (MalformedMessage).
     template <class PlaceOf>
     std::size_t read(const std::byte* in, std::size_t left, const TileLayout& layout, const PlaceOf& place) const
     {
@@ -173,7 +173,7 @@ private:
         return true;
     }
 
-    // The corner that is like most others: where the background begins, if there is any.
+    // The corner pixel that equals most other corners. Background, if there is any, is usually found in the corners.
     std::size_t fillerOf(const Region& region, const FinishedPlanes& planes) const
     {
         const auto right = static_cast<std::size_t>(region.width() - 1);
@@ -187,7 +187,7 @@ private:
                                  [&](std::size_t a, std::size_t b) { return likes(a) < likes(b); });
     }
 
-    // Which of up to 64 pixels are not like the filler, bit by bit.
+    // Returns a bit for each of up to 64 pixels, set if it differs from the filler.
     std::uint64_t findDifferent(const FinishedPlanes& from, std::size_t first, std::size_t filler, int count) const
     {
         std::uint8_t differs[64] = {};

@@ -1,7 +1,7 @@
-// Wire: an input of a tile to the bytes of a message, and back to a fragment that is read in place.
+// Wire: encodes an input of a tile as a message, and decodes that to a fragment, which is read in place.
 //
-// After the MessageHeader come a FragmentHeader and a body as in sparse_planes.hpp, which is split if it is compressed.
-// An input that the owner reads in the memory of its renderer has a PlaceInMemory as its body.
+// The MessageHeader is followed by a FragmentHeader and a body as in sparse_planes.hpp, which is split if it is
+// compressed. If the owner reads an input in the memory of its renderer, the body is a PlaceInMemory.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -45,23 +45,23 @@ static_assert(sizeof(FragmentHeader) == 40 && std::is_trivially_copyable_v<Fragm
 inline constexpr std::size_t fragmentPrefix = sizeof(MessageHeader) + sizeof(FragmentHeader);
 static_assert(fragmentPrefix % 16 == 0, "pixels are read in place");
 
-// The most that a fragment message can have with pixels of so many bytes. A row's second span costs no more than the
-// pixel that parts it from the first.
+// The largest size of a fragment message with `pixelBytes` bytes for each pixel. One span for each row is enough: each
+// further span costs no more than the empty pixel that separates it from the span before.
 inline std::size_t mostBytes(int width, int height, std::size_t pixelBytes)
 {
     const auto rows = static_cast<std::size_t>(height), pixels = rows * static_cast<std::size_t>(width);
     static_assert(sizeof(Span) <= 4);
     return fragmentPrefix + alignedTo16((sizeof(std::uint16_t) + sizeof(Span)) * rows) + pixels * pixelBytes;
 }
-// In any format of colour: none is larger than Float32.
+// The largest size in any colour format, as none is larger than Float32.
 inline std::size_t largestFragment(int width, int height, ChannelMask channels)
 {
     return mostBytes(width, height, PlaneFormat(channels, sizeof(float)).pixelBytes());
 }
 
-// Copies values premultiplied by alpha, 3 floats a pixel, and premultiplies them by the alpha that the owner gets
-// instead. The owner divides by that alpha in the end; with another one the result would not be a mean. `encoded`: the
-// colours `rgba`, as they travel.
+// Copies values of 3 floats a pixel, premultiplied by alpha, and changes them to be premultiplied by the rounded alpha
+// that the owner gets. The owner divides by the rounded alpha in the end, so with the original alpha the result would
+// not be a mean. `encoded`: the colours `rgba`, as they travel.
 inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const float* rgba, const std::byte* encoded,
                               const float* in, std::size_t pixels, float* out)
 {
@@ -75,7 +75,7 @@ inline void multiplyByRounded(const WireCoder& coder, WireFormat format, const f
                 out[c] = in[c] * (rounded / alpha);
 }
 
-// Whether all pixels of the planes are alike, bit for bit.
+// Whether all pixels of the planes are equal, bit for bit.
 inline bool areConstant(const InputPixels& tile, const ConstPlanes& planes, std::size_t pixels)
 {
     for (std::size_t c = 0; c < channelCount; ++c) {
@@ -128,8 +128,8 @@ inline void compress(MemoryPool& pool, const Codec& codec, FragmentHeader& h, Bu
     h.shape.isSplit = 1;
 }
 
-// Makes the message for a tile, with the channels of `wanted` that the tile has, the colour in this format if it is in
-// its range. Adds to `faults`. `codec` may be null.
+// Makes the message for a tile, with those channels of `wanted` that the tile has. The colour is in the format `color`
+// if all colours are in its range. Adds to `faults`. `codec` may be null.
 inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelMask wanted, std::uint32_t receiver,
                              const Codec* codec, const WireCoder& coder, WireFormat color, InputFaults& faults)
 {
@@ -139,10 +139,10 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const int width = tile.region.width(), height = tile.region.height();
     const auto pixelCount = static_cast<std::size_t>(width) * static_cast<std::size_t>(height);
     const bool isRounded = color != WireFormat::Float32 && !tile.hasBytes;
-    // Pixels that travel as they are go straight to the message, to their place if all are active.
+    // Pixels that travel unchanged are copied straight to the message, and to their final place if all are active.
     const PlaneFormat gathered(channels, tile.hasBytes ? 1 : sizeof(float));
     Buffer message = pool.acquire(isRounded ? fragmentPrefix : mostBytes(width, height, gathered.pixelBytes()));
-    Buffer before; // the message, if another takes its place
+    Buffer before; // keeps the first message if another one replaces it
     wide.resize(std::max(wide.size(), isRounded ? 4 * pixelCount : 0));
     auto* colors = isRounded ? reinterpret_cast<std::byte*>(wide.data()) : message.data() + fragmentPrefix;
     const float* rgba = floatsOf(colors);
@@ -164,7 +164,8 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     const std::size_t payload = format.bodyBytes(h.shape), size = fragmentPrefix + payload;
     h.rawPayloadBytes = static_cast<std::uint32_t>(payload);
 
-    // A block that it would not fill is soon needed again.
+    // Moves a message that does not fit its block, or fills less than three quarters of it: the block is soon needed
+    // again.
     if (4 * size < 3 * message.size() || message.size() < size) {
         Buffer smaller = pool.acquire(size);
         if (isCopied)
@@ -188,7 +189,7 @@ inline Buffer encodeFragment(MemoryPool& pool, const InputPixels& tile, ChannelM
     return message;
 }
 
-// The checksum of the valid pixels of a tile, of colour and depth.
+// The checksum of colour and depth of a tile's valid pixels.
 inline std::uint32_t checksumOf(const InputPixels& tile)
 {
     std::uint32_t sum = 0;
@@ -223,13 +224,14 @@ inline ByteRange bytesOfPlane(std::int64_t first, std::int64_t stride, const Reg
     return {std::min(upper, lower), std::max(upper, lower) + valid.width() * pixelBytes};
 }
 
-// Makes the message for a tile whose pixels the owner reads where they lie. `offsetOf(address)`: from the start of the
-// shared memory, or -1. Empty if they do not lie in it.
+// Makes the message for a tile whose pixels the owner reads where they lie. `offsetOf(address)`: the offset from the
+// start of the shared memory, or -1. Returns an empty buffer if the pixels do not lie in the shared memory.
 template <class OffsetOf>
 Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPlace& pixels, ChannelMask channels,
                      std::uint32_t receiver, const OffsetOf& offsetOf)
 {
-    // Offset of a plane's first pixel, if all of its valid ones are in the memory.
+    // Returns the offset of a plane's first pixel, or -1 unless all of the plane's valid pixels are in the shared
+    // memory.
     const auto placeOf = [&](const std::byte* plane, std::int64_t pixelBytes) -> std::int64_t {
         const ByteRange bytes = bytesOfPlane(0, pixels.stride, pixels.valid, pixelBytes);
         const std::int64_t begin = offsetOf(plane + bytes.begin), end = offsetOf(plane + bytes.end - 1);
@@ -255,10 +257,11 @@ Buffer encodeInPlace(MemoryPool& pool, const InputPixels& tile, const PixelsInPl
     return message;
 }
 
-// Looks up bytes of the memory that the sender shares with this rank; null if there are none. By offset and count.
+// Looks up bytes, by offset and count, in the memory that the sender shares with this rank. Returns null if they are
+// not in it.
 using SharedBytes = FunctionRef<const std::byte*(std::int64_t offset, std::int64_t byteCount)>;
 
-// Whether a fragment message, of which nothing has been checked, says that it is read in place.
+// Whether a fragment message claims to be read in place. Nothing in the message need have been checked.
 inline bool saysInPlace(const Buffer& message)
 {
     return message.size() >= fragmentPrefix
@@ -266,14 +269,14 @@ inline bool saysInPlace(const Buffer& message)
                   == FragmentEncoding::InPlace;
 }
 
-// The bytes that a fragment message of encodeFragment() would have without a codec.
+// The size in bytes that a message of encodeFragment() would have without a codec.
 inline std::size_t rawFragmentBytes(const Buffer& message)
 {
     return fragmentPrefix + loadAs<FragmentHeader>(message.data() + sizeof(MessageHeader)).rawPayloadBytes;
 }
 
-// Brings the payload, with its colours as Float32 unless the coder keeps them, to where the result says, in `message`,
-// which becomes another one if it must. Throws Error (MalformedMessage).
+// Decompresses the payload if needed, and converts its colours to Float32 unless the coder keeps them. Returns where
+// the payload is in `message`, which is replaced by another buffer if needed. Throws Error (MalformedMessage).
 inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const FragmentHeader& h, const Codec* codec,
                                const WireCoder& coder)
 {
@@ -307,13 +310,13 @@ inline const std::byte* unpack(MemoryPool& pool, Buffer& message, const Fragment
     if (!coder.decodeColor(h.colorFormat, in, stored, floatsOf(floats.data())))
         failMalformed("a colour that is out of its format's range");
     const std::size_t colors = format.pixelBytes(Color) * stored;
-    // All else is as it was.
+    // Everything behind the colours is copied unchanged.
     std::copy_n(in + colors, payload - colors, floats.data() + wide.pixelBytes(Color) * stored);
     message = std::move(floats);
     return message.data();
 }
 
-// A row of the one pixel that a body has.
+// Makes a row of copies of the one pixel that a Constant body has.
 inline Buffer rowOf(MemoryPool& pool, const PlaneFormat& format, const ConstPlanes& pixel, std::size_t width)
 {
     Buffer row = pool.acquire(width * format.pixelBytes());
@@ -325,7 +328,7 @@ inline Buffer rowOf(MemoryPool& pool, const PlaneFormat& format, const ConstPlan
     return row;
 }
 
-// Reads where the pixels of an input lie, and checks it completely. Throws Error (MalformedMessage).
+// Reads where the pixels of an input lie, and checks the message completely. Throws Error (MalformedMessage).
 inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader& h, const Region& region, bool byDepth,
                                      const SharedBytes& sharedBytes, FaultCounts* faults)
 {
@@ -339,7 +342,7 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
     Fragment::Parts parts;
     PixelsInPlace& p = parts.inPlace;
     p.valid = {place.x0, place.y0, place.x1, place.y1};
-    const std::int64_t largest = std::int64_t{1} << 40; // of an offset or a row, so that sums cannot overflow
+    const std::int64_t largest = std::int64_t{1} << 40; // offset or stride, so that sums cannot overflow
     const auto isSmall = [&](std::int64_t value) { return value >= -largest && value <= largest; };
     if (p.valid.x0 >= p.valid.x1 || p.valid.y0 >= p.valid.y1 || p.valid.x1 > region.width()
         || p.valid.y1 > region.height())
@@ -372,9 +375,9 @@ inline Fragment::Parts decodeInPlace(const Buffer& message, const FragmentHeader
     return parts;
 }
 
-// Checks a fragment message completely and makes the fragment of it, which keeps the message's memory (or that of its
-// decompressed form). `passesOf(tile)`: how many passes the tile has. `faults` gets those that show while the fragment
-// is read, if it is read in place. Throws Error (MalformedMessage).
+// Checks a fragment message completely and makes a fragment from it. The fragment keeps the message's memory (or that
+// of its decompressed form). `passesOf(tile)`: how many passes the tile has. If the fragment is read in place, the
+// faults that are found while it is read are added to `faults`. Throws Error (MalformedMessage).
 inline Fragment decodeFragment(
     MemoryPool& pool, Buffer&& message, const TileLayout& layout, const FunctionRef<int(int)>& passesOf,
     const Codec* codec, const WireCoder& coder,
@@ -415,7 +418,7 @@ inline Fragment decodeFragment(
     const float* depth = floatsOf(body.planes.at[Depth]);
     if (depth && hasNan(depth, h.shape.stored()))
         failMalformed("a depth is NaN");
-    if (h.shape.encoding == FragmentEncoding::Constant) { // one row that every row reads
+    if (h.shape.encoding == FragmentEncoding::Constant) { // every row reads the same one
         message = rowOf(pool, format, body.planes, static_cast<std::size_t>(width));
         body.planes = format.planesAt(std::as_const(message).data(), static_cast<std::size_t>(width));
     }

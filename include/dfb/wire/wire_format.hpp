@@ -12,8 +12,8 @@
 #include <limits>
 #include <type_traits>
 
-// Below: floats as codes of 16 or 8 bits, rounded to nearest, ties to even, and back: one at a time and in rows.
-// Rows give the same bit for bit, whatever the processor has, of numbers that have a code; of NaN another NaN.
+// Below: conversion of floats to codes of 16 or 8 bits, rounded to nearest, ties to even, and back, one at a time and
+// in rows. For numbers that have a code, rows give the same bits on every processor; NaNs may differ.
 
 DFB_NAMESPACE_BEGIN
 namespace detail {
@@ -31,33 +31,34 @@ inline std::uint32_t bitsOf(float value) noexcept
     return bits;
 }
 
-// `condition` ? a : b. With masks, as compilers do not vectorize a choice between values made of floats.
+// `condition` ? a : b. Uses masks, as compilers do not vectorize a choice between values made of floats.
 inline std::uint32_t choose(bool condition, std::uint32_t a, std::uint32_t b) noexcept
 {
     const std::uint32_t mask = 0u - static_cast<std::uint32_t>(condition);
     return (a & mask) | (b & ~mask);
 }
 
-// To the nearest binary16, ties to even, of numbers from 0 to 65504.
+// Converts a number from 0 to 65504 to the nearest binary16, ties to even.
 inline std::uint16_t positiveToHalf(float value) noexcept
 {
-    // Denormal there: adding 0.5 leaves the bits that stay at the end of the mantissa, rounded by the addition.
+    // `small` is the result where it is denormal: adding 0.5 rounds the value, and leaves the bits that stay at the end
+    // of the mantissa.
     const std::uint32_t bits = bitsOf(value), small = bitsOf(value + 0.5f) - 0x3f000000u;
     const std::uint32_t normal = (bits + 0xc8000fffu + (bits >> 13 & 1u)) >> 13;
     return static_cast<std::uint16_t>(choose(static_cast<std::int32_t>(bits) < 0x38800000, small, normal));
 }
 inline float positiveFromHalf(std::uint16_t half) noexcept { return floatOf((half & 0x7fffu) << 13) * 0x1p112f; }
 
-// To the nearest integer, ties to even, of a value within [0, 65535].
+// Rounds a value within [0, 65535] to the nearest integer, ties to even.
 inline std::uint32_t nearestInteger(float value) noexcept
 {
     return bitsOf(value + 0x1p23f) & 0x7fffffu; // the addition leaves no bit below one
 }
 
-// How a scaled channel of a colour travels. No pixel in range has a value above `most`.
+// The codes in which a scaled channel of a colour travels. No pixel in range has a code above `most`.
 struct HalfCode {
     using Word = std::uint16_t;
-    static constexpr Word most = 0x7800; // 2^15, to which alpha 1 is scaled, and beyond which no colour is
+    static constexpr Word most = 0x7800; // 2^15: alpha 1 is scaled to it, and no colour is above it
     static Word of(float value) noexcept { return positiveToHalf(value); }
     static float valueOf(Word code) noexcept { return positiveFromHalf(code); }
 };
@@ -77,7 +78,7 @@ struct WireScales {
     float color, alpha, leastAlpha = 0;
 };
 
-// Rows in plain C++. Values converted from or to bytes go through `words`: bytes could alias anything.
+// Rows in plain C++. Values converted from or to bytes go through `words`, as pointers to bytes could alias anything.
 constexpr int wireBlock = 256;
 
 template <class Code>
@@ -95,13 +96,13 @@ DFB_INLINE void encodePixels(const float* rgba, int count, const WireScales& by,
     }
 }
 
-// False if there is a code that no pixel in range has.
+// Returns false if there is a code that no pixel in range has.
 template <class Code>
 DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& by, float* rgba) noexcept
 {
     const float scales[4] = {by.color, by.color, by.color, by.alpha}, least[4] = {0, 0, 0, by.leastAlpha};
     typename Code::Word words[wireBlock];
-    std::uint16_t above = 0; // in its highest bit
+    std::uint16_t above = 0; // the highest bit is set if a code is above `most`
     for (int first = 0; first < 4 * count; first += wireBlock) {
         const int size = std::min(wireBlock, 4 * count - first);
         std::memcpy(words, in + sizeof words[0] * static_cast<std::size_t>(first),
@@ -110,13 +111,13 @@ DFB_INLINE bool decodePixels(const std::byte* in, int count, const WireScales& b
             for (int c = 0; c < 4; ++c)
                 rgba[first + i + c] = std::max(Code::valueOf(words[i + c]) * scales[c], least[c]);
         if constexpr (std::is_same_v<Code, HalfCode>)
-            for (int i = 0; i < size; ++i) // by itself, so that both are vectorized
+            for (int i = 0; i < size; ++i) // a loop of its own, so that both are vectorized
                 above = static_cast<std::uint16_t>(above | words[i] | (words[i] + (0x7fff - Code::most)));
     }
     return above < 0x8000;
 }
 
-// Of pixels of 8 bits a channel: level / 255, rounded once.
+// Converts pixels with 8 bits a channel: level / 255, rounded once.
 DFB_INLINE void decodeBytes(const std::byte* in, std::size_t count, float* rgba) noexcept
 {
     for (std::size_t i = 0; i < 4 * count; ++i)
@@ -140,10 +141,10 @@ DFB_INLINE bool arePixelsInRange(const float* rgba, int count, float maxColor) n
     return out == 0;
 }
 
-// These loops with AVX2 and F16C: whole blocks at once, and the rest as above.
+// The same loops with AVX2 and F16C: whole blocks at once, and the rest as above.
 #if defined(DFB_HAS_AVX2_CLONES)
 constexpr int toNearest = _MM_FROUND_TO_NEAREST_INT;
-// Of two pixels.
+// The factors for two pixels.
 DFB_AVX2_F16C inline __m256 wireVector(float color, float alpha) noexcept
 {
     return _mm256_setr_ps(color, color, color, alpha, color, color, color, alpha);
@@ -234,31 +235,31 @@ DFB_AVX2_F16C inline bool arePixelsInRangeAvx2(const float* rgba, int count, flo
 
 } // namespace detail
 
-// Which channels are rounded: colour and alpha, and the bound is for these. All others travel as they are. Depth,
-// positions and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0
-// counts for them, also if that was rounded to 0. Normals and albedo are means of the inputs' own, which count with
-// their rounded alphas, so that the mean is off by as much as the weights.
+// Only colour and alpha are rounded, and the bound is for these. All other channels travel unchanged. Depth, positions
+// and ids of the image are bit for bit what they would be with Float32: a pixel whose alpha was above 0 counts for them
+// even if its alpha was rounded to 0. Normals and albedo are means of the inputs' unrounded values, weighted by their
+// rounded alphas, so the mean is off by as much as the weights.
 //
-// The bound. A pixel is C = sum_j T_j c_j, with T_j the product of 1 - a_i over the layers i in front of j, the last
-// layer being the background. Rounded, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones one
-// after the other from the front: the step at j changes the pixel by T'_j (d_j - e_j B_j), where T'_j is of the rounded
-// layers in front and B_j what is behind j, as it was. So
+// The bound. A pixel is `C = sum_j T_j c_j`, with T_j the product of 1 - a_i over the layers i in front of j. The last
+// layer is the background. After rounding, layer j has c_j + d_j and a_j + e_j. Replace the layers by the rounded ones,
+// one after the other from the front. The step at j changes the pixel by `T'_j (d_j - e_j B_j)`, where T'_j is the
+// product over the rounded layers in front of j, and B_j is the unrounded pixel that the layers behind j make. So
 //
 //     |error| <= sum_j T'_j (|d_j| + |e_j| B),    B >= |B_j|
 //
 // If colours are within [0, M a] and a in [0, 1], the pixel behind is a mean of colours up to M and of the background:
 // B = max(M, background). Alpha itself is the same sum with 1 in place of M.
-//   Unorm of n bits: |d| <= M h, |e| <= h, h = 1 / (2 (2^n - 1)): each of the n layers adds up to h (M + B).
+//   Unorm of n bits: |d| <= M h, |e| <= h, h = 1 / (2 (2^n - 1)): each layer adds up to h (M + B).
 //   Float16:         |d| <= u c, |e| <= u a, u = 2^-11, and sum_j T'_j a'_j <= 1: u / (1 - u) (M + B), however many
 //                    layers there are. Values below 2^-28 M are denormal there: 2^-39 (M + B) more for each layer.
-// A mean of passes is no worse than its worst pass. Unorm is converted in float, four roundings of 2^-24 M: 2^-21 (M +
-// B) more for each layer. And `c <= M a` is checked in float: 1 + 2^-20 times all that. tests/unit/wire/wire_format.cpp
-// looks for pixels that are worse, also at the edges.
+// A mean of passes is no worse than its worst pass. Unorm is converted in float, with four roundings of 2^-24 M, which
+// adds 2^-21 (M + B) for each layer. And `c <= M a` is checked in float, which multiplies all that by 1 + 2^-20.
+// tests/unit/wire/wire_format.cpp looks for pixels that are worse, also at the edges.
 
 enum class WireFormat : std::uint8_t {
     Float32, // as the renderer wrote it
     Float16, // IEEE binary16, scaled into its range
-    Unorm16, // of a range that is the same on all ranks
+    Unorm16, // integers over a range that is the same on all ranks
     Unorm8,
     Bytes // 8-bit colours as the renderer wrote them, see TileView::color8; not to be asked for
 };
@@ -284,7 +285,7 @@ struct Precision {
     Precision() = default;
     Precision(WireFormat colorFormat) : color(colorFormat) {} // NOLINT: meant to convert
     // The format of the colour is chosen anew for each frame: the cheapest that is sure to keep within the budget,
-    // given FrameConfig::maxLayers. Where nothing is, Float32.
+    // given FrameConfig::maxLayers. If there is none, it is Float32.
     Precision(const ErrorBudget& errorBudget) // NOLINT: meant to convert
         : budget(errorBudget.error), maxColor(errorBudget.maxColor)
     {
@@ -294,11 +295,11 @@ struct Precision {
     {
     }
 
-    WireFormat color = WireFormat::Float32; // and alpha
-    double budget = 0;                      // above 0: in place of `color`
-    bool isHalfLevel = false;               // in place of both
-    // Colours that occur, as a renderer would give them before it multiplies by alpha: each channel is within
-    // [0, maxColor * alpha]. A tile of which that is not true, such as emission or HDR, travels as Float32.
+    WireFormat color = WireFormat::Float32; // of colour and alpha
+    double budget = 0;                      // above 0: replaces `color`
+    bool isHalfLevel = false;               // replaces both
+    // The largest colour that occurs, as a renderer would give it before it multiplies by alpha: each channel is within
+    // [0, maxColor * alpha]. A tile with other pixels, such as emission or HDR, travels as Float32.
     float maxColor = 1;
 };
 
@@ -320,7 +321,7 @@ inline std::size_t bytesOf(WireFormat format) noexcept
 class WireCoder {
 public:
     WireCoder() = default;
-    // `activeByDepth`: of the tile operation. `keepsBytes`: fragments are not asked for Fragment::color().
+    // `activeByDepth`: that of the tile operation. `keepsBytes`: nobody asks fragments for Fragment::color().
     explicit WireCoder(const Precision& precision, bool activeByDepth = false, bool keepsBytes = false)
         : activeByDepth_(activeByDepth), keepsBytes_(keepsBytes), maxColor_(precision.maxColor),
           scale_(std::ldexp(1.0f, 14 - std::ilogb(precision.maxColor)))
@@ -328,7 +329,7 @@ public:
     }
 
     bool activeByDepth() const noexcept { return activeByDepth_; }
-    // Whether colours in this format stay so until a FragmentCursor gets to their row.
+    // Whether colours stay in this format until a FragmentCursor reads their row.
     bool keeps(WireFormat format) const noexcept { return keepsBytes_ && format == WireFormat::Bytes; }
 
     // Whether pixels may travel in a format other than Float32.
@@ -337,7 +338,8 @@ public:
         return cpuHasF16c() ? arePixelsInRangeAvx2(rgba, count, maxColor_) : arePixelsInRange(rgba, count, maxColor_);
     }
 
-    // `count` pixels, in range unless the format is Float32; `out` gets 4 * bytesOf(format) bytes for each.
+    // Encodes `count` pixels, which are in range unless the format is Float32. `out` gets 4 * bytesOf(format) bytes for
+    // each.
     void encodeColor(WireFormat format, const float* rgba, int count, std::byte* out) const
     {
         const auto encode = [&](auto code, float colorScale, float alphaScale) {
@@ -350,12 +352,12 @@ public:
         case WireFormat::Float16: encode(HalfCode(), scale_, 0x1p15f); return;
         case WireFormat::Unorm16: encode(Unorm16Code(), 65535.0f / maxColor_, 65535.0f); return;
         case WireFormat::Unorm8: encode(Unorm8Code(), 255.0f / maxColor_, 255.0f); return;
-        case WireFormat::Bytes: return; // they are copied
+        case WireFormat::Bytes: return; // the caller has copied them
         }
     }
-    // An alpha of 0 becomes leastAlpha: it was above 0, as pixels of alpha 0 that are in range have no colour, and
-    // those do not travel; by depth they do, and stay as they are. False if there is a code that encodeColor() does not
-    // make.
+    // Decodes `count` pixels. An alpha that was rounded to 0 becomes leastAlpha. It is known to have been above 0: a
+    // pixel of alpha 0 that is in range has no colour, and does not travel. With activeByDepth it does travel, and an
+    // alpha of 0 stays 0. Returns false if there is a code that encodeColor() does not make.
     bool decodeColor(WireFormat format, const std::byte* in, std::size_t count, float* rgba) const
     {
         const auto decode = [&](auto code, float colorScale, float alphaScale) {
@@ -375,7 +377,7 @@ public:
         return true;
     }
 
-    // Not 0, less than the least alpha that has a code of its own, and nothing beside what may be off.
+    // Above 0, less than the least alpha that has a code of its own, and negligible beside the error bound.
     static constexpr float leastAlpha = 0x1p-100f;
 
 private:
@@ -390,7 +392,7 @@ private:
 // range, over a background of at most `background` in a channel. See the comment above WireFormat.
 inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxColor, double background)
 {
-    const double reach = maxColor + std::max(maxColor, background); // M + B; of alpha |1 - A|, A of those behind
+    const double reach = maxColor + std::max(maxColor, background); // M + B; for alpha |1 - A|, A the alpha behind
     const double most = (1 + 0x1p-20) * std::max({reach, 1.0, background});
     const double conversion = 0x1p-21, n = static_cast<double>(layers);
     switch (format) {
@@ -403,8 +405,8 @@ inline double wireErrorBound(WireFormat format, std::int64_t layers, double maxC
     return 0;
 }
 
-// The cheapest format whose bound is within `budget`; of two that cost the same, the better. `layers` 0: not
-// known, which is taken for 65536.
+// The cheapest format whose bound is within `budget`; of two that cost the same, the one with the smaller bound. If
+// `layers` is 0, it is not known, and 65536 is assumed.
 inline WireFormat cheapestWithin(double budget, std::int64_t layers, double maxColor, double background)
 {
     const std::int64_t most = layers > 0 ? layers : 65536;

@@ -1,5 +1,5 @@
-// WireLosses: how far the pixels of a tile may be off because inputs travelled rounded, or because layers behind them
-// were left out: the bound of wire_format.hpp for the inputs that have really come.
+// WireLosses: bounds how far the pixels of a tile may be off because inputs were rounded for sending, or because layers
+// behind nearly opaque ones were left out. It is the bound of wire_format.hpp for the inputs that have really come.
 #pragma once
 
 #include <dfb/fragment.hpp>
@@ -16,10 +16,10 @@
 DFB_NAMESPACE_BEGIN
 namespace detail {
 
-// From any thread, but newFrame().
+// Any thread may call the members, except newFrame().
 class WireLosses {
 public:
-    // `minTransmittance`: of TileInfo. `background`: the largest of its channels.
+    // `minTransmittance`: that of TileInfo. `background`: the largest of its channels.
     void newFrame(int tileCount, float maxColor, double background, float minTransmittance)
     {
         maxColor_ = static_cast<double>(maxColor);
@@ -33,7 +33,7 @@ public:
         if (fragment.empty())
             return;
         const WireFormat format = fragment.colorFormat();
-        double beyond = 0; // the most that a value of this fragment is out of range
+        double beyond = 0; // the largest colour of this fragment, if it is out of range
         if ((format == WireFormat::Float32 || format == WireFormat::Bytes)
             && !coder.inRange(fragment.color(), static_cast<int>(fragment.storedPixels())))
             beyond = largestOf(fragment);
@@ -43,7 +43,7 @@ public:
         tile.beyond += beyond;
     }
 
-    // Of a tile that is finished.
+    // The bound for a tile that is finished.
     double boundOf(int index, int passes)
     {
         Tile tile;
@@ -52,7 +52,7 @@ public:
             tile = tiles_[static_cast<std::size_t>(index)];
         }
         const double behind = std::max(maxColor_, background_) + tile.beyond;
-        double bound = minTransmittance_ > 0 ? minTransmittance_ * std::max(behind, 1.0) : 0; // `behind` may be infinite
+        double bound = minTransmittance_ > 0 ? minTransmittance_ * std::max(behind, 1.0) : 0; // `behind` may be inf
         for (const WireFormat format : {WireFormat::Unorm8, WireFormat::Unorm16, WireFormat::Float16})
             if (const std::int64_t layers = tile.layers[static_cast<std::size_t>(format)]; layers > 0) {
                 const double its = wireErrorBound(format, layers, maxColor_, behind);
@@ -67,7 +67,8 @@ private:
         double beyond = 0;
     };
 
-    // Infinity if it is not known how much of the layers behind comes through.
+    // The largest absolute colour. Infinity if one is NaN, or if an alpha is not within [0, 1], as nothing then bounds
+    // how much of the layers behind comes through.
     static double largestOf(const Fragment& fragment)
     {
         const float* rgba = fragment.color();
