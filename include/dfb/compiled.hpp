@@ -4,7 +4,7 @@
 //
 //   DFB_COMPILED_ONCE void f();
 //
-// and its body, with the same word before it, where DFB_HAS_BODIES is 1; an instantiation of a template as
+// Its body, with the same macro before it, stands where DFB_HAS_BODIES is 1. An instantiation of a template stands as
 //
 //   DFB_COMPILED_TEMPLATE(class Template<Argument>);
 #pragma once

@@ -1,6 +1,7 @@
-// DistributedFrameBuffer: makes one image of the tiles that many ranks render, each tile on its own. setTile() sends an
-// input to the owner of the tile. When all inputs of a tile have come, the tile operation makes the finished tile, the
-// pixel operation post-processes it, and it goes to the display rank (section 3 of the paper).
+// DistributedFrameBuffer: makes one image from the tiles that many ranks render. Each tile is composited independently:
+// setTile() sends an input to the owner of the tile. When all inputs of a tile have come, the tile operation makes the
+// finished tile, the pixel operation post-processes it, and it goes to the display rank. "The paper" in these comments
+// is Usher et al., "Scalable Ray Tracing Using the Distributed FrameBuffer", 2019; this is its section 3.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -64,7 +65,7 @@ public:
         std::int64_t number() const noexcept { return number_; }
 
         // The owner of a tile, and the tiles that this rank owns, in this frame. Any thread. They wait for nothing and
-        // throw nothing; nobody checks the index.
+        // throw nothing. The index is not checked.
         int tileOwner(int tile) const noexcept { return engine_->ownerNow(tile); }
         const std::vector<int>& ownedTiles() const noexcept { return engine_->ownedNow(); }
 
@@ -76,7 +77,7 @@ public:
             static_cast<TileHeader&>(tile) = engine_->headerOf(tileIndex, pass);
             tile.clear(engine_->sent());
         }
-        // Prepares a view, whose planes are null then: point them to your pixels. Threads and exceptions as above.
+        // Prepares a view. Its planes are null afterwards: point them to your pixels. Threads and exceptions as above.
         void start(TileView& tile, int tileIndex, int pass = 0) const
         {
             const TileHeader header = engine_->headerOf(tileIndex, pass);
@@ -84,29 +85,30 @@ public:
             static_cast<TileHeader&>(tile) = header;
         }
 
-        // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when it returns. Does
-        // nothing in a frame that has failed, or after end(). Any thread. Waits only while this rank has more than
-        // messages.poolBytes under way, and runs tasks of the executor meanwhile; a thread that may not call MPI does
-        // not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an index, region or
-        // pass that the frame does not have, and for a negative generation or number of children. Throws OutOfMemory.
-        // An input that contradicts others (too many, sent twice, not announced) makes the frame fail: end() throws.
+        // Sends the active pixels of a rendered tile to its owner. `tile` can be used again when setTile() returns.
+        // Does nothing in a frame that has failed, or after end(). Any thread. Waits only while more than
+        // messages.poolBytes are under way from this rank, and runs tasks of the executor meanwhile; a thread that may
+        // not call MPI does not wait. Throws InvalidArgument, with nothing sent, for a tile of another frame, for an
+        // index, region or pass that the frame does not have, and for a negative generation or number of children.
+        // Throws OutOfMemory. An input that contradicts others (too many, sent twice, not announced) makes the frame
+        // fail: end() throws.
         void setTile(const Tile& tile) { engine_->setTile(tile); }
-        // Sends pixels that lie in your own memory; they are not read any more when it returns, unless you promise
-        // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Throws InvalidArgument also if a channel
-        // that has to travel is null.
+        // Sends pixels that lie in your own memory. They are not read after setTile() has returned, unless you promise
+        // TileView::staysUntilEnd. Threads, waiting and exceptions as above. Also throws InvalidArgument if a channel
+        // that must be sent is null.
         void setTile(const TileView& tile) { engine_->setTile(tile); }
 
-        // Whether an input of that tile and generation cannot be seen and need not be rendered: this rank knows of an
-        // opaque input of a lower generation. False unless the operation has opaqueHides(). setTile() drops hidden
-        // inputs. Any thread. Waits for nothing. Nobody checks the index.
+        // True if this rank knows of an opaque input of that tile in a lower generation: an input of this generation
+        // cannot be seen then, and need not be rendered. Always false unless the operation has opaqueHides(). setTile()
+        // drops hidden inputs. Any thread. Waits for nothing. Nobody checks the index.
         bool isHidden(int tileIndex, int generation) const { return engine_->isHidden(tileIndex, generation); }
-        // Whether `tile`, which has been set, hides the inputs of higher generations. If it does, call hide() for the
-        // ranks that have such inputs. Any thread. Waits for nothing.
+        // Whether `tile`, which setTile() has sent, hides the inputs of higher generations. If it does, call hide() for
+        // the ranks that have such inputs. Any thread. Waits for nothing.
         bool hidesRest(const Tile& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         bool hidesRest(const TileView& tile) const { return engine_->opaqueHides(tile.tile) && tile.isOpaque(); }
         // Tells `rank` that inputs of this generation and higher ones cannot be seen. The owner drops those that come
-        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument for a tile, a generation or a rank that
-        // there is not, and unless the operation has opaqueHides() for this frame.
+        // nevertheless. Any thread. Waits for nothing. Throws InvalidArgument if there is no such tile or rank, if
+        // `generation` is below 1, or if opaqueHides(tileIndex) is false.
         void hide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Hides});
@@ -115,69 +117,71 @@ public:
         // Whether opaque inputs of that tile hide the inputs behind them in this frame. Any thread. Waits for nothing.
         // Nobody checks the index.
         bool opaqueHides(int tileIndex) const { return engine_->opaqueHides(tileIndex); }
-        // Tells `rank` that an input of this rank will probably hide its inputs of `generation` and higher ones. That
-        // rank should wait before it renders them. This rank must then call hide() or, if they can be seen, show().
-        // Threads and exceptions as for hide().
+        // Tells `rank` that an input of this rank will probably hide the inputs of `rank` in `generation` and higher
+        // ones. `rank` should wait before it renders them. This rank must then call hide() or, if they can be seen,
+        // show(). Threads and exceptions as for hide().
         void mayHide(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::MayHide});
         }
-        // Tells `rank`, after mayHide(), that those inputs can be seen. Threads and exceptions as for hide().
+        // Tells `rank`, after mayHide(), that its inputs can be seen. Threads and exceptions as for hide().
         void show(int tileIndex, int generation, int rank) const
         {
             engine_->tell(rank, {tileIndex, generation, detail::HiddenTiles::Word::Shows});
         }
-        // Whether another rank has said mayHide() about an input, and neither hide() nor show() yet. Any thread. Waits
-        // for nothing. Nobody checks the index.
+        // Whether another rank has called mayHide() for an input of that tile and generation, but neither hide() nor
+        // show() yet. Any thread. Waits for nothing. Nobody checks the index.
         bool isUndecided(int tileIndex, int generation) const { return engine_->isUndecided(tileIndex, generation); }
         // Waits until heard() returns true or the frame has failed. heard() is called first, and again after each
         // hide(), mayHide() or show() of another rank. Runs tasks of the executor meanwhile. Returns false after
-        // FrameBufferConfig::quiet: then render without waiting. One thread at a time; with Progress::Caller one that
-        // may call MPI. Throws TransportError.
+        // FrameBufferConfig::quiet: render without waiting then. One thread at a time may call it; with
+        // Progress::Caller, it must be one that may call MPI. Throws TransportError.
         bool waitForWord(const std::function<bool()>& heard) const { return engine_->waitForWord(heard); }
 
         // Declares the inputs of generation 1 that this rank will send in each pass. In a frame with
-        // FrameConfig::declared every rank must call it once, with an empty list if it has no inputs; else end() fails
-        // the frame. It may come after the first setTile(). Children that these inputs announce are not declared. A
-        // declared input must be sent even if it is empty; it then costs a header. A list equal to that of the last
-        // frame costs no manifest. By one thread. Waits for nothing. Throws InvalidArgument, with nothing declared, for
-        // a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
+        // FrameConfig::declared every rank must call it once, with an empty list if it has no inputs; otherwise end()
+        // fails the frame. It may come after the first setTile(). Children that these inputs announce are not declared.
+        // A declared input must be sent even if it is empty; it then costs a header. A list equal to that of the last
+        // frame is not sent again. Only one thread may call it. Waits for nothing. Throws InvalidArgument, with nothing
+        // declared, for a tile outside the image, for a second call, and in a frame without FrameConfig::declared.
         void declare(const std::vector<TileInput>& inputs) { engine_->declare(inputs); }
 
-        // Replaces FrameConfig::maxLayers for the inputs of this rank, for a renderer that learns it after begin().
-        // Ranks may give different numbers. Call it before the first setTile(), on one thread. Waits for nothing.
-        // Throws nothing.
+        // Replaces FrameConfig::maxLayers for the inputs of this rank, for a renderer that learns this number only
+        // after begin(). Ranks may give different numbers. Call it before the first setTile(), on one thread. Waits for
+        // nothing. Throws nothing.
         void expectLayers(int layers) { engine_->expectLayers(layers); }
 
         // The samples that a tile gets in this frame. Any thread. Waits for nothing. Nobody checks the index.
         TileSamples samples(int tileIndex) const { return engine_->samples(tileIndex); }
 
-        // Returns the next range of jobs for this rank, out of [0, count) for all ranks together; each job goes to one
-        // rank. An empty range: there are no more, or the frame has failed. `count` must be the same on all ranks and
-        // in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the rank that
-        // hands out the jobs, mostly not for long, because the call before has asked already. After
-        // FrameConfig::timeout the frame fails. Throws TransportError, and InvalidArgument for a count below 0.
+        // Hands out the jobs [0, count) to all ranks: returns the next range for this rank. Each job goes to one rank.
+        // An empty range means that no jobs are left, or that the frame has failed. `count` must be the same on all
+        // ranks and in all calls. Only the thread that began the frame may call it, and not from a task. Waits for the
+        // rank that hands out the jobs, usually not for long, because the previous call has already asked for this
+        // range. If it waits longer than FrameConfig::timeout, the frame fails. Throws TransportError, and
+        // InvalidArgument for a count below 0.
         JobRange nextJobs(std::int64_t count) const { return engine_->nextJobs(count); }
 
-        // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. For measurements
-        // that all ranks must know, such as the cost of a brick. Figures travel with the verdict: call it before this
-        // rank's end(). Any thread. Waits for nothing.
+        // Adds `value` to the figure with this key. FrameReport::figures has the sum over all ranks. Use it for
+        // measurements that all ranks must know, such as the cost of a brick. The figures are summed when the frame
+        // ends: call it before this rank's end(). Any thread. Waits for nothing.
         void addFigure(std::uint64_t key, double value) const { engine_->addFigure(key, value); }
 
         // Notes that an input of that tile was simplified, so that a pixel of one pass may be off by up to `bound`, in
-        // units of colour; see FrameReport::mergeErrorBound. Before this rank's end(). Any thread. Waits for nothing.
-        // Throws InvalidArgument for a tile outside the image.
+        // units of colour; see FrameReport::mergeErrorBound. Call it before this rank's end(). Any thread. Waits for
+        // nothing. Throws InvalidArgument for a tile outside the image.
         void noteMergeError(int tileIndex, double bound) const { engine_->noteMergeError(tileIndex, bound); }
 
-        // Whether the frame has failed on some rank, as far as this rank knows. Then rendering on is of no use. Any
-        // thread. Waits for nothing.
+        // Whether the frame has failed on some rank, as far as this rank knows. If so, there is no use in rendering on.
+        // Any thread. Waits for nothing.
         bool failed() const noexcept { return engine_->failed(); }
 
-        // Calls body(), the work of a loop of your own or a part of it. An exception of body() goes to abort(), and
-        // end() throws a FrameError with its text on all ranks, also on this one. So call end() in any case. Returns
-        // false if there was an exception. Any thread. Waits for no other rank. Throws nothing.
-        // With `tile`, which body() renders, the error names that tile, and with FrameConfig::allowPartial the frame
-        // goes on without it. The tile's index is read when there is an exception.
+        // Calls body(), which is a rendering loop of your own or a part of it. If body() throws, guard() passes the
+        // exception to abort(), and end() throws a FrameError with its text on all ranks, including this one. So call
+        // end() in any case. Returns false if there was an exception. Any thread. Waits for no other rank. Throws
+        // nothing.
+        // `tile` is the tile that body() renders, if any: the error names it, and with FrameConfig::allowPartial the
+        // frame goes on without it. Its index is read only after an exception, so body() may set it.
         template <class Body>
         bool guard(const Body& body, const TileHeader& tile = {})
         {
@@ -193,8 +197,8 @@ public:
         // Calls job(i, tile) for each i in [0, count), on this thread and the workers of the executor. Each thread has
         // a tile of its own: a Tile, or a TileView if that is the template argument. The job calls start(tile, ...),
         // renders, and calls setTile(tile); several threads call it at once. Any thread may call forEachTile(). Not
-        // collective. Waits until all jobs have returned, for other ranks only as setTile() does. Throws nothing: an
-        // exception of a job makes the frame fail as in guard(), and no other job begins; with
+        // collective. Waits until all jobs have returned; it waits for other ranks only inside setTile(). Throws
+        // nothing: an exception of a job makes the frame fail as in guard(), and no other job begins; with
         // FrameConfig::allowPartial the frame goes on without that job's tile.
         template <class WorkerTile = Tile, class Job>
         void forEachTile(std::int64_t count, const Job& job)
@@ -204,8 +208,8 @@ public:
                 fb_->executor().parallelFor(jobs, [&](std::size_t i) {
                     if (failed())
                         return;
-                    // Each thread keeps a tile for its next job. A job takes it out of there, because the thread may be
-                    // given another job while a renderer waits inside this one.
+                    // Each thread keeps a tile for its next job. A job takes it out of `spare`, because the thread may
+                    // be given another job while a renderer waits inside this one.
                     static thread_local std::unique_ptr<WorkerTile> spare;
                     std::unique_ptr<WorkerTile> tile = std::move(spare);
                     if (!tile)
@@ -234,9 +238,9 @@ public:
             });
         }
 
-        // Makes the frame fail on all ranks, with the text of this exception. `tileIndex`: the tile that it concerns,
-        // which the error names, or -1. With FrameConfig::allowPartial the frame goes on without that tile. Any thread.
-        // Does nothing after end(). Waits for nothing.
+        // Makes the frame fail on all ranks, with the text of this exception. `tileIndex`: the tile that the exception
+        // concerns, which the error names; or -1. With FrameConfig::allowPartial the frame goes on without that tile.
+        // Any thread. Does nothing after end(). Waits for nothing.
         void abort(const std::exception_ptr& reason, int tileIndex = -1) { engine_->abort(number_, reason, tileIndex); }
 
         // Makes the frame fail on all ranks with ErrorKind::Cancelled, because nobody needs it any more. Call end() all
@@ -253,9 +257,9 @@ public:
         // missing. Waits until all tiles of all ranks are finished and the display rank has the image, or until the
         // frame has failed. It fails, too, if nothing is under way that could complete it (ErrorKind::MissingInput).
         // Throws FrameError, the same on every rank; with FrameConfig::allowPartial it returns instead, with
-        // FrameReport::failure set, unless ranks disagree. Throws TransportError. The frame is over then, and after a
-        // FrameError the next may begin. Throws InvalidArgument on a thread that may not call MPI (see Progress); the
-        // frame is still open then.
+        // FrameReport::failure set, unless ranks disagree. Throws TransportError. In all these cases the frame is over;
+        // after a FrameError the next one may begin. Throws InvalidArgument on a thread that may not call MPI (see
+        // Progress); the frame is still open then.
         FrameReport end()
         {
             requireOpen();
@@ -276,7 +280,7 @@ public:
             return engine_->isDone();
         }
 
-        // Ends the frame and returns its report if isDone(); otherwise returns nothing, at once. Waits no longer than
+        // If isDone(), ends the frame and returns its report; otherwise returns nothing, at once. Waits no longer than
         // end() does after isDone(). Throws what end() throws.
         std::optional<FrameReport> tryEnd() { return isDone() ? std::optional<FrameReport>(end()) : std::nullopt; }
 
@@ -304,15 +308,15 @@ public:
     {
     }
 
-    // Does so with a network configuration of your own.
+    // The same, with a network configuration of your own.
     DistributedFrameBuffer(const Communicator& communicator, Config config, NetworkConfig network, PixelOp pixelOp = {})
         : DistributedFrameBuffer(connect<Transport>(communicator, std::move(network)), std::move(config),
                                  std::move(pixelOp))
     {
     }
 
-    // Makes a framebuffer on a connection, which several may share. All ranks make them in the same order. Collective;
-    // waits and throws as above.
+    // Makes a framebuffer on a connection. Several framebuffers may share a connection; all ranks must make them in the
+    // same order. Collective. Waits and throws as above.
     DistributedFrameBuffer(std::shared_ptr<Connection> connection, Config config, PixelOp pixelOp = {})
         : connection_(std::move(connection))
     {
@@ -331,7 +335,7 @@ public:
     ~DistributedFrameBuffer()
     {
         for (const auto& engine : engines_)
-            if (engine->isOpen()) { // its Frame would use what is gone
+            if (engine->isOpen()) { // its Frame would use the destroyed framebuffer
                 std::fputs("dfb: a framebuffer is destroyed before a Frame of it: end() the frame first\n", stderr);
                 std::abort();
             }
@@ -344,18 +348,18 @@ public:
     bool isDisplayRank() const noexcept { return rank() == config().image.displayRank; }
     const Config& config() const noexcept { return engine().config(); }
     const TileLayout& layout() const noexcept { return engine().layout(); }
-    // By config().image.ownerMap. A frame can have other owners: see Frame.
+    // The owners by config().image.ownerMap. A frame can have other owners: see Frame::tileOwner().
     int tileOwner(int tile) const noexcept { return engine().tileOwner(tile); }
     const std::vector<int>& ownedTiles() const noexcept { return engine().ownedTiles(); }
-    // For each rank the lowest rank that shares memory with it: ranks with the same number here are on one node. With a
-    // transport that knows no shared memory all ranks are on one node.
+    // For each rank the lowest rank that shares memory with it: ranks with the same number here are on one node. If the
+    // transport knows no shared memory, all ranks count as being on one node.
     const std::vector<int>& nodeOf() const noexcept { return engine().nodeOf(); }
     Executor& executor() const noexcept { return *config().executor; }
 
     // On the display rank: the image of the last frame that ended well or partial. With config.framesInFlight = 1 it is
-    // valid until the next begin(); with n frames in flight until the n-th begin() after that of its own frame. Empty
-    // before the first frame, when it is no longer valid, and on other ranks. For the thread that begins and ends
-    // frames.
+    // valid until the next begin(); with n frames in flight, until the n-th begin() after that of its own frame. Empty
+    // before the first frame, when it is no longer valid, and on other ranks. Only the thread that begins and ends
+    // frames may call it.
     const Image& image() const noexcept { return lastEnded_->image(); }
 
     // Copies the display rank's image() to every rank, and returns it; an empty image if image() is empty there. The
@@ -379,8 +383,8 @@ public:
     // Begins a frame. Every rank must call it, with an equal `params`. All ranks must call begin() and end() in the
     // same order: setTile() may wait for room at a rank, and there is none before that rank has begun the frame. Copies
     // `tileData` and `pixelData`. Waits for no other rank. Throws InvalidArgument, with nothing sent, if the frame that
-    // was begun config.framesInFlight frames ago is open, if a field of `params` is out of range, or on a thread that
-    // may not call MPI (see Progress). Throws TransportError if the connection has failed.
+    // was begun config.framesInFlight frames ago is still open, if a field of `params` is out of range, or on a thread
+    // that may not call MPI (see Progress). Throws TransportError if the connection has failed.
     Frame begin(const FrameConfig& params = {}, const TileFrameData& tileData = {},
                 const PixelFrameData& pixelData = {})
     {
@@ -408,7 +412,7 @@ public:
 
     // Returns memory for pixels that all ranks of the node can read: see TileView::staysUntilEnd. It is not cleared,
     // and aligned to 64 bytes. If there is no shared memory, or no more of it (4 GiB a rank), it is memory of this rank
-    // alone, and pixels in it are sent. Any thread. Waits for nothing. Throws OutOfMemory.
+    // alone, and pixels in it must be sent. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
     using Reduce = dfb::Reduce;
@@ -423,9 +427,10 @@ public:
         return engine().allReduce(values, how);
     }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` names this call in the error for different calls.
-    // The sizes may differ and may be 0; each rank needs memory for the bytes of all, several times. Collective,
-    // outside frames. Waits and throws as allReduce(); also throws std::bad_alloc on a rank that lacks memory.
+    // Returns the bytes of each rank, by rank, on all ranks. `call` is the name of this call in the error that is
+    // thrown if ranks make different calls. The sizes may differ and may be 0; each rank needs memory for the bytes of
+    // all, several times. Collective, outside frames. Waits and throws as allReduce(); also throws std::bad_alloc on a
+    // rank that lacks memory.
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
         return engine().allGather(bytes, call);
@@ -451,7 +456,7 @@ private:
     }
 
     std::shared_ptr<Connection> connection_;
-    // Each pair has one frame at a time; they take turns.
+    // Each pair of one of these and one of engines_ has one frame at a time. The pairs take turns.
     std::vector<std::unique_ptr<Operations>> operations_;
     std::vector<std::unique_ptr<Engine>> engines_;
     std::size_t next_ = 0;

@@ -29,8 +29,8 @@ struct ImageConfig {
     ChannelMask aux = 0;                       // its auxiliary channels, which the tile operation must have
     bool dither = false;                       // dithers 8-bit colour instead of rounding it: see ditherPixels()
     int displayRank = 0;                       // the rank that gets the image
-    // Which rank owns which tile. Null: latticeOwner; and where ranks are on several nodes, loops with a SharedWorld,
-    // and ImageCompositor, give each frame owners near the pixels.
+    // Which rank owns which tile. Null: latticeOwner. Only if it is null, loops with a SharedWorld and ImageCompositor
+    // choose owners near the pixels for each frame, where ranks are on several nodes.
     OwnerMap ownerMap{};
 };
 
@@ -38,8 +38,8 @@ struct ImageConfig {
 struct MessageConfig {
     std::shared_ptr<const Codec> codec{}; // compresses messages; null: none are compressed
     CompressionMode compression = CompressionMode::Always;
-    // The most that inputs and finished tiles take up in a rank's inbox and on the way to it, and the most that a rank
-    // has under way to others before setTile() waits. Raised to 4 times the largest possible message.
+    // Limits the bytes of inputs and finished tiles in a rank's inbox and on the way to it. Also limits what a rank has
+    // under way to others before setTile() waits. It is raised to 4 times the largest possible message if it is less.
     std::size_t poolBytes = std::size_t{64} << 20;
 };
 
@@ -56,13 +56,13 @@ struct FrameBufferConfig {
 
     ImageConfig image;
     MessageConfig messages;
-    // How exactly the colour of inputs travels: a WireFormat, an ErrorBudget, HalfLevel, or a Precision. The default is
-    // exact. Depth, positions and ids always travel exactly; normals and albedo are scaled to the rounded alpha.
+    // How precisely the colour of inputs is sent: a WireFormat, an ErrorBudget, HalfLevel, or a Precision. The default
+    // is exact. Depth, positions and ids always travel exactly; normals and albedo are scaled to the rounded alpha.
     // Finished tiles travel in image.format. All ranks must give the same.
     Precision precision{};
-    // For AlphaBlend, OrderedBlend and DeepBlend. If the layers of a pixel let through less than this part of the
-    // light, the layers behind them are left out. The pixel changes by no more than this times the largest colour.
-    // 0 (exact) to below 1. All ranks must give the same.
+    // For AlphaBlend, OrderedBlend and DeepBlend. If the layers of a pixel let through less than this fraction of the
+    // light, the layers behind them are left out. The pixel changes by no more than this times the largest colour. 0
+    // (exact) to below 1. All ranks must give the same.
     float minTransmittance = 0;
     // How many frames may be open at once, 1 or more. Memory grows with it. Operations that keep state allow one. All
     // ranks must give the same.
@@ -71,48 +71,50 @@ struct FrameBufferConfig {
     // CallerExecutor makes no threads. Ranks may give different ones.
     std::shared_ptr<Executor> executor{};
     // onTile(tile index, its pixels, image), for windows that show a frame while it is made. Called on the display rank
-    // for each composited tile, when its pixels are in the image of the open frame; with the operations of the library,
-    // for each tile that has an active pixel. Worker threads, the progress thread or a thread in end() call it, for
-    // several tiles at once, while other pixels of the image are written. It must be quick. An exception makes the
-    // frame fail. For tiles of ranks on the display rank's node all calls may come at the end.
+    // for each composited tile, when its pixels are in the image of the open frame. With the operations of the library,
+    // these are the tiles that have an active pixel. Worker threads, the progress thread or a thread in end() call it,
+    // for several tiles at once, while other pixels of the image are still being written. It must be quick. An
+    // exception makes the frame fail. For tiles whose owners are on the display rank's node, all calls may come at the
+    // end of the frame.
     TileCallback onTile{};
     // After this time in end(), ranks check whether a message is still under way; they check again at growing
-    // intervals. If none is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a few
-    // messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message that
-    // says so, then renders the tile. Ranks may give different times.
+    // intervals. If no message is, the frame fails with ErrorKind::MissingInput. 1 ms to 24 days. A short time costs a
+    // few messages in each slow frame. If a tile may be hidden, an OrderedLoop waits at most this long for the message
+    // that says so, then renders the tile. Ranks may give different times.
     std::chrono::milliseconds quiet{2000};
-    // Records what this rank does for its frames, and when: see trace.hpp. Null: nothing is recorded, and it costs
-    // nothing. Ranks may give different ones.
+    // Records what this rank does for its frames, and when: see trace.hpp. Null: nothing is recorded, at no cost. Ranks
+    // may give different ones.
     std::shared_ptr<TraceSink> trace{};
 };
 
-// The samples that a tile gets in a frame: those with the numbers [first, first + count).
+// The samples that a tile gets in a frame: those numbered [first, first + count).
 struct TileSamples {
     int first = 0, count = 1;
 };
 using SamplePlan = std::shared_ptr<const std::vector<TileSamples>>;
 
-// The parameters of a frame. All ranks must give the same; the verdict checks it.
+// The parameters of a frame. All ranks must give the same. This is checked by the verdict: the reduction over all ranks
+// that ends a frame.
 struct FrameConfig {
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA behind everything
     // Samples a pixel, 1 or more; each is a pass. They are numbered from 0, or, with a tile operation that has
     // keepsState, from where the last frame with this accumulationId stopped.
     int passes = 1;
-    // Not null: the samples of each tile, by its index, in place of `passes`; see sampling.hpp. A tile with none is not
-    // rendered, and the image keeps its pixels from the last frame. The last frame must then have ended well. An
-    // operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1 and a
-    // pixel operation that is pointwise.
+    // If not null, it has the samples of each tile, by the tile's index, and replaces `passes`; see sampling.hpp. A
+    // tile without samples is not rendered, and the image keeps its pixels from the last frame, which must have ended
+    // well. An operation without keepsState begins with sample 0, and may leave tiles out only with framesInFlight 1
+    // and a pixel operation that is pointwise.
     SamplePlan samples;
     // For an ErrorBudget: the most inputs that a pixel has in a pass. 0: not known, counts as 65536. ImageParallelLoop,
     // MixedParallelLoop, OrderedLoop and ImageCompositor set it; DataParallelLoop and DeepParallelLoop do not.
     int maxLayers = 0;
     // For tile operations with keepsState, such as Progressive: the image is the mean of the samples of all consecutive
     // frames with this id. Give another id when camera, scene or background change; the samples of each tile then begin
-    // with 0. They also do so after a frame that failed or was partial, and in a frame without `samples` after one with
-    // them.
+    // with 0. They also begin with 0 after a frame that failed or was partial, and in a frame without `samples` that
+    // follows a frame with them.
     std::uint64_t accumulationId = 0;
-    // False: inputs of generation 0 announce the others, as in the paper, and every tile needs one per pass. True: each
-    // rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
+    // False: inputs of generation 0 announce the others, as in the paper, and every tile needs one of them per pass.
+    // True: each rank calls Frame::declare(), and owners wait for the declared inputs. Loops set it themselves.
     bool declared = false;
     // The frame fails with ErrorKind::TimedOut if it is not complete this long after a rank called end(). It also fails
     // if setTile() waits for room, and no receiver takes a message of this rank for this long. The error says what is
@@ -120,14 +122,14 @@ struct FrameConfig {
     // limit. At most 24 days. An input that is never sent needs no time-out: the frame fails with
     // ErrorKind::MissingInput some seconds after all ranks are in end().
     std::chrono::milliseconds timeout{0};
-    // For AlphaBlend. Not null: the sources of all inputs, front to back for every ray of the frame. Inputs are then
-    // blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are the same
-    // as without it. An input with pixels of a source that is not in the order makes the frame fail. MixedParallelLoop,
-    // and DataParallelLoop with a SharedWorld, set it where the bricks (1024 at most) have such an order and the camera
-    // says where its rays begin: see render/visibility.hpp.
+    // For AlphaBlend. If not null, it lists the sources of all inputs, front to back for every ray of the frame. Inputs
+    // are then blended in this order: nothing is sorted, and no depth travels unless the image has it. The pixels are
+    // the same as without it. An input with pixels of a source that is not in the order makes the frame fail.
+    // MixedParallelLoop, and DataParallelLoop with a SharedWorld, set it where the bricks (1024 at most) have such an
+    // order and the camera says where its rays begin: see render/visibility.hpp.
     std::shared_ptr<const SourceOrder> order{};
-    // Not null: which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does not depend
-    // on it. Not for operations that keep state. Loops set it themselves: see ImageConfig::ownerMap.
+    // If not null, it says which rank owns which tile in this frame, in place of ImageConfig::ownerMap. The image does
+    // not depend on it. Not allowed for operations that keep state. Loops set it themselves: see ImageConfig::ownerMap.
     TileOwners owners{};
     // True: a frame that fails still gives the tiles that were finished. end() then throws no FrameError but sets
     // FrameReport::failure; DistributedFrameBuffer::isComplete() tells which tiles there are. If a renderer or an
@@ -137,7 +139,7 @@ struct FrameConfig {
     bool allowPartial = false;
 };
 
-// An input that a rank declares for a tile: one of generation 1 for each pass of the frame.
+// A declaration that a rank will send an input of generation 1 for this tile in each pass of the frame.
 struct TileInput {
     int tile = 0;
     std::uint32_t source = 0;
@@ -168,23 +170,23 @@ struct Figure {
     double value = 0;
 };
 
-// Those figures of a finished frame that are sums over all ranks.
+// The figures of a finished frame that are sums over all ranks.
 struct FrameSums {
-    // Bytes of messages to other ranks, without the transport's own headers; and bytes that owners wrote into the
-    // display rank's image directly.
+    // Bytes of messages to other ranks, without the transport's own headers, plus the bytes that owners wrote directly
+    // into the display rank's image.
     std::int64_t bytesSent = 0;
     std::int64_t messagesSent = 0;
     std::int64_t tilesTouched = 0; // tiles that had an input
     // Input pixels with an infinite or NaN colour, or a NaN depth. Pixels that are read in place count only if they
-    // were read: those behind an opaque input may not be.
+    // were read. Those behind an opaque input may be left unread.
     std::int64_t nonFinitePixels = 0;
     std::int64_t alphaOutsidePixels = 0;   // finite input pixels whose alpha is not within [0, 1]
     std::int64_t orderUndefinedPixels = 0; // of finished tiles, see TileReport
     std::int64_t compressedLinks = 0;      // pairs of sender and receiver for which compression paid
-    // Messages with pixels that were dropped since the last verdict: of frames that failed, or hidden by an opaque
-    // input that came sooner.
+    // Messages with pixels that were dropped since the last verdict, because their frame had failed, or because an
+    // opaque input that came sooner hides them.
     std::int64_t lateMessages = 0;
-    std::int64_t repeatedMessages = 0; // came twice, dropped since the last verdict
+    std::int64_t repeatedMessages = 0; // messages that came twice and were dropped, since the last verdict
 };
 
 // Figures of a finished frame. Those marked "all" are sums or maxima over the ranks, and the same on all of them; they
@@ -192,8 +194,8 @@ struct FrameSums {
 struct FrameReport : FrameSums {
     std::int64_t frame = 0;
     std::optional<ErrorInfo> failure; // all: with FrameConfig::allowPartial, why tiles are missing, if any are
-    // All: tiles that were not finished; the display rank also counts finished tiles that have not come. They show the
-    // background.
+    // All: tiles that were not finished. Finished tiles that have not reached the display rank count, too. Such tiles
+    // show the background.
     std::int64_t tilesIncomplete = 0;
     double totalMs = 0;               // begin() to the return of end(), this rank
     double renderMs = 0;              // begin() to the call of end(), this rank
@@ -212,7 +214,7 @@ struct FrameReport : FrameSums {
     double mergeErrorBound = 0;        // all: how far a pixel may be off because segments were merged, see DeepTile
     std::vector<TileError> tileErrors; // all: of the tiles finished in this frame, by index, if the operation reports
     std::vector<Figure> figures;       // all: the sums of Frame::addFigure(), by key
-    std::int64_t peakInboxBytes = 0;   // all: the most that a rank's inbox held of what messages.poolBytes limits
+    std::int64_t peakInboxBytes = 0;   // all: the most bytes limited by messages.poolBytes that a rank's inbox held
     std::int64_t peakMemoryBytes = 0;  // all: the most message and image memory that a rank's framebuffer ever held
 };
 
