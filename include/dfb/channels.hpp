@@ -20,24 +20,25 @@ DFB_NAMESPACE_BEGIN
 // +infinity. With DepthComposite it then gives depth, position and ids whatever its colour and alpha.
 using ChannelMask = std::uint16_t;
 inline constexpr ChannelMask colorChannel = 1; // premultiplied linear RGBA, 4 floats: blended by the operator over
-// Distance along the ray or any monotone function of it, 1 float: the nearest of the inputs with alpha > 0.
+// 1 float: the distance along the ray, or any function that grows with it. The image gets the nearest of the inputs
+// with alpha > 0.
 inline constexpr ChannelMask depthChannel = 2;
-// Auxiliary channels. Those of 3 floats that are blended are premultiplied by the pixel's alpha, as colour is; they
-// come out as the mean weighted by alpha, without the background, and 0 where alpha is 0.
+// Auxiliary channels. Normals and albedo are blended, so they are premultiplied by the pixel's alpha, as colour is. The
+// image gets their mean weighted by alpha, without the background, and 0 where alpha is 0.
 //
 // Position and ids are those of the front input: the first input with alpha > 0 in the order of blending, which is that
 // of (depth, source, part), or the one given to OrderedBlend. An id comes from the first such input that has one. With
-// several passes, the pass with the nearest front input counts; of equally near ones, or without depths, the first
-// pass. To compare passes, depth is sent even if the image has none. With one pass it is sent only if the operation
-// needs it.
+// several passes, they are taken from the pass with the nearest front input; if some are equally near, or there are no
+// depths, from the first of these passes. To compare passes, depth is sent even if the image has none. With one pass it
+// is sent only if the operation needs it.
 inline constexpr ChannelMask normalChannel =
     4; // 3 floats times alpha: over; comes out shorter than 1 where normals differ
 inline constexpr ChannelMask albedoChannel = 8;       // 3 floats times alpha: over
 inline constexpr ChannelMask positionChannel = 16;    // 3 floats, not premultiplied: of the front input; else 0
 inline constexpr ChannelMask primitiveIdChannel = 32; // 1 unsigned: of the front input that has one; else noId
 inline constexpr ChannelMask instanceIdChannel = 64;  // the same
-// How far back the input reaches, 1 float in the units of depth: the interval [depth, far] holds all that was blended
-// into the pixel. It is compared, never blended and no part of an image.
+// 1 float: how far back the input reaches, in the units of depth. The interval [depth, far] holds all that was blended
+// into the pixel. It is compared, never blended, and not part of an image.
 inline constexpr ChannelMask farChannel = 128;
 
 // The channels that an image can have beside colour and depth.
@@ -45,7 +46,7 @@ inline constexpr ChannelMask imageAuxChannels =
     normalChannel | albedoChannel | positionChannel | primitiveIdChannel | instanceIdChannel;
 inline constexpr ChannelMask allChannels = colorChannel | depthChannel | imageAuxChannels | farChannel;
 
-// Where there is no primitive or instance.
+// The id of pixels where there is no primitive or instance.
 inline constexpr std::uint32_t noId = 0xffffffffu;
 
 namespace detail {
@@ -89,7 +90,7 @@ inline const std::uint32_t* idsOf(const std::byte* plane) noexcept
 inline std::uint32_t* idsOf(std::byte* plane) noexcept { return reinterpret_cast<std::uint32_t*>(plane); }
 
 // Whether alpha is 1 in all pixels of a colour plane, which has a byte a channel or floats; rows are `stride` pixels
-// apart. Looks at no more of them than it must.
+// apart. Stops at the first pixel that is not opaque.
 inline bool isOpaque(const std::byte* color, bool hasBytes, int width, int height, std::ptrdiff_t stride) noexcept
 {
     for (int y = 0; y < height; ++y)

@@ -95,9 +95,9 @@ inline __m128 pixelOf(const double* rgba) noexcept
 inline __m128 pixelOf(const float* rgba) noexcept { return _mm_add_ps(_mm_loadu_ps(rgba), _mm_setzero_ps()); }
 #endif
 
-// Stores float pixels past the cache, in whole lines of it: `out` is not read soon by this thread, so its lines need
-// not be fetched. storesAreDone() must follow before others may know of them. Returns how many pixels from the first on
-// were stored; the others are left to the caller.
+// Stores float pixels past the cache, in whole cache lines: this thread does not read `out` soon, so its lines need not
+// be fetched. Call storesAreDone() before other threads learn of the pixels. Returns how many pixels were stored, from
+// the first on. The caller must store the others.
 template <class Real>
 int streamPixels([[maybe_unused]] const Real* rgba, [[maybe_unused]] int count, [[maybe_unused]] float* out) noexcept
 {
@@ -150,7 +150,7 @@ double convertPixels(const Real* rgba, int count, OutputFormat format, std::byte
 class Image {
 public:
     Image() = default;
-    // `channels`: beside the colour. Throws OutOfMemory, with the bytes of the whole image.
+    // `channels`: those beside the colour. Throws OutOfMemory, which tells the bytes of the whole image.
     Image(MemoryPool& pool, int width, int height, OutputFormat format, ChannelMask channels)
         : width_(width), height_(height), format_(format)
     {
@@ -197,8 +197,8 @@ public:
         require(format_ == OutputFormat::RGBA32F, "float pixels");
         return reinterpret_cast<const float*>(bytes());
     }
-    // One float a pixel, +infinity where nothing was hit. This and the next throw InvalidArgument if the channel was
-    // not asked for. channels.hpp says what they mean where inputs were blended.
+    // One float a pixel, +infinity where nothing was hit. This and the following members throw InvalidArgument if the
+    // channel was not asked for. channels.hpp says what the values mean where inputs were blended.
     const float* depth() const { return detail::floatsOf(plane(detail::Depth, "depth")); }
     const float* normal() const { return detail::floatsOf(plane(detail::Normal, "normals")); }       // 3 a pixel
     const float* albedo() const { return detail::floatsOf(plane(detail::Albedo, "albedo")); }        // 3 a pixel
@@ -207,7 +207,7 @@ public:
     const std::uint32_t* primitiveId() const { return detail::idsOf(plane(detail::PrimitiveId, "primitive ids")); }
     const std::uint32_t* instanceId() const { return detail::idsOf(plane(detail::InstanceId, "instance ids")); }
 
-    // Calls use(bytes, count) for each plane that there is: colour, then depth, then the auxiliary channels.
+    // Calls use(bytes, byteCount) for each plane that the image has: colour, then depth, then the auxiliary channels.
     template <class Use>
     void forEachPlane(const Use& use) const
     {
@@ -223,10 +223,10 @@ public:
                 use(planes_[c].data(), pixelCount() * pixelBytes(c));
     }
 
-    // Gives its memory away; the image is empty then.
+    // Hands over the memory of the planes. The image is empty afterwards.
     std::array<Buffer, detail::channelCount> release() noexcept { return std::move(planes_); }
 
-    // Where pixel `first` of each plane is; null where there is none.
+    // The address of pixel `first` in each plane; null where there is no plane.
     detail::Planes planesAt(std::size_t first) noexcept
     {
         detail::Planes planes;
@@ -262,9 +262,9 @@ private:
 };
 
 // Writes the colours of an image to a file that any image viewer opens: a PPM file, 8 bits a channel, without alpha.
-// RGBA32F becomes sRGB; 8-bit images are written as they are. Replaces a file that is there. Not collective: call it on
-// a rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if
-// the file cannot be written, which may leave a part of it.
+// RGBA32F becomes sRGB; 8-bit images are written as they are. Replaces an existing file. Not collective: call it on a
+// rank that has an image. Any thread. Throws InvalidArgument if the image is empty, and then writes nothing, or if the
+// file cannot be written, which may leave a part of it.
 DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image);
 
 #if DFB_HAS_BODIES
@@ -293,19 +293,19 @@ DFB_COMPILED_ONCE void writePpm(const std::string& path, const Image& image)
 }
 #endif
 
-// Dither: conversion to 8 bit that leaves no bands in gradients. Each pixel's place in the image says from which part
-// of the way between two levels on it takes the upper one, so that the mean over neighbours lies between the levels,
-// too.
+// Dither: conversion to 8 bits that leaves no bands in gradients. Each pixel's place in the image gives a threshold. A
+// value that is farther than this fraction of the way between two levels takes the upper one. So the mean over
+// neighbours can lie between levels.
 //
 // The thresholds are those of B. E. Bayer, "An optimum method for two-level rendition of continuous-tone pictures",
-// IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64 once in any 8x8 pixels. Unlike noise they keep the
-// mean over every such block, and are made of integers alone. Colours are rounded to float first: then each step is
-// exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so grey stays grey,
-// and a darker channel does not become a lighter one.
+// IEEE Intl. Conf. on Communications 1973: each of (rank + 1/2) / 64, for ranks 0 to 63, occurs once in any 8x8 pixels.
+// Unlike noise, they keep the mean over every such block, and need only integers. Colours are rounded to float first:
+// then each step is exact, and an image of floats gets the same levels. All channels of a pixel have one threshold, so
+// grey stays grey, and a darker channel does not come out lighter than a brighter one.
 
 namespace detail {
 
-// 0 to 63: the bits of x ^ y and y in turn, the lowest in front.
+// Returns 0 to 63: the bits of x ^ y and of y in turn, the lowest bits of x and y becoming the highest.
 constexpr int ditherRank(int x, int y) noexcept
 {
     int rank = 0;
@@ -314,7 +314,8 @@ constexpr int ditherRank(int x, int y) noexcept
     return rank;
 }
 
-// The level at or below `value`, or the next if it is more than `threshold` of the way there. Clamped; NaN gives 0.
+// The level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to it.
+// Clamped; NaN gives 0.
 inline int ditherUnorm8(float value, double threshold) noexcept
 {
     if (!(value > 0.0f))
@@ -326,8 +327,9 @@ inline int ditherUnorm8(float value, double threshold) noexcept
     return below + (scaled - below > threshold ? 1 : 0);
 }
 
-// The sRGB level at or below `value`, or the next if it is more than `threshold` of the way there. The way is measured
-// in light, so that the mean is right for an eye that sees no single pixel; in levels it differs by less than 1/128.
+// The sRGB level at or below `value`, or the next one if `value` is more than the fraction `threshold` of the way to
+// it. The fraction is measured in linear light, so that the mean is right for an eye that sees no single pixels.
+// Measured in levels, it differs by less than 1/128.
 inline int ditherSrgb8(float value, double threshold)
 {
     static const std::array<double, 256> light = [] {
@@ -350,8 +352,8 @@ inline int ditherSrgb8(float value, double threshold)
 } // namespace detail
 
 // convertPixels() with dithered colour, if the format has 8 bits; (x, y) is the place of the first pixel in the image.
-// Alpha is rounded, not dithered. A colour that is at most alpha gets no level above that of alpha, where alpha is
-// converted as a colour and a tie goes to the lower level: so in RGBA8 it stays at most alpha. This costs it half a
+// Alpha is rounded, not dithered. A colour value that is at most alpha gets no level above the one that alpha would get
+// if it were a colour, with ties going to the lower level. So in RGBA8 it stays at most alpha. This lowers it by half a
 // level at most. Returns the largest rounding distance of alpha, as convertPixels() does.
 template <class Real>
 double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int y, std::byte* out)
@@ -365,7 +367,7 @@ double ditherPixels(const Real* rgba, int count, OutputFormat format, int x, int
         const double threshold = (detail::ditherRank(x + i, y) + 0.5) / 64, exactAlpha = rgba[3];
         farthest = std::max(farthest, detail::toUnorm8(&exactAlpha, 1, bytes + 3));
         const auto alpha = static_cast<float>(rgba[3]);
-        // A tie may yet be decided either way, with more digits.
+        // What is a tie in float may go either way in the exact alpha, which has more digits.
         const int most = isSrgb ? detail::toSrgb8(static_cast<double>(alpha)) : detail::ditherUnorm8(alpha, 0.5001);
         for (int c = 0; c < 3; ++c) {
             const auto value = static_cast<float>(rgba[c]);

@@ -1,4 +1,5 @@
-// ImageCompositor: makes one picture of images that the ranks have rendered already. No camera, no bricks, no tiles:
+// ImageCompositor: makes one picture from images that the ranks have already rendered. It needs no camera, bricks or
+// tiles:
 //
 //   dfb::ImageCompositor compositor(communicator, dfb::ImageBlend::Nearest, {width, height});
 //   dfb::InputImage mine(pixels, depths);
@@ -35,7 +36,7 @@ DFB_NAMESPACE_BEGIN
 
 // How the images of the ranks become one.
 enum class ImageBlend : std::uint8_t {
-    Nearest, // of each pixel the one with the least depth, for opaque geometry; a pixel without a depth is empty
+    Nearest, // the nearest input of each pixel wins: for opaque geometry; a pixel without a depth is empty
     ByDepth, // each pixel blended front to back by depth; at equal depths the lower rank is in front
     InOrder  // images blended front to back in an order of the ranks; no depth is needed
 };
@@ -44,12 +45,12 @@ enum class ImageBlend : std::uint8_t {
 struct InputImage {
     // This rank has nothing to show.
     InputImage() = default;
-    // 4 bytes or floats a pixel, and a depth for each pixel. Null depths: none, for ImageBlend::InOrder.
+    // 4 bytes or floats a pixel, and a depth for each pixel. `depths` may be null for ImageBlend::InOrder.
     explicit InputImage(const std::uint8_t* bytes, const float* depths = nullptr) : rgba8(bytes), depth(depths) {}
     explicit InputImage(const float* floats, const float* depths = nullptr) : rgba32f(floats), depth(depths) {}
 
-    // Set one of the two. 8-bit colours are sent as bytes; level k means the float next to k / 255. Images that are
-    // encoded for a display (sRGB) are blended without decoding: ask for OutputFormat::RGBA8, which does not encode
+    // Set one of these two. 8-bit colours are sent as bytes; level k means the float nearest to k / 255. Images that
+    // are encoded for a display (sRGB) are blended without decoding: ask for OutputFormat::RGBA8, which does not encode
     // them a second time.
     const std::uint8_t* rgba8 = nullptr;
     const float* rgba32f = nullptr;
@@ -61,20 +62,21 @@ struct InputImage {
     // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
     float farDepth = std::numeric_limits<float>::infinity();
     // The part of the picture that the memory holds; pixels outside of the picture are not read. x counts from the
-    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region without pixels: nothing
-    // to show.
+    // left, y from the first row in memory. {0, 0, 0, 0}: the whole picture. Any other region without pixels means that
+    // this rank has nothing to show.
     Region region{0, 0, 0, 0};
-    // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
+    // Pixels outside of this part of the picture are empty and not read. Its coordinates are those of `region`. By
+    // default it is everything.
     Region valid{0, 0, std::numeric_limits<int>::max(), std::numeric_limits<int>::max()};
     // A promise: the memory stays as it is until end() has returned. Then pixels need not be copied if their colours
-    // are premultiplied RGBA: a rank reads its own where they lie, and those of other ranks of its node if they lie in
-    // memory of sharedMemory(). composite() takes it as promised.
+    // are premultiplied RGBA: a rank reads its own pixels where they lie, and those of other ranks of its node if they
+    // lie in memory of sharedMemory(). composite() sets it by itself.
     bool staysUntilEnd = false;
 };
 
 // One object per rank. Construction, destruction, resize(), composite(), end(), imageOnAllRanks() and allGather() are
 // collective. One thread at a time may call members; they work on all threads of config.executor. Members that are not
-// collective wait for no other rank, except start() for room.
+// collective wait for no other rank, except that start() may wait for room.
 class ImageCompositor {
 public:
     // Makes a compositor on a connection. config.image: the picture of the display rank. config.framesInFlight becomes
@@ -108,12 +110,12 @@ public:
     // same value on all ranks while no picture is open; nobody checks that. Waits for nothing.
     void setBottomUp(bool bottomUp) { bottomUp_ = bottomUp; }
 
-    // Makes one picture of the images of all ranks: start() and end() in one. `place`, for ImageBlend::InOrder: this
-    // rank's place in the order, 0 in front, a different one on each rank; else it is ignored. `frame` must have one
-    // pass and no samples. If config.executor was not given and this rank's share is one processor, the calling thread
-    // does all the work. Collective. Waits as end(). Throws what start() and end() throw.
+    // Makes one picture from the images of all ranks: start() and end() in one. `place` is this rank's place in the
+    // order of ImageBlend::InOrder: 0 is in front, and each rank gives a different one. Other blends ignore it. `frame`
+    // must have one pass and no samples. If config.executor was not given and this rank's share is one processor, the
+    // calling thread does all the work. Collective. Waits as end(). Throws what start() and end() throw.
     FrameReport composite(const InputImage& image, int place, const FrameConfig& frame = {});
-    // Does so for the other ways to blend, which need no place.
+    // The same for the other ways to blend, which need no place.
     FrameReport composite(const InputImage& image, const FrameConfig& frame = {})
     {
         return composite(image, -1, frame);
@@ -149,10 +151,10 @@ public:
     // and after one that failed. Pixels that no image has show FrameConfig::background, at a depth of +infinity.
     const Image& image() const noexcept { return engine_->image(); }
 
-    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; empty if that is. Takes
-    // memory for several more images on every rank while it runs. Waits for all ranks, without a time-out. Throws
-    // InvalidArgument on all ranks if one makes another collective call; TransportError; and std::bad_alloc on a rank
-    // that lacks memory.
+    // Collective, between pictures. Returns a copy of the display rank's image() on every rank; it is empty if image()
+    // is empty there. Takes memory for several more images on every rank while it runs. Waits for all ranks, without a
+    // time-out. Throws InvalidArgument on all ranks if one makes another collective call; TransportError; and
+    // std::bad_alloc on a rank that lacks memory.
     Image imageOnAllRanks() { return engine_->imageOnAllRanks(*engine_); }
 
     // Returns memory for an image that all ranks of the node can read, so that nobody has to copy it. It is not
@@ -161,8 +163,9 @@ public:
     // destroyed. Any thread. Waits for nothing. Throws OutOfMemory.
     Buffer sharedMemory(std::size_t byteCount) const { return connection_->pool()->acquire(byteCount); }
 
-    // Returns the bytes of each rank, by rank, on all ranks. `call` names this call in the error for different calls.
-    // The sizes may differ and may be 0. Collective, while no picture is open. Waits and throws as imageOnAllRanks().
+    // Returns the bytes of each rank, by rank, on all ranks. `call` is the name of this call in the error that is
+    // thrown if ranks make different calls. The sizes may differ and may be 0. Collective, while no picture is open.
+    // Waits and throws as imageOnAllRanks().
     std::vector<std::vector<std::byte>> allGather(const std::vector<std::byte>& bytes, const char* call = "allGather()")
     {
         return engine_->allGather(bytes, call);
@@ -187,7 +190,7 @@ private:
     std::unique_ptr<detail::Operations> operations_;
     std::unique_ptr<detail::Engine> engine_;
     std::vector<TileInput> inputs_;
-    // On several nodes:
+    // Used only if ranks are on several nodes:
     std::optional<detail::LinkOwners> owners_;
     std::vector<int> ranks_;      // all, ascending
     std::vector<Figure> regions_; // of the ranks' images in the last picture: see detail::PackedRegion
@@ -202,7 +205,7 @@ DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
-// Blends inputs front to back by their source, which is the place of their rank.
+// Blends inputs front to back by their source, which is the `place` of their rank.
 class BlendBySource : public SortLast<BlendRule::InOrder, 64, colorChannel | depthChannel> {
 public:
     static constexpr ChannelMask neededChannels = colorChannel;
@@ -212,8 +215,8 @@ public:
 // each image. Square tiles of as many pixels touch a page of memory for each of their rows, which takes up to 1.5 times
 // as long. 4 strips a rank share the work well enough. A strip of under 4096 pixels costs more to send than to blend.
 //
-// Between nodes bytes cost more than pages. Squares are smaller than most images: many have pixels of one rank alone,
-// which owns them and sends them once.
+// Between nodes, sent bytes cost more than touched pages. Tiles are square there, and small compared with most images.
+// So many tiles have pixels of one rank alone, which owns them and sends their pixels once.
 template <class TileOp>
 std::unique_ptr<Operations> imageOperations(const char* name, const ImageConfig& image, int ranks, bool isOneNode)
 {
@@ -229,7 +232,7 @@ std::unique_ptr<Operations> imageOperations(const char* name, const ImageConfig&
     return std::make_unique<OperationsOf<TileOp, NoPixelOp>>(NoPixelOp(), std::move(traits));
 }
 
-// A region of a picture in a number that a double holds: 13 bits for each side.
+// Packs a region of a picture into a number that a double holds exactly: 13 bits for each side.
 class PackedRegion {
 public:
     explicit PackedRegion(const TileLayout& layout) : step_((std::max(layout.width(), layout.height()) - 1) / 8191 + 1)
@@ -276,8 +279,8 @@ public:
 
     const Region& valid() const noexcept { return valid_; } // in the picture
 
-    // Returns where the pixels of a tile are; `view` is used for them. Pixels that have to be converted are in
-    // `converted`.
+    // Returns where the pixels of the tile `view` are, and points `view` to them. Pixels that have to be converted are
+    // written to `converted`.
     InputPixels find(View& view, Converted& converted) const
     {
         const std::ptrdiff_t rowPixels = image_.rowPixels != 0 ? image_.rowPixels : held_.width();
@@ -299,7 +302,7 @@ public:
     }
 
 private:
-    // Copies the valid pixels, as a framebuffer wants them.
+    // Copies the valid pixels, converted to what a framebuffer takes.
     void convert(View& view, Converted& to) const
     {
         const Region some = intersection(view.region, valid_);
@@ -387,10 +390,11 @@ DFB_COMPILED_ONCE void ImageCompositor::makeEngine(const FrameBufferConfig& conf
     for (int rank = 0; rank < size(); ++rank)
         ranks_.push_back(rank);
     if (!owners_->isOneNode())
-        makeEngine(config); // with other tiles
+        makeEngine(config); // with square tiles
 }
 
-// By the regions of the last picture, as nobody knows those of this one. Null: none are known, or need not be.
+// Finds owners by the regions of the last picture, because those of this one are not known yet. Returns null if no
+// regions are known, or none are needed.
 DFB_COMPILED_ONCE TileOwners ImageCompositor::findOwners()
 {
     if (regions_.empty() || config().image.ownerMap)
@@ -456,7 +460,8 @@ DFB_COMPILED_ONCE void ImageCompositor::start(const InputImage& image, int place
 
 DFB_COMPILED_ONCE FrameReport ImageCompositor::composite(const InputImage& image, int place, const FrameConfig& frame)
 {
-    // On one processor the thread that waits here anyway does it all, also the work of the progress thread.
+    // On one processor, this thread has to wait here anyway. So it does all the work, including that of the progress
+    // thread.
     std::optional<Connection::StandIn> standIn;
     const auto wake = [](ThreadExecutor* threads) { threads->rest(false); };
     const std::unique_ptr<ThreadExecutor, decltype(wake)> resting(oneThread_.get(), wake);
@@ -481,7 +486,7 @@ DFB_COMPILED_ONCE FrameReport ImageCompositor::end()
     return report;
 }
 
-// Declares and sends the tiles that the image has a part of.
+// Declares and sends the tiles that the image covers at least in part.
 DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place, bool usesDepth)
 {
     const TileLayout& layout = engine_->layout();
@@ -526,10 +531,10 @@ DFB_COMPILED_ONCE void ImageCompositor::send(const InputImage& image, int place,
         static_cast<TileHeader&>(view) = engine_->headerOf(inputs_[i].tile, 0);
         view.generation = 1;
         view.source = source;
-        static thread_local detail::InputTile::Converted converted; // with its memory, from tile to tile
+        static thread_local detail::InputTile::Converted converted; // keeps its memory from tile to tile
         engine_->setTile(part.find(view, converted));
     };
-    config().executor->parallelFor(inputs_.size(), std::cref(sendTile)); // a std::function of it would take memory
+    config().executor->parallelFor(inputs_.size(), std::cref(sendTile)); // copied, it would need memory
 }
 
 DFB_NAMESPACE_END

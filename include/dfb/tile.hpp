@@ -20,13 +20,13 @@ DFB_NAMESPACE_BEGIN
 struct TileHeader {
     std::int64_t frame = -1;  // set by Frame::start
     int tile = -1;            // index in the TileLayout
-    Region region;            // its pixels; at the right and lower border smaller than the tile
+    Region region;            // its pixels; smaller than the tile at the image's right and lower border
     int pass = 0;             // passes are composited each by itself, then averaged
     int generation = 0;       // level in the tile's dependency tree
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id; the rank where there are no bricks
     std::uint16_t part = 0;   // to tell apart several inputs of one source
-    int sample = 0;           // of the pixel, over all frames that accumulate: the index to seed with; set by start
+    int sample = 0;           // sample number over all frames that accumulate: the index to seed with; set by Frame::start
 };
 
 // An order of the sources of inputs, from front to back.
@@ -171,13 +171,13 @@ struct Tile : TileHeader, detail::TilePlanes<Channels, Size * Size> {
                 std::fill(std::begin(values), std::end(values), infinity);
             else if (channel == detail::Far)
                 std::fill(std::begin(values), std::end(values),
-                          -infinity); // nobody has said: no farther than the depth
+                          -infinity); // not set: no farther than the depth
             else
                 std::memset(values, 0, sizeof values);
         });
     }
 
-    // All pixels: one premultiplied RGBA colour at one depth.
+    // Sets all pixels to one premultiplied RGBA colour at one depth.
     void fill(const float (&rgba)[4], float depthValue = std::numeric_limits<float>::infinity())
     {
         for (int i = 0; i < Size * Size; ++i)
@@ -233,8 +233,8 @@ struct TileView : TileHeader {
     const std::uint8_t* color8 = nullptr;
     const std::uint32_t *primitiveId = nullptr, *instanceId = nullptr;
     const float* farDepth = nullptr;
-    // Pixels of the image outside of this region are empty, and are not read: for a renderer that knows where its data
-    // project to. By default there is no such limit.
+    // Pixels of the image outside of this region are empty, and are not read. Set it in a renderer that knows where its
+    // data project to. By default there is no such limit.
     Region valid{std::numeric_limits<int>::min(), std::numeric_limits<int>::min(), std::numeric_limits<int>::max(),
                  std::numeric_limits<int>::max()};
     Region validRegion() const noexcept { return intersection(region, valid); }
@@ -266,8 +266,8 @@ struct TileView : TileHeader {
 
 namespace detail {
 
-// A Tile or a TileView of any size and channels: its header, and where its pixels lie. Behind the door of the
-// framebuffer nothing is a template on the type of a tile.
+// A Tile or a TileView of any size and channels: its header, and where its pixels lie. Nothing inside the framebuffer
+// is a template on the type of a tile.
 struct InputPixels : TileHeader {
     template <ChannelMask Channels, int Size>
     InputPixels(const Tile<Channels, Size>& from)
@@ -290,7 +290,7 @@ struct InputPixels : TileHeader {
     ChannelMask channels;
     ConstPlanes planes;    // to the first pixel of the region; null: not there
     std::ptrdiff_t stride; // from a row to the next, in pixels
-    Region valid;          // of the region; pixels outside of it have nothing, and are not read
+    Region valid;          // part of the region; pixels outside of it are empty and not read
     bool hasBytes = false; // the colour has 8 bits a channel
     bool staysUntilEnd = false;
     float depthLimit = std::numeric_limits<float>::infinity(); // at this depth or beyond a pixel is empty

@@ -2,12 +2,12 @@
 //
 // A TileOp is a default-constructible type. A rank makes an object when a tile that it owns first needs one, for each
 // frame in flight. If owners change, an object without keepsState may serve another tile later. Calls for one tile come
-// one after the other, from any worker, so the operation needs no mutex; calls for different tiles come at once. It
+// one after the other, from any worker, so the operation needs no mutex; calls for different tiles may come at once. It
 // does not know the framebuffer, messages or threads. An exception makes the frame fail on all ranks, with its text.
 //
 // All passes of a tile come to one object. The operation itself composites each pass (TileHeader::pass), lays each over
-// TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order, empty ones too:
-// Fragment::empty().
+// TileInfo::background, and averages them; PassImages does the last two. Inputs come in any order. Empty ones come,
+// too: see Fragment::empty().
 //
 //   static constexpr ChannelMask channels;       the channels its inputs have (Tile<channels, tileSize>)
 //   void newFrame(const TileInfo&);              forget the last frame; or, with a FrameData,
@@ -65,21 +65,22 @@ DFB_NAMESPACE_BEGIN
 
 // The tile and the frame that newFrame() begins.
 struct TileInfo {
-    int rank = 0; // that owns the tile
+    int rank = 0; // the rank that owns the tile
     std::int64_t frame = 0;
     int tile = 0;
     Region region;                               // the tile's pixels
     int passes = 1;                              // samples a pixel; each pass has a dependency tree of its own
     int firstSample = 0;                         // the sample number of pass 0, over all frames that accumulate
     int emptySamples = 0;                        // the number of samples before it, if none of them had an input
-    std::uint64_t accumulationId = 0;            // another one: the samples accumulated before are of no use
+    std::uint64_t accumulationId = 0;            // if it changes, the samples accumulated before are of no use
     float minTransmittance = 0;                  // a pixel whose layers let less than this through counts as opaque
     ChannelMask wanted = 0;                      // channels of the image beside the colour
     std::array<float, 4> background{0, 0, 0, 0}; // premultiplied linear RGBA, behind everything
-    const SourceOrder* order = nullptr;          // FrameConfig::order; null without, and without takesOrder
+    const SourceOrder* order = nullptr;          // FrameConfig::order; null if that is null, or without takesOrder
 };
 
-// One row of the auxiliary channels of a finished tile; see channels.hpp for what they hold. Null: nothing anywhere.
+// One row of the auxiliary channels of a finished tile; see channels.hpp for what they hold. Null: the channel is empty
+// in the whole row.
 struct AuxRow {
     const float* normal = nullptr;
     const float* albedo = nullptr;
@@ -88,13 +89,13 @@ struct AuxRow {
     const std::uint32_t* instanceId = nullptr;
 };
 
-// Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way. Only within
-// TileOp::finish(), on its thread. Members that set pixels throw InvalidArgument, with nothing set, for pixels outside
-// the region.
+// Where a TileOp writes its result, row by row; the rows are rounded to the output format on the way. Use it only
+// within TileOp::finish(), on the thread of that call. Members that set pixels throw InvalidArgument, with nothing set,
+// for pixels outside the region.
 class FinishedTile {
 public:
-    // `to`: pixel (0, 0) of the region in each plane that is wanted, rows `stride` pixels apart, colour in `format`.
-    // `background`: which of these pixels are known to be background; may be null.
+    // `to` points to pixel (0, 0) of the region in each plane that is wanted. Rows are `stride` pixels apart; colour is
+    // in `format`. `background`: which of these pixels are known to be background; may be null.
     FinishedTile(const Region& region, OutputFormat format, const detail::Planes& to, std::size_t stride,
                  bool dither = false, detail::BackgroundPixels* background = nullptr)
         : region_(region), format_(format), to_(to), stride_(stride), dither_(dither), background_(background)
@@ -111,8 +112,8 @@ public:
     bool isDithered() const noexcept { return dither_; } // the colour, not alpha
     bool wantsDepth() const noexcept { return to_.at[detail::Depth] != nullptr; }
 
-    // Row y in [0, height()): 4 * width() premultiplied linear values and, if wantsDepth(), width() depths (null:
-    // all +infinity), and of the auxiliary channels those that the image has. Every row must be set once. Returns what
+    // Sets row y, in [0, height()): 4 * width() premultiplied linear values; if wantsDepth(), width() depths (null: all
+    // +infinity); and those auxiliary channels that the image has. Every row must be set once. Returns what
     // convertPixels() or ditherPixels() returns.
     template <class Real>
     double setRow(int y, const Real* rgba, const float* depth, const AuxRow& aux = {})
@@ -274,8 +275,8 @@ public:
         color_.assign(4 * pixels_ * passes_, 0.0);
     }
 
-    // The number of a pixel, for other values that an operation keeps of it: 0 to count() - 1. `pass` is
-    // TileHeader::pass; x and y count from the tile's upper left corner.
+    // The index of a pixel, 0 to count() - 1; also for arrays of other values that an operation keeps for each pixel.
+    // `pass` is TileHeader::pass; x and y count from the tile's upper left corner.
     std::size_t index(int pass, int x, int y) const noexcept
     {
         return static_cast<std::size_t>(pass) * pixels_ + static_cast<std::size_t>(y * width_ + x);
@@ -313,7 +314,7 @@ private:
 // Figures of a finished tile, which a TileOp sets in report() if it has that member.
 struct TileReport {
     double error = -1;                     // how far the tile's pixels may be off, in units of colour; < 0: not known
-    std::int64_t orderUndefinedPixels = 0; // whose inputs overlap in depth, so that no order of them is right
+    std::int64_t orderUndefinedPixels = 0; // pixels whose inputs overlap in depth, so that no order is right
 };
 
 struct NoFrameData {};
