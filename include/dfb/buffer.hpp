@@ -32,7 +32,7 @@ private:
     char text_[200];
 };
 
-// Where a block goes when its Buffer ends. From any thread.
+// Takes a block back when its Buffer is destroyed, on any thread.
 class BlockOwner {
 public:
     virtual void giveBack(std::byte* block, int sizeClass) noexcept = 0;
@@ -45,7 +45,7 @@ protected:
 class Buffer {
 public:
     Buffer() = default;
-    // `sizeClass` is the owner's own affair.
+    // `sizeClass` is passed to owner->giveBack() unchanged.
     Buffer(std::shared_ptr<BlockOwner> owner, std::byte* data, std::size_t size, int sizeClass) noexcept
         : block_(data, {std::move(owner), sizeClass}), size_(size)
     {
@@ -56,7 +56,7 @@ public:
     std::size_t size() const noexcept { return block_ ? size_ : 0; }
     bool empty() const noexcept { return size() == 0; }
 
-    // Makes the block count as shorter; the memory stays. `byteCount` must not exceed size().
+    // Reduces size(); the block keeps its memory. `byteCount` must not exceed size().
     void shrink(std::size_t byteCount) noexcept { size_ = byteCount < size_ ? byteCount : size_; }
 
 private:
@@ -71,15 +71,15 @@ private:
     std::size_t size_ = 0;
 };
 
-// Memory that other processes see as well, in which a pool may have its blocks; comm/node_memory.hpp is such. All
-// members may be called from any thread.
+// Memory that other processes see as well. A pool may take its blocks from it. See comm/node_memory.hpp. All members
+// may be called from any thread.
 class SharedMemory {
 public:
     // A block that is never given back, 64-byte aligned; null if there is no more.
     virtual std::byte* take(std::size_t byteCount) noexcept = 0;
     virtual bool holds(const std::byte* block) const noexcept = 0;
-    // Of a block that it holds: its owner lends it to another process; and whether that process has not yet given it
-    // back.
+    // For a block that it holds. lend(): its owner lends the block to another process. isLent(): whether that process
+    // has not given it back yet.
     virtual void lend(std::byte* block) noexcept = 0;
     virtual bool isLent(const std::byte* block) const noexcept = 0;
 
@@ -91,7 +91,7 @@ protected:
 // handle of the pool are gone. All members may be called from any thread.
 class MemoryPool final : public BlockOwner, public std::enable_shared_from_this<MemoryPool> {
 public:
-    static constexpr std::size_t smallestShared = 2048; // blocks below are never in memory that other processes see
+    static constexpr std::size_t smallestShared = 2048; // smaller blocks are never in memory that other processes see
 
     // `mayBeShared`: a transport may put its blocks into memory that other processes see.
     static std::shared_ptr<MemoryPool> create(bool mayBeShared = true)
@@ -143,7 +143,7 @@ public:
 
     bool mayBeShared() const noexcept { return mayBeShared_; }
 
-    // From now on larger blocks are in `memory`, as far as it has room. Once.
+    // Makes new blocks of smallestShared bytes or more come from `memory`, as far as it has room. Call it once.
     void share(std::shared_ptr<SharedMemory> memory)
     {
         std::lock_guard<std::mutex> lock(mutex_);
@@ -176,7 +176,7 @@ private:
 
     struct SizeClass {
         std::vector<std::byte*> free;
-        detail::Fifo<std::byte*> lent; // the longest ago first
+        detail::Fifo<std::byte*> lent; // oldest first
         std::size_t blocks = 0;
     };
 
@@ -209,7 +209,7 @@ private:
         }
     }
 
-    // A block that was lent and is back, or null. Does not look for it for long.
+    // A block that was lent and is back, or null. Looks at a few only.
     std::byte* returned(SizeClass& sizeClass)
     {
         detail::Fifo<std::byte*>& lent = sizeClass.lent;

@@ -26,7 +26,7 @@ public:
     // Forgets everything and expects `rootCount` inputs of generation 0 (the paper's background tile is one).
     void reset(int rootCount = 1)
     {
-        generations_.assign(2, {}); // nearly every tree has as many
+        generations_.assign(2, {}); // most trees have two generations
         inputs_.clear();
         declared_.clear();
         hasDeclaration_ = false;
@@ -110,8 +110,9 @@ public:
     struct Missing {
         int generation = 0;
         std::int64_t expected = 0, got = 0;
-        std::vector<Declared> inputs; // those that are known by name, because they were declared
-        // Else: the inputs that announced those of this generation, and those of it that have come.
+        std::vector<Declared> inputs; // those that are known, because they were declared
+        // Otherwise: the inputs that announced inputs of this generation, and the inputs of this generation that have
+        // come.
         std::vector<Declared> announcers, arrived;
 
         std::string text() const
@@ -153,7 +154,7 @@ private:
         int generation;
         std::uint32_t source;
         std::uint16_t part;
-        int rank, children; // do not tell it from others
+        int rank, children; // not part of its identity
         bool operator==(const Input& o) const
         {
             return generation == o.generation && source == o.source && part == o.part;
@@ -166,7 +167,8 @@ private:
         }
     };
 
-    // Sees to it that there is a generation `place`, with what has come of it. False if it is too far.
+    // Makes sure that generations_ has a generation `place`, with the inputs of it that have come. Returns false if it
+    // is too far ahead.
     bool reach(std::size_t place)
     {
         const std::size_t before = generations_.size();
@@ -174,7 +176,7 @@ private:
             return false;
         if (place < before)
             return true;
-        generations_.resize((place / 8 + 1) * 8); // whichever of them comes first, the same memory
+        generations_.resize((place / 8 + 1) * 8); // the same memory, whichever of these generations comes first
         for (auto input = firstFrom(static_cast<int>(before)); input != inputs_.end(); ++input) {
             const auto g = static_cast<std::size_t>(input->generation);
             if (g >= generations_.size())
@@ -185,13 +187,13 @@ private:
         return true;
     }
 
-    // The first input of a generation, or else of a later one.
+    // The first input of a generation, or, if it has none, of a later one.
     std::vector<Input>::const_iterator firstFrom(int generation) const
     {
         return std::lower_bound(inputs_.begin(), inputs_.end(), Input{generation, 0, 0, -1, 0});
     }
 
-    // Steps over every generation that is complete; the next one expects its children.
+    // Steps over every complete generation. The next one expects the children that it announced.
     void advance()
     {
         while (!closed_) {
@@ -226,7 +228,7 @@ private:
         fail(kind, generationIndex, isThere ? first->source : 0, isThere ? first->rank : -1, expected, got, "");
     }
 
-    // Two ranks, which may be one, or -1 if that is not known, have the same input.
+    // Fails because the same input came twice: from these two ranks, which may be equal, and are -1 if not known.
     [[noreturn]] static void failTwice(int generation, std::uint32_t source, std::uint16_t part, int rank,
                                        int otherRank)
     {
@@ -255,11 +257,11 @@ private:
         throw Error(std::move(info));
     }
 
-    // The most generations that one input may add: one with a wrong number must not take all memory.
+    // The most generations that one input may add: an input with a wrong generation must not take all memory.
     static constexpr std::size_t mostAhead = 64;
 
-    std::vector<Generation> generations_; // the first ones
-    std::vector<Input> inputs_;           // sorted; also of generations behind those
+    std::vector<Generation> generations_; // the first generations
+    std::vector<Input> inputs_;           // sorted; may have later generations than generations_
     std::vector<Input> declared_;         // sorted
     bool hasDeclaration_ = false;
     int current_ = 0; // the first generation that is not complete

@@ -23,7 +23,7 @@ class DisplayWall;
 
 // The pixel operation that sends tiles to a wall. Works after every tile operation, and as the last of a PixelOpChain.
 struct ToWall {
-    DisplayWall* wall = nullptr; // outlives the framebuffer
+    DisplayWall* wall = nullptr; // must outlive the framebuffer
 
     void newFrame(const NoFrameData&);
     void process(PixelTile& tile) const;
@@ -45,8 +45,8 @@ class DisplayWall {
 public:
     // Makes a wall whose displays show images in `format`. `executor` runs its work; null: threads of its own, beside
     // those of the framebuffers. `poolBytes`: as MessageConfig::poolBytes. Collective, in the same order as the
-    // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is
-    // wrong, if that, `format` or `poolBytes` differ between ranks, or if a rank has no memory for it.
+    // framebuffers of the connection. Waits for all ranks. Throws InvalidArgument on all ranks if the layout is wrong,
+    // if `layout`, `format` or `poolBytes` differ between ranks, or if a rank has no memory for it.
     DisplayWall(std::shared_ptr<Connection> connection, const WallLayout& layout, OutputFormat format,
                 std::shared_ptr<Executor> executor = {}, std::size_t poolBytes = std::size_t{64} << 20);
 
@@ -57,7 +57,7 @@ public:
 
     const WallLayout& layout() const noexcept { return layout_; }
 
-    // The configuration of a framebuffer of the wall's size, whose image goes to the wall alone.
+    // The configuration of a framebuffer of the wall's size, whose image goes to the wall only.
     FrameBufferConfig frameBufferConfig() const
     {
         FrameBufferConfig config;
@@ -67,24 +67,25 @@ public:
         return config;
     }
 
-    // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective,
-    // after the frame has ended, in the order of the frames, once for each. All frames of a wall are of one
-    // framebuffer. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks: TimedOut
-    // if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have not sent
-    // all of it, because it failed or was partial; MalformedMessage if a part of it cannot be right. The displays then
-    // keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread that may not
-    // call MPI, or for a frame that is not later than the last.
+    // Waits until all displays have frame number `frame`: that is the moment to show it on all of them. Collective.
+    // Call it once for each frame, after the frame has ended, in the order of the frames. All frames of a wall must be
+    // of one framebuffer. Waits for all ranks to call it, whatever `timeout` is. Throws Error, the same on all ranks:
+    // TimedOut if a display has not got the whole frame within `timeout` (0: no limit); MissingInput if the ranks have
+    // not sent all of it, because it failed or was partial; MalformedMessage if a part of it cannot be right. The
+    // displays then keep their picture. Throws TransportError if the connection fails, and InvalidArgument on a thread
+    // that may not call MPI, or for a frame that is not later than the last.
     void finish(std::int64_t frame, std::chrono::milliseconds timeout = std::chrono::milliseconds(0));
 
     // The image of a display of this rank: the last frame that was finished well, until the next one is. Empty before
-    // the first. By the thread that calls finish(). Throws InvalidArgument if another rank drives the display.
+    // the first. Only the thread that calls finish() may call it. Throws InvalidArgument if another rank drives the
+    // display.
     const Image& image(int display) const;
 
-    // The number of the frame that all displays show, as in FrameReport::frame; -1 before the first. By the thread that
-    // calls finish().
+    // The number of the frame that all displays show, as in FrameReport::frame; -1 before the first. Only the thread
+    // that calls finish() may call it.
     std::int64_t imageFrame() const noexcept;
 
-    // Called by ToWall: in each begin(), and from any thread.
+    // ToWall calls these: begin() in each begin() of the framebuffer, put() from any thread.
     void begin();
     void put(const PixelTile& tile);
 

@@ -28,8 +28,7 @@ inline std::string printed(const char* format, std::va_list values)
     return text;
 }
 
-// The text that printf() would write. It takes less of a compiler's time than sums of strings, and there are many of
-// them.
+// The text that printf() would write. It compiles faster than concatenated strings, of which there would be many.
 [[gnu::format(printf, 1, 2)]] inline std::string printed(const char* format, ...)
 {
     std::va_list values;
@@ -42,7 +41,7 @@ inline std::string printed(const char* format, std::va_list values)
 } // namespace detail
 
 enum class ErrorKind : std::uint32_t {
-    InvalidArgument,  // a call with a wrong argument; in a FrameError one between begin() and end()
+    InvalidArgument,  // a call with a wrong argument; in a FrameError: a call between begin() and end()
     TooManyInputs,    // a generation has received more inputs than were announced for it
     DuplicateInput,   // the same (pass, generation, source, part) came twice for one tile
     UnannouncedInput, // an input of a generation or source that nobody announced
@@ -82,7 +81,7 @@ struct ErrorInfo {
     // is lost. For wrong or missing inputs and messages: the rank that noticed, which need not be the one to blame.
     int rank = -1;
     // The rank that the input or message came from. If something did not come (TimedOut, MissingInput, Transport): the
-    // rank that it should come from; for a missing input of a tile, the rank that announced it.
+    // rank that should have sent it; for a missing input of a tile, the rank that announced it.
     int from = -1;
     std::int64_t frame = -1;
     std::int64_t tile = -1;
@@ -148,7 +147,7 @@ inline ErrorInfo errorInfo(ErrorKind kind, std::string message, int rank = -1)
 
 class Error : public std::runtime_error {
 public:
-    // `whileThrown` lives as long as the exception does.
+    // The exception keeps `whileThrown` alive.
     explicit Error(ErrorInfo info, std::shared_ptr<const void> whileThrown = {})
         : std::runtime_error(info.describe()), info_(std::move(info)), whileThrown_(std::move(whileThrown))
     {
@@ -188,7 +187,7 @@ public:
 
 namespace detail {
 
-// Throws InvalidArgument, with what printf() would write.
+// Throws InvalidArgument, with the text that printf() would write.
 [[noreturn, gnu::format(printf, 1, 2)]] inline void failArgument(const char* format, ...)
 {
     std::va_list values;

@@ -1,5 +1,5 @@
-// Executor: runs the tasks of a framebuffer and the loops of a renderer. ThreadExecutor: on std::threads of
-// its own. CallerExecutor: on the threads that call. (TbbExecutor, in tbb_executor.hpp: in a oneTBB arena of its own.)
+// Executor: runs the tasks of a framebuffer and the loops of a renderer. A ThreadExecutor runs them on std::threads of
+// its own, a CallerExecutor on the threads that call it, a TbbExecutor (tbb_executor.hpp) in a oneTBB arena of its own.
 #pragma once
 
 #include <dfb/base/cpu.hpp>
@@ -26,7 +26,7 @@ public:
     using Task = std::function<void()>;
 
     virtual ~Executor() = default;
-    Executor() { tasks_.reserve(256); } // how many wait at once depends on time: mostly no more
+    Executor() { tasks_.reserve(256); } // more tasks rarely wait at once
     Executor(const Executor&) = delete;
     Executor& operator=(const Executor&) = delete;
 
@@ -47,8 +47,8 @@ public:
         wake();
     }
 
-    // Runs the oldest waiting task on the calling thread, and returns when it has ended. For threads that wait
-    // themselves. Any thread. Returns false, at once, if no task waits.
+    // Runs the oldest waiting task on the calling thread, and returns when it has ended. For threads that have to wait
+    // for something. Any thread. Returns false, at once, if no task waits.
     bool help()
     {
         Task task;
@@ -63,15 +63,15 @@ public:
         --depth();
         return true;
     }
-    bool hasTasks() // that wait; from any thread
+    bool hasTasks() // whether a task waits; any thread
     {
         const std::lock_guard<std::mutex> lock(mutex_);
         return !tasks_.empty();
     }
 
     // Calls body(i) for i in [0, count), in no particular order, on several workers at once. Any thread may call it,
-    // several at once. Waits until all have returned. In a task of a ThreadExecutor, the loop runs on the thread of
-    // that task. Rethrows the first exception of a body; after it no other body begins.
+    // several at once. Waits until all these calls have returned. In a task of a ThreadExecutor, the loop runs on the
+    // thread of that task. Rethrows the first exception of a body; after it no other body begins.
     void parallelFor(std::size_t count, const std::function<void(std::size_t)>& body)
     {
         if (count == 0)
@@ -90,23 +90,23 @@ public:
                     error = std::current_exception();
                 stop.store(true, std::memory_order_relaxed);
             }
-            // Not within a task: tasks that have loops would nest without a limit.
+            // Not within a task: otherwise tasks that contain loops would nest without a limit.
             while (depth() == 0 && help()) {
             }
         };
-        run(count, std::ref(guarded)); // which, unlike a copy, takes no memory
+        run(count, std::ref(guarded)); // std::ref, unlike a copy, takes no memory
         if (error)
             std::rethrow_exception(error);
     }
 
 protected:
-    // Sees to it that a worker calls help() soon.
+    // Makes a worker call help() soon.
     virtual void wake() = 0;
     // Calls body(i) for all i on the workers, and waits. The body does not throw.
     virtual void run(std::size_t count, const std::function<void(std::size_t)>& body) = 0;
 
 private:
-    // Of tasks that the calling thread is in.
+    // How many tasks, one within the other, the calling thread is running.
     static int& depth() noexcept
     {
         static thread_local int depth = 0;
@@ -244,9 +244,10 @@ private:
     std::vector<std::thread> threads_;
 };
 
-// No threads of its own. Loops run on the thread that calls parallelFor(). Tasks run there between two iterations, in
-// setTile(), in poll(), and on a thread that waits for a frame. For ranks that have one core each. With
-// Progress::Caller as well, the library does nothing while the program does not call it, and other ranks may wait.
+// Has no threads of its own. Loops run on the thread that calls parallelFor(). Tasks run on that thread between two
+// iterations, on threads that call setTile() or poll(), and on a thread that waits for a frame. For ranks that have one
+// core each. With Progress::Caller as well, the library does nothing while the program does not call it, and other
+// ranks may wait.
 class CallerExecutor final : public Executor {
 public:
     CallerExecutor() = default;

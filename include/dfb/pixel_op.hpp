@@ -50,7 +50,7 @@ DFB_DETECTS(has_pixel_new_frame_v, std::declval<T&>().newFrame(std::declval<cons
 template <class T>
 inline constexpr bool is_pixel_op_v = std::is_copy_constructible_v<T>&& detail::has_process_v<T>;
 
-// Leaves the tile as it is: it is rounded to the output format straight from double.
+// Leaves the tile as it is. The tile is then rounded to the output format directly from double.
 struct NoPixelOp {
     static constexpr bool pointwise = true;
     void process(PixelTile&) const noexcept {}
@@ -72,8 +72,8 @@ constexpr bool checkPixelOp()
 } // namespace detail
 
 // Exposure, then Reinhard's global operator on the colour divided by alpha: c -> k c / (1 + k c), c = colour / alpha
-// (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. Pixels of
-// alpha 0 are treated as if it were 1, so that emission is kept.
+// (Reinhard et al., "Photographic Tone Reproduction for Digital Images", 2002, equation 3). Alpha stays. In pixels
+// whose alpha is 0, 1 is used in its place, so that emission is kept.
 struct ToneMap {
     static constexpr bool pointwise = true;
     struct FrameData {
@@ -98,7 +98,7 @@ private:
     float exposure_ = 1.0f;
 };
 
-// First, then Second.
+// Applies First, then Second.
 template <class First, class Second>
 struct PixelOpChain {
     static constexpr bool pointwise = detail::is_pointwise_v<First> && detail::is_pointwise_v<Second>;

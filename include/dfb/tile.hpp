@@ -26,7 +26,7 @@ struct TileHeader {
     int children = 0;         // how many inputs of generation + 1 this one announces
     std::uint32_t source = 0; // brick id; the rank where there are no bricks
     std::uint16_t part = 0;   // to tell apart several inputs of one source
-    int sample = 0;           // sample number over all frames that accumulate: the index to seed with; set by Frame::start
+    int sample = 0;           // sample number over all frames that accumulate: the index to seed with; set by start
 };
 
 // An order of the sources of inputs, from front to back.

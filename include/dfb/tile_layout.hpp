@@ -56,7 +56,8 @@ public:
         return {x0, y0, std::min(x0 + tileWidth_, width_), std::min(y0 + tileHeight_, height_)};
     }
 
-    // The columns and rows of tiles that meet a region of pixels, half-open; empty if they miss the image.
+    // The tiles that meet a region of pixels, as half-open ranges of tile columns (x) and tile rows (y). Empty if the
+    // region is outside the image.
     Region tilesIn(const Region& pixels) const noexcept
     {
         const Region r = intersection(pixels, {0, 0, width_, height_});
@@ -109,15 +110,16 @@ inline int hashOwner(int tile, const TileLayout&, int rankCount)
 
 // WallLayout: where the displays of a wall are, and which ranks drive them.
 //
-// Displays of equal size in columns and rows, 0 at the upper left, row by row. The framebuffer has the pixels of all of
-// them and those behind the bezels between them, so that a line that crosses a bezel goes on straight.
+// The displays have one size and stand in columns and rows. They are numbered row by row, from 0 at the upper left. The
+// framebuffer has the pixels of all of them and those behind the bezels between them, so that a line that crosses a
+// bezel goes on straight.
 struct WallLayout {
     int columns = 1, rows = 1;
     int displayWidth = 0, displayHeight = 0; // pixels
     int bezelX = 0, bezelY = 0;              // pixels that are not seen between two displays
     std::vector<int> ranks;                  // for each display the rank that drives it; one may drive several, or none
 
-    // Of the framebuffer.
+    // The size of the framebuffer, in pixels.
     int width() const noexcept { return columns * displayWidth + (columns - 1) * bezelX; }
     int height() const noexcept { return rows * displayHeight + (rows - 1) * bezelY; }
     int displayCount() const noexcept { return columns * rows; }

@@ -15,12 +15,12 @@ struct TraceEvent {
     using Clock = std::chrono::steady_clock;
 
     enum class Kind : std::uint8_t {
-        // Of a frame, told at its end, also if it failed:
+        // Spans of a frame, reported at its end, even if it failed:
         Frame,   // begin() to the return of end(): FrameReport::totalMs
         Render,  // begin() to the call of end(): renderMs
         End,     // the call of end() to its return: compositingOverheadMs
-        Verdict, // this rank's vote to the verdict of all; byteCount: this rank's part of FrameReport::bytesSent
-        // Of a thread, which reports them itself. Two spans of a thread are nested, or do not overlap:
+        Verdict, // from this rank's vote to the verdict of all; byteCount: this rank's part of FrameReport::bytesSent
+        // Spans of a thread, which reports them itself. Two spans of a thread are nested, or do not overlap:
         Tile,    // a job of Frame::forEachTile()
         SetTile, // Frame::setTile(): the input is encoded and sent, or taken by this rank
         Input,   // an input is taken by the owner of its tile: TileOp::add(). peer: whose message it is, or -1
@@ -31,12 +31,12 @@ struct TraceEvent {
     };
 
     Kind kind = Kind::Frame;
-    std::uint8_t message = 0; // of Send and Receive: what it is, a detail::MessageKind
+    std::uint8_t message = 0; // for Send and Receive: a detail::MessageKind
     Clock::time_point begin{}, end{};
-    std::int64_t frame = -1; // its number; -1: of none
+    std::int64_t frame = -1; // the frame's number; -1: it belongs to no frame
     std::int64_t byteCount = 0;
     std::int32_t tile = -1, peer = -1; // -1: none
-    // Of Send and Receive: with both ranks it says which message of a connection it is.
+    // For Send and Receive: together with both ranks, this identifies a message of a connection.
     std::uint32_t sequence = 0;
 };
 
@@ -50,7 +50,7 @@ public:
 
 namespace detail {
 
-// Tells a sink, if there is one, of the time from its construction to its end.
+// Reports the time from its construction to its destruction to a sink, if there is one.
 class TraceSpan {
 public:
     TraceSpan(TraceSink* sink, TraceEvent::Kind kind, std::int64_t frame, std::int64_t tile = -1)

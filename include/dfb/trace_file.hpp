@@ -31,14 +31,14 @@ DFB_NAMESPACE_BEGIN
 
 namespace detail {
 
-// An event, and which thread of its rank told it.
+// An event, and which thread of its rank reported it.
 struct TraceRecord {
     TraceEvent event;
     std::int32_t thread = 0; // from 0
 };
 static_assert(std::is_trivially_copyable_v<TraceRecord>); // it travels as it is
 
-// The records of all ranks, by rank; on one clock; as text.
+// Writes the records of all ranks as text, with their times on one clock.
 class TraceWriter {
 public:
     using Duration = TraceEvent::Clock::duration;
@@ -92,7 +92,7 @@ private:
             for (const TraceRecord& r : ranks_[rank]) {
                 const auto peer = static_cast<std::size_t>(r.event.peer);
                 if (peer == rank)
-                    continue; // it had no way to go
+                    continue; // it did not travel
                 if (r.event.kind == TraceEvent::Kind::Send)
                     messages_[{rank, peer, r.event.sequence}].sent = &r;
                 else if (r.event.kind == TraceEvent::Kind::Receive)
@@ -100,8 +100,9 @@ private:
             }
     }
 
-    // No message is received before it is sent. So each limits how far one clock can be ahead of another, and so does a
-    // chain of messages. The middle between the limits of chains from and to rank 0 keeps all of them.
+    // No message is received before it is sent. So each message limits how far the clock of one rank can be ahead of
+    // another's, and so does a chain of messages. Chains from and to rank 0 give each rank a lower and an upper limit.
+    // The middle between these satisfies all limits.
     void alignClocks()
     {
         std::map<std::pair<std::size_t, std::size_t>, Duration> shortest; // by sender and receiver
@@ -147,7 +148,7 @@ private:
             return x.begin != y.begin ? x.begin < y.begin : x.end != y.end ? x.end > y.end : x.kind < y.kind;
         });
         std::set<int> named;
-        std::vector<std::vector<TraceEvent>> open; // by row of frames: those that are not over, one in another
+        std::vector<std::vector<TraceEvent>> open; // for each row of frames: the events that are not over, nested
         for (const TraceRecord& r : records) {
             const TraceEvent& e = r.event;
             const bool isThread = e.kind > TraceEvent::Kind::Verdict;
@@ -156,7 +157,8 @@ private:
                 out << printed(",\n{\"ph\": \"M\", \"name\": \"thread_name\", \"pid\": %d, \"tid\": %d, \"args\": "
                                "{\"name\": \"%s %d\"}}",
                                pid, row, isThread ? "thread" : "frames", isThread ? r.thread : row);
-            // Viewers add duration to begin: by rounding, a span must not overlap one that begins when it ends.
+            // Viewers add the duration to the begin, and round. 1 ns less keeps a span from overlapping one that begins
+            // when it ends.
             const bool isPart = e.kind != TraceEvent::Kind::Frame && e.end > e.begin;
             const Duration lasts = e.end - e.begin - std::chrono::nanoseconds(isPart ? 1 : 0);
             out << ",\n{\"ph\": \"X\", \"name\": \"" << nameOf(e) << '"' << place(rank, row, e.begin)
@@ -186,7 +188,7 @@ private:
             return static_cast<int>(row);
         }
     }
-    static int rowOf(const TraceRecord& r) { return 1000 + r.thread; } // after those of frames
+    static int rowOf(const TraceRecord& r) { return 1000 + r.thread; } // after the rows of frames
 
     std::string place(std::size_t rank, int row, Time time) const
     {
@@ -248,8 +250,8 @@ public:
         ++dropped_;
     }
 
-    // Writes the file on rank 0, and forgets the events, also if that fails. Collective, outside frames, on the thread
-    // that begins frames; waits for all ranks, without a time-out. `fb`: one of the framebuffers, or an
+    // Writes the file on rank 0, and forgets the events, even if that fails. Collective, outside frames, on the thread
+    // that begins frames. Waits for all ranks, without a time-out. `fb`: one of the framebuffers, or an
     // ImageCompositor. Each rank gets the events of all, and needs memory for them. Throws InvalidArgument on all ranks
     // if the file cannot be written; TransportError; and std::bad_alloc on a rank that lacks memory.
     template <class FrameBuffer>
@@ -257,9 +259,9 @@ public:
     {
         {
             const std::lock_guard<std::mutex> lock(mutex_);
-            capacity_ = std::max(capacity_, records_.size() + 10'000); // for what comes now
+            capacity_ = std::max(capacity_, records_.size() + 10'000); // room for the events of this call
         }
-        constexpr int rounds = 20; // of messages by which clocks are compared: some are quick
+        constexpr int rounds = 20; // of messages to compare clocks by: the quickest ones tell most
         for (int round = 0; round < rounds; ++round)
             fb.allGather({});
         const std::vector<std::vector<std::byte>> parts = fb.allGather(take());
@@ -280,7 +282,7 @@ public:
     }
 
 private:
-    // Of this rank, as bytes: the number of events that were dropped, and the records.
+    // Returns, as bytes, the number of events that this rank dropped, and its records; and forgets them.
     std::vector<std::byte> take()
     {
         const std::lock_guard<std::mutex> lock(mutex_);
