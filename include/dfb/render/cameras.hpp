@@ -1,7 +1,7 @@
 // Cameras beyond the pinhole: matrices, depth of field, stereo, domes, motion blur (section 4.2 of the paper). ray() is
 // the ray through a point of the image, with sample numbers for lens and time. project() says which pixels a box may
-// cover. Make the sample numbers of pixel, sample and seed alone: then all bricks are seen along the same ray. Each
-// sample is a pass. Any thread may call any member, several at once.
+// cover. Compute the sample numbers from pixel, sample and seed alone: then all bricks are seen along the same ray.
+// Each sample is a pass. Any thread may call any member, several at once.
 //
 // Points of the image are in pixels, pixel centres at .5; sample numbers are in [0, 1); angles in degrees.
 #pragma once
@@ -20,8 +20,9 @@ DFB_NAMESPACE_BEGIN
 // A camera as most toolkits have it, from a view matrix and a projection matrix: perspective, off-axis or orthographic.
 //
 // Matrices are 4x4, column by column, as OpenGL takes them: row r of column c is at [4 * c + r]. VTK's vtkMatrix4x4
-// lies row by row: transpose it. Clip coordinates as in OpenGL: -w to w is the image from left to right in x, from its
-// lowest row to its uppermost in y. The far plane cuts nothing off, the near plane only orthographic rays.
+// lies row by row: transpose it. Clip coordinates are as in OpenGL: -w to w is the image from left to right in x, and
+// from its lowest row to its uppermost in y. The far plane cuts nothing off. The near plane cuts off orthographic rays
+// only, which begin there.
 class MatrixCamera {
 public:
     // Each has 16 numbers. Throws InvalidArgument if one is not finite or the matrices make no image.
@@ -55,7 +56,7 @@ public:
     // Whether all rays have one direction.
     bool isOrthographic() const noexcept { return isOrthographic_; }
 
-    // Where all rays begin. Of no use for an orthographic camera.
+    // The point where all rays begin. It has no meaning for an orthographic camera.
     Vec3 eye() const noexcept { return toFloat(eye_); }
     // See dfb/render/visibility.hpp.
     std::optional<Vec3> commonEye() const
@@ -111,7 +112,7 @@ private:
         double at(const Vec3d& p) const { return dot(normal, p) + offset; }
     };
 
-    // Where `row` is `k` times w.
+    // The plane where `row` is `k` times w.
     Plane through(const Plane& row, double k) const
     {
         return {row.normal - k * rows_[3].normal, row.offset - k * rows_[3].offset};
@@ -164,8 +165,8 @@ private:
     double radius_, focus_;
 };
 
-// Two eyes side by side: the left half of the image is the left one's, the right half the right one's. They are
-// `separation` apart. A point at `convergence` along the view is at the same place in both halves.
+// Two eyes side by side: the left half of the image shows what the left eye sees, the right half what the right eye
+// sees. The eyes are `separation` apart. A point at `convergence` along the view is at the same place in both halves.
 class StereoCamera {
 public:
     // Looks along `view`, of any length; `fovY` is that of each half. `convergence` may be infinite: the eyes then look
@@ -189,7 +190,7 @@ public:
         return {toFloat(pose_.eye + aside), toFloat(normalize(to - (1 / convergence_) * aside))};
     }
 
-    // One per eye, each in its half.
+    // Returns a footprint for each eye, in its half of the image.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {
         const double scale = 0.5 * height / pose_.tangent;
@@ -210,8 +211,8 @@ private:
     double separation_, convergence_;
 };
 
-// An equidistant fisheye for domes: a circle as large as fits into the image, its middle along the view, its border
-// `angle` / 2 off it; nothing is seen outside.
+// An equidistant fisheye for domes. It shows a circle as large as fits into the image. The centre of the circle is
+// along the view, its border is `angle` / 2 off the view, and nothing is seen outside.
 class DomeCamera {
 public:
     // Throws InvalidArgument for an angle that is not in (0, 360] degrees, if `view` is 0 or `up` is 0 or along it, or
@@ -238,7 +239,8 @@ public:
 
     // Returns the image of a sphere around the box, widened to an octagon; the whole image if the eye is in the sphere
     // or the box is near the point behind the eye; nothing if the box is outside the dome. Distances along a radius of
-    // the image are true to angles; across, at theta off the view, they are stretched by theta / sin(theta).
+    // the image are proportional to angles. Distances across the radius, at the angle theta off the view, are stretched
+    // by theta / sin(theta).
     Footprint project(const Box3& bounds, int width, int height) const
     {
         const Vec3d lower = detail::cornerOf(bounds, 0), upper = detail::cornerOf(bounds, 7);
@@ -252,7 +254,7 @@ public:
                      theta = std::atan2(std::hypot(x, y), dot(to, pose_.forward)), farthest = theta + half;
         if (theta - half > border_)
             return {};
-        if (farthest > 2.6) // near the point behind, which is stretched to a circle
+        if (farthest > 2.6) // near the point behind the eye, which is stretched to a circle
             return Footprint::whole(width, height);
         const double scale = 0.5 * std::min(width, height) / border_, aside = std::hypot(x, y);
         const double cx = 0.5 * width + (aside > 0 ? scale * theta * x / aside : 0),
@@ -293,8 +295,8 @@ public:
         return {toFloat(pose.eye), toFloat(normalize(pose.through(x, y, width, height)))};
     }
 
-    // Returns a footprint for each part of the time that the shutter is open. A turn of the camera moves the image as a
-    // turn of the world the other way does. So a point at distance rho from the axis is never farther than rho times
+    // Returns a footprint for each part of the time that the shutter is open. Turning the camera moves the image as
+    // turning the world the other way does. So a point at distance rho from the axis is never farther than rho times
     // half the part's angle from its place in the middle of that part.
     std::vector<Footprint> project(const Box3& bounds, int width, int height) const
     {

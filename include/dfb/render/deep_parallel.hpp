@@ -27,16 +27,17 @@ struct Segment {
 };
 
 // A tile whose pixels may have several segments, all of one brick. A segment is what the brick contributes along one
-// piece of a ray. In the gaps between its segments other bricks may have theirs. A pixel keeps at most `maxSegments`,
-// which bounds memory and messages. If one more is added, two neighbours are merged: those that change the pixel least.
-// A merge is exact unless another brick has something between the two. Then that layer (c', a') is blended behind both.
-// This puts the pixel off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the part of the
-// light that passes the brick's segments in front of it. This is at most T max(a2, |c2|) for colours with c' <= a' <=
-// 1. The sum over all merges bounds the error of a pixel: errorBound(). Where c' is more than a', multiply it by the
-// largest c' / a'.
+// piece of a ray. Other bricks may have segments in the gaps between them. A pixel keeps at most `maxSegments`, which
+// bounds memory and messages. If one more is added, two neighbours are merged: those whose merge may change the pixel
+// least. A merge is exact unless another brick has something between the two. Then that layer (c', a') is blended
+// behind both. This puts the pixel off by T |c' a2 - c2 a'|, where (c2, a2) is the farther of the two, and T is the
+// part of the light that passes the brick's segments in front of it. This is at most T max(a2, |c2|) for colours with
+// c' <= a' <= 1. The sum over all merges bounds the error of a pixel: errorBound(). Where c' is more than a', multiply
+// it by the largest c' / a'.
 class DeepTile {
 public:
-    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. For one thread at a time.
+    // `maxSegments`: segments a pixel, 1 to 65535. Less counts as 1, more as 65535. One thread at a time may use the
+    // tile.
     explicit DeepTile(int maxSegments) : maxSegments_(std::clamp(maxSegments, 1, 65535)) {}
 
     int maxSegments() const noexcept { return maxSegments_; }
@@ -57,8 +58,7 @@ public:
     const TileHeader& header() const noexcept { return header_; }
 
     // Adds a segment to pixel (x, y) of the image, which is in the tile's region. Segments of one pixel come in any
-    // order and should not overlap. One that has no colour and no alpha is left out. One thread at a time; nobody
-    // checks x and y.
+    // order and should not overlap. A segment without colour and alpha is left out. Nobody checks x and y.
     void add(int x, int y, const Segment& segment)
     {
         if (segment.rgba == std::array<float, 4>{})
@@ -84,7 +84,7 @@ public:
     // The largest number of segments of a pixel, at most maxSegments().
     int layers() const noexcept { return layers_; }
 
-    // How much merging may have changed a pixel, at most; see above.
+    // How much merging may have changed a pixel, at most: see DeepTile.
     double errorBound() const noexcept { return errorBound_; }
 
     // Writes segment `layer` of each pixel, counted from 0 at the front, into a cleared tile of the same region; pixels
@@ -110,7 +110,7 @@ public:
 private:
     static bool nearer(const Segment& a, const Segment& b) { return a.depth < b.depth; }
 
-    // Merges two neighbours; returns by how much that may change the pixel.
+    // Merges the two neighbours whose merge may change the pixel least, and returns by how much.
     static double mergeCheapest(std::vector<Segment>& all)
     {
         std::size_t best = 0;
@@ -136,7 +136,7 @@ private:
         return bestCost;
     }
 
-    // Counted in the region.
+    // x and y count from the corner of the region.
     std::size_t pixelAt(int x, int y) const { return static_cast<std::size_t>(y * header_.region.width() + x); }
 
     int maxSegments_;
@@ -149,20 +149,20 @@ private:
     double errorBound_ = 0;
 };
 
-// Sorts segments, also those of one brick, and counts the pixels in which some overlap:
-// FrameReport::orderUndefinedPixels.
+// Sorts all segments, including those of one brick. FrameReport::orderUndefinedPixels counts the pixels in which some
+// overlap.
 template <int TileSize = 64>
 using BasicDeepBlend = BasicAlphaBlend<TileSize, colorChannel | depthChannel | farChannel>;
 using DeepBlend = BasicDeepBlend<>;
 
-// As DataParallelLoop, with bricks that may overlap: their bounds enclose their data. The operation of the framebuffer
-// is DeepBlend, or another with depth and farChannel. Framebuffer and world must outlive it. One thread at a time may
-// use it.
+// Like DataParallelLoop, for bricks that may overlap: the bounds of a brick need only enclose its data. The operation
+// of the framebuffer is DeepBlend, or another with depth and farChannel. Framebuffer and world must outlive it. One
+// thread at a time may use it.
 template <class FrameBuffer>
 class DeepParallelLoop {
 public:
-    // Each pixel of a brick keeps `maxSegments` at most. Not collective. Waits for nothing. Throws InvalidArgument if
-    // they are not 1 to 65535.
+    // Each pixel of a brick keeps at most `maxSegments` segments. Not collective. Waits for nothing. Throws
+    // InvalidArgument if `maxSegments` is not 1 to 65535.
     DeepParallelLoop(FrameBuffer& fb, const World& world, int maxSegments)
         : fb_(fb), world_(world), maxSegments_(maxSegments)
     {

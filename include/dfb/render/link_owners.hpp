@@ -1,5 +1,5 @@
-// LinkOwners: gives the tiles of a frame to ranks such that little goes from node to node, and no link has much more to
-// carry than the others.
+// LinkOwners: gives the tiles of a frame to ranks so that few bytes go from node to node, and no link carries many more
+// than the others.
 #pragma once
 
 #include <dfb/base/function_ref.hpp>
@@ -19,10 +19,10 @@ DFB_NAMESPACE_BEGIN
 namespace detail {
 
 // All ranks call the same members with the same values, and get the same owners: no message is needed. Keeps its memory
-// from frame to frame. The owners of a frame: start(), add() for all pixels that somebody has, find().
+// from frame to frame. For each frame, call start(), then add() for all pixels that some rank has, then find().
 class LinkOwners {
 public:
-    // `nodeOf`: of each rank, the lowest rank of its node.
+    // `nodeOf`: for each rank, the lowest rank of its node.
     explicit LinkOwners(const std::vector<int>& nodeOf)
         : nodeOf_(nodeOf), ranksOf_(nodeOf.size()), links_(nodeOf.size()), work_(nodeOf.size())
     {
@@ -30,7 +30,7 @@ public:
             ranksOf_[static_cast<std::size_t>(nodeOf[rank])].push_back(static_cast<int>(rank));
     }
 
-    // On one node, any owner is as near as another.
+    // On one node, any owner is as near to the pixels as another.
     bool isOneNode() const { return ranksOf_.empty() || ranksOf_.front().size() == nodeOf_.size(); }
 
     void start(const TileLayout& layout)
@@ -48,8 +48,8 @@ public:
         ++first_[static_cast<std::size_t>(tile) + 1];
     }
 
-    // Returns the owners of tiles that have pixels. `hasDepth`: inputs have. `elsewhere(tile)` gives the owners of the
-    // other tiles.
+    // Returns the owner of each tile. `hasDepth`: whether inputs have depth. `elsewhere(tile)` gives the owners of
+    // tiles without pixels.
     TileOwners find(const FrameBufferConfig& config, bool hasDepth, FunctionRef<int(int)> elsewhere);
 
 private:
@@ -59,7 +59,7 @@ private:
         std::size_t rankCount = 0;
         double pixels = 0;
     };
-    struct Link { // of a node, bytes
+    struct Link { // the bytes into and out of a node
         double in = 0, out = 0;
     };
 
@@ -86,8 +86,8 @@ private:
         from_.emplace_back(node, bytes);
     }
 
-    // Calls f(load, bytes) for the loads of links that the inputs in from_ and the finished tile add to, with the owner
-    // on a node.
+    // Calls f(load, bytes) for each load of a link to which the inputs in from_ or the finished tile add bytes, if the
+    // owner is on `node`.
     template <class F>
     void forEachLoad(int node, double finished, const F& f)
     {
@@ -107,7 +107,7 @@ private:
     {
         forEachLoad(node, finished, [sign](double& load, double bytes) { load += sign * bytes; });
     }
-    // How much the sum of the squares grows.
+    // How much the sum of the squares of all loads grows with an owner on `node`.
     double costOf(int node, double finished)
     {
         double cost = 0;
@@ -120,13 +120,13 @@ private:
     std::vector<int> nodeOf_;
     std::vector<std::vector<int>> ranksOf_; // of each node
     TileLayout layout_;
-    double inputBytes_ = 0, imageBytes_ = 0; // of a pixel on the way to the owner, and to the display rank
+    double inputBytes_ = 0, imageBytes_ = 0; // bytes of a pixel: to the owner, and to the display rank
     int displayNode_ = 0;
     std::vector<Part> found_, parts_;          // parts_: tile by tile
-    std::vector<std::size_t> first_, next_;    // of each tile in parts_
-    std::vector<std::pair<int, double>> from_; // nodes, and the bytes of a tile that come from there
+    std::vector<std::size_t> first_, next_;    // for each tile, an index into parts_
+    std::vector<std::pair<int, double>> from_; // nodes, and how many bytes of a tile come from each
     std::vector<Link> links_;                  // of each node
-    std::vector<double> work_;                 // of each rank: pixels
+    std::vector<double> work_;                 // pixels that each rank has to blend
     std::vector<int> nodes_, owners_;          // of each tile
     TileOwners last_;
     std::vector<std::shared_ptr<std::vector<int>>> lists_;
@@ -156,7 +156,7 @@ DFB_COMPILED_ONCE TileOwners LinkOwners::find(const FrameBufferConfig& config, b
     return last_;
 }
 
-// Frames that are open have lists of theirs.
+// Returns owners_ in a list that no open frame uses.
 DFB_COMPILED_ONCE TileOwners LinkOwners::keep()
 {
     for (const auto& list : lists_)
@@ -178,8 +178,8 @@ DFB_COMPILED_ONCE void LinkOwners::sortByTile()
         parts_[next_[static_cast<std::size_t>(part.tile)]++] = part;
 }
 
-// Takes a tile to the node with which the sum of the squares of all links' loads is least: one that has pixels of
-// it, or that of the display rank.
+// Gives a tile to the node with which the sum of the squares of all links' loads is least. The node has pixels of the
+// tile, or is that of the display rank.
 DFB_COMPILED_ONCE void LinkOwners::place(int tile)
 {
     double pixels = 0;
@@ -204,7 +204,7 @@ DFB_COMPILED_ONCE void LinkOwners::place(int tile)
     carry(node, finished, 1);
 }
 
-// Of the ranks of the tile's node, the one with the fewest pixels to blend.
+// Returns the rank on the tile's node that has the fewest pixels to blend.
 DFB_COMPILED_ONCE int LinkOwners::leastBusy(int tile)
 {
     const auto& ranks = ranksOf_[static_cast<std::size_t>(nodes_[static_cast<std::size_t>(tile)])];

@@ -61,7 +61,7 @@ struct Job {
     int pass = 0;
 };
 
-// A job for each pass of each of some items, numbered item by item.
+// Makes a job of each pass of some items. Jobs are numbered item by item.
 class PassJobs {
 public:
     // `passesOf(item)`: how many passes an item has.
@@ -83,7 +83,7 @@ public:
     }
 
 private:
-    std::vector<std::int64_t> firstJob_{0}; // of each item; then their number
+    std::vector<std::int64_t> firstJob_{0}; // the first job of each item; at the end, the number of jobs
 };
 
 } // namespace detail
@@ -144,7 +144,7 @@ public:
             jobs_.find(hasList ? tiles.size() : static_cast<std::size_t>(fb_.layout().tileCount()),
                        [&](std::size_t item) { return frame.samples(tileOf(item)).count; });
             const std::int64_t count = jobs_.count(), rank = fb_.rank(), size = fb_.size();
-            // `number` jobs: first, first + step and so on, modulo all there are.
+            // Runs `number` jobs: first, first + step and so on, modulo `count`.
             const auto run = [&](std::int64_t first, std::int64_t number, std::int64_t step = 1) {
                 frame.template forEachTile<detail::TileFor<FrameBuffer, RenderTile>>(
                     number, [&](std::int64_t i, auto& tile) {
@@ -189,8 +189,8 @@ private:
 
 namespace detail {
 
-// Order and owners of a loop's frames, found from a SharedWorld and a camera. begin() needs them; but an exception of
-// the camera has to come out of the frame, on all ranks.
+// Finds the order and the owners of a loop's frames from a SharedWorld and a camera. begin() needs them, but an
+// exception of the camera has to come out of the frame, on all ranks: so set() keeps it, and rethrow() throws it.
 class FromWorld {
 public:
     // `isOrdered`: inputs come in an order that the loop was given, without depth.
@@ -208,7 +208,7 @@ public:
         }
     }
 
-    // Within the frame: throws what the camera has thrown before.
+    // Call it within the frame: throws what the camera threw in set().
     void rethrow() const
     {
         if (failure_)
@@ -217,7 +217,7 @@ public:
 
 private:
     // Sets config.owners, where ranks are on several nodes, unless it is set or the framebuffer has an owner map.
-    // `hasDepth`: inputs have.
+    // `hasDepth`: whether inputs have depth.
     template <class FrameBuffer, class Camera>
     void findOwners(FrameConfig& config, const FrameBuffer& fb, const SharedWorld& world, const Camera& camera,
                     bool hasDepth)
@@ -286,7 +286,7 @@ public:
 
     // `all` has the bricks of all ranks, those of `world` among them. It must outlive the loop. If the bricks have an
     // order from front to back for the camera, the loop sets FrameConfig::order: AlphaBlend then sends no depth, and
-    // sorts nothing. On several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
+    // sorts nothing. If ranks are on several nodes, tiles belong to ranks near their pixels: see ImageConfig::ownerMap.
     DataParallelLoop(FrameBuffer& fb, const World& world, const SharedWorld& all) : fb_(fb), world_(world), all_(&all)
     {
     }

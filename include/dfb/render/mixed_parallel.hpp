@@ -32,8 +32,8 @@
 
 DFB_NAMESPACE_BEGIN
 
-// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper). Tiles are mixed first: in
-// their own order, ranks would get whole columns of some images, and neighbours cost alike.
+// Deals the tiles of a brick in turn to the ranks that hold it (section 4.3 of the paper). The order of tiles is mixed
+// first. Otherwise, a rank would get whole columns of some images, and neighbouring tiles cost alike.
 struct RoundRobinBricks {
     int operator()(const SharedBrick& brick, int tile, int /*pass*/) const
     {
@@ -47,8 +47,8 @@ struct RoundRobinBricks {
 // The cost is the number that renderBrick returns, or else the time that it took.
 class MeasuredCostBricks {
 public:
-    // Takes the costs of the frame of this report, and forgets all others. One that is not finite is not known. Call it
-    // on all ranks, between frames. Sends nothing and waits for nothing.
+    // Takes the costs of the frame of this report, and forgets all others. A cost that is not finite counts as not
+    // known. Call it on all ranks, between frames. Sends nothing and waits for nothing.
     void update(const FrameReport& report)
     {
         costs_.clear();
@@ -79,7 +79,7 @@ public:
             for (int pass = 0; pass < passes[p]; ++pass)
                 jobs.push_back({pairCosts[p] / passes[p], p, pass, 0});
         }
-        // The costliest first, each to the rank that has least (Graham 1969).
+        // Each job, the costliest first, goes to the rank with the least load (Graham 1969).
         std::sort(jobs.begin(), jobs.end(), [](const Job& a, const Job& b) {
             return a.cost != b.cost ? a.cost > b.cost : std::tie(a.pair, a.pass) < std::tie(b.pair, b.pass);
         });
@@ -93,7 +93,8 @@ public:
             job.rank = least(job);
             loadOf(job.rank) += job.cost;
         }
-        // Not every rank can have every job: from a rank that has too much, jobs move on from rank to rank.
+        // Not every rank holds every brick. So jobs may have to move on, from rank to rank, away from one with too much
+        // load.
         for (int sweep = 0, moved = 1; sweep < 32 && moved > 0; ++sweep) {
             moved = 0;
             for (Job& job : jobs) {
@@ -165,8 +166,8 @@ DFB_DETECTS(has_plan_v,
 struct MixedWork {
     std::vector<BrickInTile> pairs;
     std::vector<int> passes;  // of each pair
-    std::vector<Job> jobs;    // of this rank, for pairs
-    std::vector<int> perTile; // pairs
+    std::vector<Job> jobs;    // of this rank; `item` is an index into `pairs`
+    std::vector<int> perTile; // how many pairs each tile has
 
     // The most bricks that meet in a tile.
     int mostPerTile(int tileCount)
@@ -206,15 +207,15 @@ struct MixedWork {
 struct OrderedWork : MixedWork {
     std::vector<int> place;             // of each brick, from the front
     std::vector<int> firstPair;         // of each tile, or -1
-    std::vector<int> empty;             // tiles of this rank
+    std::vector<int> empty;             // the tiles that this rank owns and no brick projects to
     std::atomic<bool> anyHidden{false}; // in the last frame an input of this rank was hidden, or hid others
     std::vector<std::atomic<int>>
         hider;                  // of each tile: the brick of this rank that hid others in the last frame, or -1
     std::vector<int> announced; // of each tile: the brick that may hide others in this frame, or -1
     std::mutex undecidedMutex;
-    std::vector<Job> undecided; // that another rank may hide
+    std::vector<Job> undecided; // jobs that another rank may hide
 
-    // Throws InvalidArgument.
+    // Sorts `pairs` by tile, then front to back. Throws InvalidArgument if `order` does not have each brick once.
     void sortFrontToBack(const SharedWorld& world, const std::vector<int>& order)
     {
         place.assign(world.bricks().size(), -1);
@@ -230,7 +231,7 @@ struct OrderedWork : MixedWork {
         });
     }
 
-    // Which of this rank's tiles no brick projects to; and where the pairs of the others begin.
+    // Finds which of this rank's tiles no brick projects to, and where the pairs of the other tiles begin.
     void findEmpty(int tileCount, const std::vector<int>& ownedTiles)
     {
         firstPair.assign(static_cast<std::size_t>(tileCount), -1);
@@ -247,15 +248,15 @@ struct OrderedWork : MixedWork {
         return static_cast<int>(job.item) - firstPair[static_cast<std::size_t>(pairs[job.item].tile)];
     }
 
-    // Begins with the tiles of which this rank has the front, so that others hear soon which inputs are hidden. Not for
-    // images that hide nothing: their tiles would be complete later.
+    // Puts the jobs first that are in front in their tile, so that other ranks hear soon which inputs are hidden. Not
+    // for images in which nothing is hidden: their tiles would be complete later.
     void renderFrontsFirst()
     {
         std::stable_partition(jobs.begin(), jobs.end(), [this](const Job& job) { return generationOf(job) == 0; });
     }
 
-    // Tells the ranks behind them of this rank's inputs that hid others in the last frame: they are likely to do so
-    // again.
+    // Announces this rank's inputs that hid others in the last frame, which are likely to do so again, to the ranks
+    // behind them.
     template <class Frame, class Owner>
     void announceHiders(const Frame& frame, const SharedWorld& world, int tileCount, Owner& owner)
     {
@@ -275,7 +276,8 @@ struct OrderedWork : MixedWork {
         }
     }
 
-    // Calls f(generation, rank) for the ranks that render something behind a job; `generation`: the first one behind.
+    // Calls f(generation, rank) for each rank that renders something behind a job. `generation` is the first one behind
+    // it.
     template <class Owner, class F>
     void forEachRankBehind(const SharedWorld& world, const Job& job, Owner& owner, const F& f) const
     {
@@ -338,7 +340,7 @@ public:
             work_.pairs = visibleTiles(world_, camera, fb_.layout(), std::move(work_.pairs));
             frame.expectLayers(work_.mostPerTile(fb_.layout().tileCount()));
             work_.findJobs(frame, world_, owner_);
-            // The first rank that holds the brick declares the tile, also if another one renders it.
+            // The first rank that holds the brick declares the tile, even if another one renders it.
             inputs_.clear();
             for (const BrickInTile& pair : work_.pairs)
                 if (const SharedBrick& b = detail::brickOf(world_, pair); b.ranks.front() == fb_.rank())
@@ -379,9 +381,9 @@ private:
 };
 
 // The mixed-parallel loop for OrderedBlend. The generation of an input is its place in the order, so owners sort
-// nothing and wait for no manifest. An input behind an opaque one is not sent, nor rendered if its rank hears of that
-// in time. An input that was hidden in the last frame waits until the tile that hid it has been rendered again, at most
-// FrameBufferConfig::quiet. Use it only if one order of the bricks is right for all rays of a frame: not with an
+// nothing and wait for no declarations. An input behind an opaque one is not sent, nor rendered if its rank hears of
+// that in time. An input that was hidden in the last frame waits until the tile that hid it has been rendered again, at
+// most FrameBufferConfig::quiet. Use it only if one order of the bricks is right for all rays of a frame: not with an
 // extended lens or several eyes. Framebuffer, world and owner must outlive it. One thread at a time may use it.
 template <class FrameBuffer, class TileBrickOwner>
 class OrderedLoop {
@@ -393,7 +395,7 @@ public:
     }
 
     // As MixedParallelLoop::start(). `order`: the bricks front to back, by their place in world.bricks(), as
-    // visibilityOrder() returns them. If it has not each brick once, the frame fails (InvalidArgument).
+    // visibilityOrder() returns them. If it does not have each brick once, the frame fails (InvalidArgument).
     template <class Camera, class RenderBrick>
     typename FrameBuffer::Frame start(const Camera& camera, const std::vector<int>& order,
                                       const RenderBrick& renderBrick, FrameConfig params = {},
@@ -488,14 +490,14 @@ private:
             detail::renderMeasured<TileBrickOwner>(frame, brick, renderBrick, tile);
             frame.setTile(tile);
         } catch (...) {
-            tellBehind(frame, job, false); // in a partial frame others would wait for this word
+            tellBehind(frame, job, false); // in a partial frame, others would wait to be told
             throw;
         }
         if (tile.children > 0 && frame.opaqueHides(pair.tile))
             tellBehind(frame, job, frame.hidesRest(tile));
     }
 
-    // Tells the ranks behind an input that it hides theirs, or does not, if they wait for that.
+    // Tells the ranks behind an input that it hides theirs; or, if they wait to be told, that it does not.
     void tellBehind(typename FrameBuffer::Frame& frame, const detail::Job& job, bool hides)
     {
         const BrickInTile& pair = work_.pairs[job.item];

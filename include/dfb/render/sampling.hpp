@@ -1,5 +1,5 @@
-// Plans of samples: a part of the image, and AdaptiveSampler, which gives each tile samples by its error (section 4.1.1
-// of the paper).
+// Plans of samples: samplesIn(), for a part of the image; and AdaptiveSampler, which gives each tile samples by its
+// error (section 4.1.1 of the paper).
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -36,8 +36,8 @@ struct SamplingConfig {
     int frameSamples = 64; // the most that a tile gets in one frame; memory grows with it
 };
 
-// Use it alike on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere. If a rank
-// decides otherwise, the frame fails (Disagreement). The operation is a Progressive one:
+// Use it in the same way on all ranks. Its decisions depend only on the frames' reports, which are the same everywhere.
+// If a rank decides otherwise, the frame fails (Disagreement). The tile operation must be a Progressive one:
 //
 //   dfb::ImageParallelLoop loop(fb);
 //   dfb::AdaptiveSampler sampler(fb.layout(), {0.01});
@@ -88,7 +88,7 @@ public:
     {
         for (std::size_t t = 0; t < plan_.size(); ++t)
             if (taken_[t] == 0)
-                error_[t] = untouched; // unless somebody says otherwise
+                error_[t] = untouched; // unless the report has an error for it
         for (const TileError& e : report.tileErrors) {
             const auto t = static_cast<std::size_t>(e.tile);
             taken_[t] += plan_[t].count;

@@ -1,5 +1,5 @@
-// SharedWorld: the bricks of all ranks, and which ranks hold each. For bricks that several ranks hold, and for orders
-// of bricks from front to back.
+// SharedWorld: the bricks of all ranks, and which ranks hold each. Used for bricks that several ranks hold, and to find
+// an order of the bricks from front to back.
 #pragma once
 
 #include <dfb/base/detect.hpp>
@@ -28,9 +28,9 @@ struct SharedBrick : Brick {
 // number of all bricks.
 class SharedWorld {
 public:
-    // Gathers the bricks of all ranks. Bricks with the same id are one. Collective, outside frames. Waits for all
-    // ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the bricks of a
-    // rank cannot be read. Throws TransportError.
+    // Gathers the bricks of all ranks. Bricks with the same id are the same brick. Collective, outside frames. Waits
+    // for all ranks. Throws InvalidArgument on all ranks if the bounds of one brick differ between ranks, or if the
+    // bricks of a rank cannot be read. Throws TransportError.
     template <class FrameBuffer>
     SharedWorld(FrameBuffer& fb, const World& world) : rank_(fb.rank())
     {
@@ -81,13 +81,13 @@ namespace detail {
 
 DFB_DETECTS(has_common_eye_v, std::declval<const T&>().commonEye());
 
-// Finds the order of bricks. Keeps it, for as long as boxes and eye stay.
+// Finds the order of bricks. Keeps it as long as their boxes and the eye stay the same.
 class FrontToBack {
 public:
     // Returns null, or why there is no order.
     const char* find(const SharedWorld& world, const Vec3& eye);
 
-    // By their place in SharedWorld::bricks().
+    // The bricks front to back, by their place in SharedWorld::bricks().
     const std::vector<int>& order() const noexcept { return order_; }
 
 private:
@@ -111,7 +111,7 @@ DFB_COMPILED_ONCE const char* FrontToBack::find(const SharedWorld& world, const 
         && std::equal(bricks.begin(), bricks.end(), boxes_.begin(), boxes_.end(),
                       [&](const Brick& brick, const Box3& box) { return same(brick.bounds, box); }))
         return why_;
-    order_.reserve(bricks.size()); // nothing throws once the boxes are there
+    order_.reserve(bricks.size()); // nothing may throw once boxes_ is set
     inFront_.reserve(bricks.size());
     eye_ = eye;
     boxes_.clear();
@@ -145,8 +145,8 @@ DFB_COMPILED_ONCE const char* FrontToBack::findAgain()
                : "the bricks are in front of each other in a circle: no order is right for all pixels";
 }
 
-// A plane between two boxes with the eye on one side of it (or on it) makes it right to have that side's box first.
-// Either is right if no ray crosses it: the eye's coordinate is then NaN, and no comparison holds.
+// If the eye is on one side of a plane between two boxes, or on the plane, the box on that side may come first. If no
+// ray crosses the plane, either may: the eye's coordinate is NaN then, and all comparisons are false.
 DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(std::size_t i, std::size_t j) const
 {
     const Box3 &a = boxes_[i], &b = boxes_[j];
@@ -175,8 +175,9 @@ DFB_COMPILED_ONCE FrontToBack::Before FrontToBack::before(std::size_t i, std::si
 // Gives FrameConfig::order to the frames of a loop.
 class BrickOrder {
 public:
-    // Sets config.order if it is not set, the operation takes an order, it is known where the camera's rays begin,
-    // and the bricks have an order. Takes time with the square of their number: not for more than 1024.
+    // Sets config.order if it is not set, the operation takes an order, it is known where the camera's rays begin, and
+    // the bricks have an order. The time grows with the square of the number of bricks, so it does nothing for more
+    // than 1024.
     template <class FrameBuffer, class Camera>
     void set(FrameConfig& config, const SharedWorld& world, const Camera& camera)
     {
@@ -214,7 +215,8 @@ inline std::vector<int> visibilityOrder(const SharedWorld& world, const Vec3& ey
     return bricks.order();
 }
 
-// Returns this order for all rays of a camera that has commonEye(), also of an orthographic one. Throws likewise.
+// Returns this order for all rays of a camera that has commonEye(), which may be orthographic. Throws as above, and
+// also if commonEye() returns nothing.
 template <class Camera, std::enable_if_t<detail::has_common_eye_v<Camera>, int> = 0>
 std::vector<int> visibilityOrder(const SharedWorld& world, const Camera& camera)
 {

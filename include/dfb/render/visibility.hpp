@@ -27,7 +27,7 @@
 
 DFB_NAMESPACE_BEGIN
 
-// In pixels; pixel (x, y) is the square from there to (x + 1, y + 1).
+// A point of an image, in pixels. Pixel (x, y) is the square from there to (x + 1, y + 1).
 struct PixelPoint {
     double x = 0, y = 0;
 };
@@ -90,8 +90,8 @@ DFB_COMPILED_ONCE bool Footprint::meets(const Region& r) const
 {
     if (intersection(region_, r).empty())
         return false;
-    // Two convex sets are apart if and only if a line along an edge of one of them parts them. The rectangle's own
-    // edges are the test above.
+    // Two convex sets are disjoint if and only if a line along an edge of one of them separates them. The test above
+    // covers the rectangle's own edges.
     const double xs[2] = {static_cast<double>(r.x0), static_cast<double>(r.x1)},
                  ys[2] = {static_cast<double>(r.y0), static_cast<double>(r.y1)};
     for (std::size_t i = 0; i < hull_.size(); ++i) {
@@ -147,12 +147,12 @@ inline Vec3d cornerOf(const Box3& b, int corner) noexcept
 
 inline constexpr double pi = 3.14159265358979323846;
 
-// Where the eye is and how it looks; the axes are orthonormal.
+// The eye and its orientation. The axes are orthonormal.
 struct Pose {
     Vec3d eye, forward, right, up;
     double tangent = 0; // of half the vertical angle of view
 
-    // From the eye to a point of the image that is 1 away along `forward`.
+    // The vector from the eye to a point of the image, in the plane at distance 1 along `forward`.
     Vec3d through(double x, double y, int width, int height) const
     {
         const double scale = 2 * tangent / height;
@@ -160,7 +160,7 @@ struct Pose {
     }
 };
 
-// Throws InvalidArgument if the view or `up` are none, or a number is not finite.
+// Throws InvalidArgument if `view` is 0, `up` is 0 or along it, or a number is not finite.
 inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
 {
     const Vec3d e = toDouble(eye), v = toDouble(view), side = cross(v, toDouble(up));
@@ -176,7 +176,7 @@ inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up)
     return pose;
 }
 
-// Throws so, too, for an angle of view that is not in (0, 180) degrees.
+// Also throws InvalidArgument for an angle of view that is not in (0, 180) degrees.
 inline Pose poseOf(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
 {
     Pose pose = poseOf(eye, view, up);
@@ -193,8 +193,8 @@ struct SeenCorner {
     double margin, blur = 0; // blur: by how many pixels it may be off to any side
 };
 
-// The footprint of a box, of which `see(point)` returns the SeenCorners. Of a box that reaches behind the eye: the
-// whole image; of one that is behind it altogether: nothing.
+// The footprint of a box. `see(point)` returns the SeenCorner of a corner. The footprint is the whole image if the box
+// reaches behind the eye, and nothing if all of the box is behind it.
 //
 // The image of a convex body in front of the eye is the hull of the images of its corners. The margin covers the
 // rounding of renderers' rays and points, which are floats: 1/8 pixel for directions (2^-23 of an image of 65536 pixels
@@ -229,11 +229,11 @@ Footprint footprintOf(const Box3& bounds, int width, int height, const See& see)
     return Footprint(std::move(points), margin, width, height);
 }
 
-// Of a pinhole whose image has its middle at width / 2 + shiftX, or of a lens.
+// The footprint of a box for a pinhole whose image has its middle at width / 2 + shiftX, or for a lens.
 //
-// Seen from a point of the lens at most `lensRadius` off its middle, a point at depth z is off by at most
-// lensRadius |1/z - 1/focusDistance| in the plane at distance 1, so each corner's image lies in a square around that
-// from the middle. The hull of all these squares holds the image of the box from every point of the lens.
+// Seen from a point of the lens at most `lensRadius` off its middle, a point at depth z is off by at most lensRadius
+// |1/z - 1/focusDistance| in the plane at distance 1, so each corner's image lies in a square around its image from the
+// middle. The hull of all these squares holds the image of the box from every point of the lens.
 DFB_COMPILED_ONCE Footprint projectBox(const Box3& bounds, const Pose& pose, int width, int height, double shiftX = 0,
                                        double lensRadius = 0, double focusDistance = 1);
 
@@ -264,7 +264,7 @@ struct Ray {
     Vec3 origin, direction;
 };
 
-// The point of the lens and the moment of the shutter of a ray.
+// The point of the lens and the moment of the shutter for a ray.
 struct LensSample {
     double lensU = 0, lensV = 0, time = 0;
 };
@@ -279,8 +279,8 @@ public:
     {
     }
 
-    // Looks along `view`, of any length: also where the eye is so far from the origin that no target near it is exact.
-    // Throws as above.
+    // Looks along `view`, of any length. This also works where the eye is so far from the origin that no float target
+    // near it is exact. Throws as above.
     static PerspectiveCamera along(const Vec3& eye, const Vec3& view, const Vec3& up, float fovY)
     {
         return PerspectiveCamera(detail::poseOf(eye, view, up, fovY));

@@ -64,11 +64,11 @@ inline bool isBox(const Box3& b) noexcept
 
 } // namespace detail
 
-// A convex region of space that overlaps no other brick, with what it holds. Camera rays see it within `bounds` only:
+// A convex region of space that overlaps no other brick, with the data in it. Camera rays see it within `bounds` only:
 // renderers clip them to it. Its data may reach farther: ghost voxels, or geometry for shadows and ambient occlusion,
 // which secondary rays see beyond the bounds as well.
 struct Brick {
-    std::uint32_t id = 0; // the same number: the same brick on any rank, with equal bounds in a SharedWorld
+    std::uint32_t id = 0; // equal on two ranks: the same brick, whose bounds must be equal in a SharedWorld
     Box3 bounds;
 };
 
