@@ -1,4 +1,4 @@
-// Adversarial: inputs of a tile that are likely to show what is wrong with an operation, a format or a codec.
+// Adversarial: inputs of a tile that are likely to reveal faults of an operation, a format or a codec.
 #pragma once
 
 #include <dfb/testing/tile_op_test.hpp>
@@ -19,7 +19,7 @@ inline std::size_t below(Random& random, std::size_t count) { return static_cast
 
 inline constexpr float smallestDenormal = 1e-45f;
 
-// Exactly 0 and 1, next to them, denormal, quarters (exact results, and ties in 8 bits), or anything.
+// Returns exactly 0 or 1, a value next to them, a denormal, a quarter (exact results, and ties in 8 bits), or anything.
 inline float anyAlpha(Random& random)
 {
     switch (below(random, 8)) {
@@ -33,7 +33,7 @@ inline float anyAlpha(Random& random)
     }
 }
 
-// Up to 1e30, denormal, emission where alpha is 0, or below alpha.
+// Returns 0 or 1, a value up to 1e30, a denormal, or one below alpha; any value below 1 if alpha is 0 (emission).
 inline float anyColor(Random& random, float alpha)
 {
     switch (below(random, 8)) {
@@ -45,7 +45,8 @@ inline float anyColor(Random& random, float alpha)
     }
 }
 
-// Of 8 kinds: all equal, few values, 0 and -0, infinities, denormals, negative ones, neighbours in the last bit, any.
+// Returns a depth of one of 8 kinds: all equal, few values, 0 and -0, infinities, denormals, negative ones, neighbours
+// in the last bit, any.
 inline float anyDepth(Random& random, std::size_t kind)
 {
     switch (kind) {
@@ -60,8 +61,8 @@ inline float anyDepth(Random& random, std::size_t kind)
     }
 }
 
-// Random spans rather than random pixels, so that orders change within a row and stay over some of it. `inRange`: with
-// colours up to alpha, so that lossy formats apply.
+// Fills random spans rather than random pixels, so that the order changes within a row but also stays for some pixels.
+// `inRange`: no colour is above alpha, so that lossy formats apply.
 template <class Tile>
 void fillAdversarial(Tile& tile, Random& random, bool inRange = false)
 {
@@ -86,8 +87,8 @@ void fillAdversarial(Tile& tile, Random& random, bool inRange = false)
         }
 }
 
-// `layers` inputs of generation 1 in each pass; `image`: one of generation 0. Some tiles lie at the image's border,
-// some images have a background.
+// Makes `layers` inputs of generation 1 in each pass; with `image`, one input of generation 0 instead. Some tiles lie
+// at the image's border, some images have a background.
 template <int Size>
 TileInputs<Size> adversarial(std::uint64_t seed, int layers, int passes, bool image = false, bool inRange = false)
 {

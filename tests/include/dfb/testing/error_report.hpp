@@ -1,4 +1,4 @@
-// ErrorReport: how far an image is off what it should be.
+// ErrorReport: how far an image is off the exact one.
 #pragma once
 
 #include <dfb/testing/reference.hpp>
@@ -13,21 +13,21 @@
 
 namespace dfb::testing {
 
-// All counts but the last two are of values of colour and alpha, 4 to a pixel. Images are added up, piece by piece,
-// with add().
+// All figures but `others` and `wrongOthers` are of values of colour and alpha, 4 to a pixel. add() adds the values of
+// an image, one by one, or another report.
 struct ErrorReport {
     std::int64_t values = 0;
     double maxAbs = 0; // of finite values
     double sumSquares = 0;
     double peak = 0; // the largest exact value
-    // Distances to the exact value rounded, in floats: 0, 1, 2 to 3, 4 to 7, ..., the last: 2^14 or more, or not finite
-    // where the exact value is.
+    // How many values are this far from the rounded exact value, in ulps: 0, 1, 2 to 3, 4 to 7, ..., and last 2^14 or
+    // more. Values that are not finite where the exact one is count in the last place, too.
     std::array<std::int64_t, 16> ulps{};
     std::int64_t bytes = 0, wrongBytes = 0;   // of 8-bit values: all, and those that are not the exact value rounded
-    int maxLevels = 0;                        // by which such a value is off
+    int maxLevels = 0;                        // the most levels by which such a value is off
     std::int64_t others = 0, wrongOthers = 0; // values of depth and auxiliary channels: all, and those that are wrong
 
-    // Of two values that are not finite both, nothing is said.
+    // If the exact value is not finite, or rounds to no finite float, every measured value counts as right.
     void add(float measured, Exact exact)
     {
         ++values;
@@ -56,7 +56,7 @@ struct ErrorReport {
         maxLevels = std::max(maxLevels, std::abs(int{measured} - int{expected}));
     }
 
-    // Of depth or an auxiliary channel.
+    // Adds a value of depth or of an auxiliary channel.
     void addOther(bool isWrong)
     {
         ++others;
@@ -79,12 +79,12 @@ struct ErrorReport {
     }
 
     double rmse() const { return values > 0 ? std::sqrt(sumSquares / static_cast<double>(values)) : 0.0; }
-    // Decibels; infinite for no error.
+    // In decibels; infinite if there is no error.
     double psnr() const
     {
         return sumSquares > 0 ? 20 * std::log10(peak / rmse()) : std::numeric_limits<double>::infinity();
     }
-    // The greatest distance is less than this.
+    // All distances, in ulps, are less than this.
     std::int64_t ulpsBelow() const
     {
         std::size_t last = ulps.size() - 1;

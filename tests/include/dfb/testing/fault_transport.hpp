@@ -64,8 +64,8 @@ inline std::uint64_t scramble(std::uint64_t x) noexcept // splitmix64
 } // namespace detail
 
 // The decision for the message with this running number from `rank` to `destination`: the same at every call, whatever
-// threads do. Each probability has its own part of the random sequence, so that changing one leaves the others'
-// messages.
+// threads do. Each probability has its own part of the random sequence, so changing one does not change which messages
+// the others affect.
 inline FaultDecision decideFault(const FaultOptions& options, int rank, int destination, std::uint64_t number)
 {
     std::uint64_t state = options.seed;
@@ -91,7 +91,7 @@ inline FaultDecision decideFault(const FaultOptions& options, int rank, int dest
 }
 
 // Keeps the contract of a transport (comm/transport.hpp) as far as Base and the faults do. Needs polling if messages
-// are held back, also over a transport that does not.
+// are held back, even if Base needs none.
 template <class Base>
 class FaultTransport {
 public:
@@ -132,7 +132,7 @@ public:
             decision = decideFault(options_, rank(), destination, number);
         if (decision.drop && takeLethal()) {
             ++counts_->dropped;
-            message = Buffer(); // the caller may keep what it has handed over
+            message = Buffer(); // the caller may keep the moved-from object alive
             return;
         }
         if (decision.corrupt && !message.empty() && takeLethal()) {
@@ -166,7 +166,7 @@ public:
         return base_.poll() || letGo;
     }
 
-    // In this order: what is let go reaches the base before it stops counting as held.
+    // The order of the two matters: a message that is released reaches base_ before it stops counting as held.
     bool quiet() const { return heldCount_ == 0 && base_.quiet(); }
 
     void nap(std::chrono::nanoseconds limit)
@@ -187,8 +187,8 @@ public:
         base_.stop(orderly);
     }
 
-    // Optional members of Base: this has them if Base has. Data that goes through shared memory without a message stays
-    // unharmed.
+    // Optional members: this class has them if Base has. Data that goes through shared memory without a message is not
+    // harmed.
     template <class B = Base>
     auto abort(const std::string& text) -> decltype(std::declval<B&>().abort(text))
     {
@@ -224,7 +224,7 @@ private:
         int destination;
         Buffer message;
         Clock::time_point due;
-        std::uint64_t dueNumber; // due as well once so many messages to the destination have been sent
+        std::uint64_t dueNumber; // also due once so many messages to the destination have been sent
     };
 
     bool takeLethal()
@@ -242,7 +242,7 @@ private:
             message.shrink(draw(message.size()));
             return;
         }
-        // Different places, as a byte changed twice could be the old one again.
+        // The places must differ: a byte that is changed twice could become the old one again.
         std::array<std::size_t, 8> places{};
         const std::size_t wanted = 1 + draw(std::min(places.size(), message.size()));
         for (std::size_t done = 0; done < wanted;) {
@@ -289,7 +289,7 @@ private:
 
     std::mutex mutex_;
     std::vector<Held> held_;                // under mutex_
-    std::atomic<std::size_t> heldCount_{0}; // of those in held_ and those on their way from it to base_
+    std::atomic<std::size_t> heldCount_{0}; // how many are in held_ or on their way from it to base_
 };
 
 static_assert(is_transport_v<FaultTransport<InprocTransport>>);

@@ -1,5 +1,5 @@
-// The serial reference that results are compared with: per pixel, in arithmetic of more than twice the precision
-// of double (with compilers that have no __float128, of long double), with no thought of speed. It shares no code with
+// The serial reference that results are compared with: it works pixel by pixel, with more than twice the precision of
+// double (or in long double, if the compiler has no __float128), and without regard to speed. It shares no code with
 // the library.
 #pragma once
 
@@ -64,17 +64,17 @@ struct Taken {
 struct Pixel {
     std::array<Exact, 4> rgba{};
     float depth = std::numeric_limits<float>::infinity(); // of the nearest input with alpha > 0, or of nearest()
-    // Sums weighted by what is let through, without the background, of which the alpha is the last; and the same of
-    // the largest magnitudes.
+    // Sums over the inputs, weighted by the transmittance in front of each, without the background. `weight` is the sum
+    // of alpha, `magnitude` that of each input's largest |component| of normal and albedo.
     std::array<Exact, 3> normal{}, albedo{};
     Exact weight = 0, magnitude = 0;
     Taken<std::array<float, 3>> position; // of the first input with alpha > 0, or of nearest()
-    Taken<std::uint32_t> primitiveId{noIdOfPixel}, instanceId{noIdOfPixel}; // the same, of the first that has one
+    Taken<std::uint32_t> primitiveId{noIdOfPixel}, instanceId{noIdOfPixel}; // the same, of the first input that has one
 };
 
 using Color = std::array<float, 4>;
 
-// As a depth is compared: NaN is farthest.
+// The depth to compare by: NaN is farthest.
 inline float comparable(float depth) { return std::isnan(depth) ? std::numeric_limits<float>::infinity() : depth; }
 
 inline bool isInFront(const Sample& a, const Sample& b)
@@ -83,8 +83,8 @@ inline bool isInFront(const Sample& a, const Sample& b)
            < std::make_tuple(comparable(b.depth), b.source, b.part);
 }
 
-// OrderedBlend and ImageParallel: in the order of the samples, front to back: A += T a, T *= 1 - a; the background
-// last. `anyAlpha`: all give depth, position and ids, not only those with alpha > 0.
+// OrderedBlend and ImageParallel: blends the samples in their order, front to back: A += T a, T *= 1 - a; the
+// background last. `anyAlpha`: all samples give depth, position and ids, not only those with alpha > 0.
 inline Pixel compositeInOrder(const std::vector<Sample>& samples, const Color& background, bool anyAlpha = false)
 {
     Pixel result;
@@ -123,7 +123,7 @@ inline Pixel composite(std::vector<Sample> samples, const Color& background)
     return compositeInOrder(samples, background);
 }
 
-// DepthComposite: the first of these alone, if it has a depth, whatever its alpha.
+// DepthComposite: the sample in front alone, if its depth is below +infinity, whatever its alpha.
 inline Pixel nearest(const std::vector<Sample>& samples, const Color& background)
 {
     const auto first = std::min_element(samples.begin(), samples.end(), isInFront);
@@ -132,7 +132,8 @@ inline Pixel nearest(const std::vector<Sample>& samples, const Color& background
     return compositeInOrder({*first}, background, true);
 }
 
-// The mean of passes that were composited each by itself; the nearest of their depths, and what the nearest have.
+// The mean of passes, each of which was composited by itself. Depth, position and ids are those of the nearest pass.
+// Normal, albedo and their weights remain sums.
 inline Pixel mean(const std::vector<Pixel>& passes)
 {
     Pixel result;
@@ -155,15 +156,15 @@ inline Pixel mean(const std::vector<Pixel>& passes)
     return result;
 }
 
-// Whether a normal or albedo of the image is wrong. `sum`: the one of the pixel that it is the mean of. They have
-// either sign: what cancels is off by the rounding of what was summed, 2^-36 of that (see compositing.hpp), and rounded
-// to float at the end.
+// Whether a normal or albedo of the image is wrong. `sum`: the sum in `pixel` of which it is the mean. The terms have
+// either sign. So the mean is off by the rounding of terms that may cancel, 2^-36 of them (see compositing.hpp), and is
+// rounded to float at the end.
 inline bool isWrongMean(float measured, Exact sum, const Pixel& pixel)
 {
     if (!(pixel.weight > 0))
         return measured != 0.0f;
     const auto expected = static_cast<double>(sum / pixel.weight);
-    if (!std::isfinite(expected)) // nothing is said of it
+    if (!std::isfinite(expected)) // such a value is not checked
         return false;
     const auto spread = static_cast<double>(pixel.magnitude / pixel.weight);
     return !(std::fabs(static_cast<double>(measured) - expected)
@@ -172,8 +173,9 @@ inline bool isWrongMean(float measured, Exact sum, const Pixel& pixel)
 
 inline float toFloat(Exact value) { return static_cast<float>(value); }
 
-// To the nearest of 0..255, ties to even, clamped; NaN gives 0. What is within the rounding of Exact of a tie is one:
-// the mean of 3 passes can be 1/6, that is 42.5 / 255, which no binary number is.
+// Rounds to the nearest of 0 to 255, ties to even, clamped; NaN gives 0. A value that differs from a tie by no more
+// than the rounding of Exact counts as a tie: the mean of 3 passes can be 1/6, that is 42.5 / 255, which no binary
+// number is.
 inline std::uint8_t toUnorm8(Exact value)
 {
     if (!(value > 0))
@@ -188,8 +190,8 @@ inline std::uint8_t toUnorm8(Exact value)
     return static_cast<std::uint8_t>(below + (isTie ? below % 2 : overTie > 0 ? 1 : 0));
 }
 
-// Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. With
-// the fifth power on both sides there is no root to take.
+// Whether the sRGB level of a linear value is above `level`: value >= the inverse curve at (level + 1/2) / 255. Both
+// sides are raised to the fifth power, so that no root is needed.
 inline bool isAboveSrgbLevel(Exact value, int level)
 {
     const Exact s = static_cast<Exact>(2 * level + 1) / 510;
@@ -209,7 +211,7 @@ inline std::uint8_t toSrgb8(Exact value)
     return static_cast<std::uint8_t>(level);
 }
 
-// How many floats lie from a to b; 0 for equal ones (also 0 and -0) and for two NaNs.
+// The distance of a and b in ulps: 0 for equal values (also 0 and -0) and for two NaNs.
 inline std::int64_t ulpsBetween(float a, float b)
 {
     if (std::isnan(a) || std::isnan(b))

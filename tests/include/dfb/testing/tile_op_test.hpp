@@ -1,5 +1,5 @@
-// TileOpTest: runs a tile operation on the inputs of one tile, as the framebuffer does, and holds what it makes of them
-// against the reference. For the library's operations and for your own:
+// TileOpTest: runs a tile operation on the inputs of one tile, as the framebuffer does, and compares the result with
+// the reference. For the library's operations and for your own:
 //
 //   dfb::testing::TileInputs<MyOp::tileSize> in = dfb::testing::adversarial<MyOp::tileSize>(seed, layers, passes);
 //   const auto expected = dfb::testing::referenceOf(in, [&](const std::vector<Sample>& samples) { return ...; });
@@ -41,7 +41,7 @@ struct TileInputs {
 
     Region region() const { return layout.region(tile); }
 
-    // An empty one.
+    // Adds an empty input.
     Tile& add(int pass, std::uint32_t source, std::uint16_t part = 0, int generation = 1)
     {
         tiles.push_back(std::make_unique<Tile>());
@@ -51,7 +51,7 @@ struct TileInputs {
         return t;
     }
 
-    // 0, 1, 2, ...
+    // The order of `tiles`: 0, 1, 2, ...
     std::vector<std::size_t> order() const
     {
         std::vector<std::size_t> all(tiles.size());
@@ -61,7 +61,7 @@ struct TileInputs {
     }
 };
 
-// How inputs travel, and what the operation is told of it.
+// How inputs are sent, and what the operation is told of it.
 struct TileWire {
     Precision precision;
     float minTransmittance = 0;
@@ -81,7 +81,7 @@ struct TileOutput {
         return color == o.color && depth.size() == o.depth.size()
                && (depth.empty() || std::memcmp(depth.data(), o.depth.data(), depth.size() * sizeof(float)) == 0);
     }
-    // Of OutputFormat::RGBA32F.
+    // Value i of the colour; only for OutputFormat::RGBA32F.
     float value(std::size_t i) const
     {
         float v = 0;
@@ -90,7 +90,7 @@ struct TileOutput {
     }
 };
 
-// Treats a tile in a frame as the framebuffer does, with the inputs arriving in this order. Sets `written` to the
+// Runs `op` for a tile in one frame as the framebuffer does. The inputs arrive in this order. Sets `written` to the
 // number of pixels that the operation has set.
 template <class Op>
 TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order,
@@ -138,7 +138,7 @@ TileOutput runTileOp(Op& op, const TileInputs<tileSizeOf<Op>>& in, const std::ve
     return out;
 }
 
-// The second of two such frames with a new operation: one is used again from frame to frame.
+// Runs two such frames with a new operation, and returns the second: operations are used again from frame to frame.
 template <class Op>
 TileOutput runTileOp(const TileInputs<tileSizeOf<Op>>& in, const std::vector<std::size_t>& order, OutputFormat format,
                      bool withDepth = true, const TileWire& wire = {}, bool dither = false)
@@ -148,8 +148,8 @@ TileOutput runTileOp(const TileInputs<tileSizeOf<Op>>& in, const std::vector<std
     return runTileOp(op, in, order, format, withDepth, wire, dither);
 }
 
-// Exact pixels: the mean over the passes of what `rule(samples)` makes of the inputs' samples, which are in the order
-// of in.tiles. A sample of an input that has nothing there is all 0.
+// Returns exact pixels: for each, the mean over the passes of what `rule(samples)` returns. The samples are in the
+// order of in.tiles. Where an input has nothing, its sample has colour 0 and depth +infinity.
 template <int Size, class Rule>
 std::vector<Pixel> referenceOf(const TileInputs<Size>& in, const Rule& rule)
 {
@@ -178,7 +178,7 @@ std::vector<Pixel> referenceOf(const TileInputs<Size>& in)
     return referenceOf(in, [&](const std::vector<Sample>& samples) { return composite(samples, in.background); });
 }
 
-// All formats and the depth against exact pixels; a wrong depth counts as 4 wrong bytes.
+// Compares all formats and the depth with exact pixels. A wrong depth counts as 4 wrong bytes.
 template <class Op>
 ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixel>& expected)
 {
@@ -203,9 +203,9 @@ ErrorReport compare(const TileInputs<tileSizeOf<Op>>& in, const std::vector<Pixe
 // Checks an operation of your own against the contract in tile_op.hpp, in one line: REQUIRE(checkTileOp<MyOp>() == "").
 // Returns a sentence for each fault, or nothing. The image must not depend on the order in which inputs come, nor on
 // the frame before. Each pixel must be set. An image of two passes must be the mean of the images of each. Empty inputs
-// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` gives each
-// the generation and source that the operation expects; by default generation 1 and source `layer`. For operations that
-// keep no state.
+// must show the background. Inputs are random, half transparent, and have a depth. `label(header, layer)` may set the
+// generation and source that the operation expects; without it they are generation 1 and source `layer`. For operations
+// that keep no state.
 template <class Op, class Label>
 std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
 {
@@ -213,7 +213,7 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
     constexpr int size = tileSizeOf<Op>, layers = 3;
     std::mt19937_64 random(seed);
     const auto number = [&] { return static_cast<float>(random() >> 40) * 0x1p-24f; };
-    // Of `passes` passes, with an image of this size.
+    // Makes inputs of `passes` passes, for an image `width` pixels wide.
     const auto make = [&](int passes, int width, bool isEmpty) {
         Inputs in;
         in.layout = TileLayout(width, size - 1, size);
@@ -237,7 +237,7 @@ std::string checkTileOp(const Label& label, std::uint64_t seed = 1)
             }
         return in;
     };
-    // The inputs of one of its passes, as the only one.
+    // The inputs of one pass of `in`, as the only pass.
     const auto passOf = [&](Inputs& in, int pass) {
         Inputs one;
         one.layout = in.layout;

@@ -1,5 +1,5 @@
-// checkTransport: whether a transport keeps the contract of comm/transport.hpp. For authors of transports; needs no
-// test framework, and no other way between the ranks than the transport itself.
+// checkTransport: checks whether a transport keeps the contract of comm/transport.hpp. For authors of transports. It
+// needs no test framework, and no connection between the ranks other than the transport itself.
 //
 //   for (const auto& result : dfb::testing::checkTransport<MyTransport>(communicator))
 //       if (!result.passed())
@@ -33,7 +33,7 @@ namespace dfb::testing {
 struct ConformanceResult {
     std::string name;
     std::string message; // empty if the case passed here and, as far as this rank heard, on all others
-    bool ran = true;     // false after a case that could not end
+    bool ran = true;     // false if it was not run, after a case that could not end
     bool passed() const { return message.empty(); }
 };
 
@@ -41,8 +41,8 @@ struct ConformanceOptions {
     std::uint64_t seed = 1;                            // of the contents, sizes and pauses; the same on all ranks
     std::size_t largestMessage = std::size_t{1} << 24; // bytes. A rank holds a few of them
     int smallMessages = 20000;                         // of all ranks together, in the cases with many messages
-    std::chrono::milliseconds timeLimit{10000};        // of a case. What must happen "soon" gets a tenth of it
-    bool duplicatesAllowed = false;                    // if messages may come more than once
+    std::chrono::milliseconds timeLimit{10000};        // of a case. What must happen soon gets a tenth of it
+    bool duplicatesAllowed = false;                    // whether messages may come more than once
     std::vector<Progress> modes{Progress::Thread, Progress::Caller};
 };
 
@@ -64,7 +64,7 @@ namespace detail {
 // The state of a suite that runs in another thread.
 class Report {
 public:
-    // A case, or another step that must end within `limit`.
+    // Begins a case, or another step that must end within `limit`.
     void enter(const std::string& what, Clock::duration limit)
     {
         const std::lock_guard<std::mutex> lock(mutex_);
@@ -85,7 +85,7 @@ public:
         changed_.notify_all();
     }
 
-    // Returns false if a step has not ended in time; then it is the last result.
+    // Returns false if a step has not ended in time. The last result then says so.
     bool waitForEnd()
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -113,8 +113,9 @@ private:
     bool finished_ = false;
 };
 
-// The cases, on one rank. All ranks go through them in step, by announcements over a transport of the suite's own,
-// which are repeated until they are heard: so a transport that loses messages is found out by the cases.
+// The cases, on one rank. All ranks go through them in step: they send announcements over a transport of the suite's
+// own, and repeat them until they are heard. So the suite itself works over a transport that loses messages, and the
+// cases find that out.
 template <class Transport>
 class Suite {
 public:
@@ -181,12 +182,12 @@ private:
         std::uint32_t channel;
         bool polledHere, polledByThread;
         bool started = false, resting = false;
-        bool mayFail = false; // a rank has left it, or will: the others may hear of that
+        bool mayFail = false; // a rank has left it, or will, and others may be told of a failure
         std::unique_ptr<Poller<Transport>> poller;
     };
 
-    // A rank's message to the others: it has come to a step, and after the last step of a case, how the case went. The
-    // words follow.
+    // A rank's message to the others: it has reached this step. After the last step of a case, a text follows that says
+    // how the case went.
     struct Announcement {
         std::uint64_t magic = controlMagic, checksum = 0;
         std::uint32_t step = 0;
@@ -218,14 +219,14 @@ private:
         bool givesUp = false;
         try {
             body();
-        } catch (const std::exception& e) { // ours, or one of the transport
+        } catch (const std::exception& e) { // GaveUp, or an exception of the transport
             problems_.add(e.what());
             lookForStrays();
             givesUp = true;
         }
         lookForLateCalls();
 
-        // One that gives up waits only so long that the others can hear of it.
+        // A rank that gives up waits only long enough for the others to hear of it.
         const Clock::duration patience = givesUp ? soon_ : 2 * options_.timeLimit + std::chrono::seconds(2);
         report_.enter(name + ", waiting for the other ranks", patience + grace);
         step_ = caseNumber_ * stepsPerCase + stepsPerCase - 1;
@@ -263,7 +264,8 @@ private:
             if (r != rank_)
                 tell(r, false);
         nextRepeat_ = Clock::now() + repeatAfter;
-        // This rank may go into a call that waits for the others: they must be on their way to it by then.
+        // This rank may now enter a call that waits for the others. So its announcements must have left: without them,
+        // the others would not get to that call.
         waitUntil([this] { return control_.quiet(); }, nextRepeat_);
     }
 
@@ -345,12 +347,13 @@ private:
         return missing.text();
     }
 
-    // Waits until all ranks are here.
+    // Waits until all ranks have reached this step.
     void meet()
     {
         ++step_;
         announce("", false);
-        // A little longer than for a message: what is missing says more than who waits for it.
+        // This waits a little longer than for a message: the rank that misses a message has more to say than those that
+        // wait for it.
         await([this] { return allHaveCome(); }, [this] { return whoHasNotCome(options_.timeLimit); },
               deadline_ + soon_);
     }
@@ -399,8 +402,8 @@ private:
         return true;
     }
 
-    // Waits within the time limit of the case. Throws GaveUp if `ready` has not come true by then, with the words of
-    // `what`, and before if there is no more hope.
+    // Waits until ready() is true. Throws GaveUp, with the text of what(), if it is not within the time limit of the
+    // case; and earlier if there is no more hope.
     template <class Ready, class What>
     void await(const Ready& ready, const What& what)
     {
@@ -415,7 +418,7 @@ private:
             trouble = hopeless();
             return !trouble.empty() || ready();
         };
-        // A cause that is missing here says more than that another rank waits for this one.
+        // What is missing here says more than that another rank gave up.
         if (!waitUntil(over, deadline) || (!trouble.empty() && Clock::now() >= deadline))
             throw GaveUp(what());
         if (!trouble.empty())
@@ -464,7 +467,7 @@ private:
             end.poller = std::make_unique<Poller<Transport>>(end.transport);
     }
 
-    // While it rests the suite does not poll it.
+    // The suite does not poll a transport while it rests.
     void rest(End& end, bool resting)
     {
         end.resting = resting;
@@ -512,7 +515,7 @@ private:
 
     static std::size_t small(std::uint64_t) { return smallSize; }
     std::size_t atMost(std::size_t size) const { return std::max(smallSize, std::min(size, options_.largestMessage)); }
-    // The first is large, the second medium, the others small.
+    // Sizes of messages: the first is large, the second medium, the others small.
     SizeOf mixed() const
     {
         return [large = atMost(largeSize), medium = atMost(mediumSize)](std::uint64_t number) {
@@ -540,7 +543,7 @@ private:
         end.transport.send(destination, makeMessage(*pool_, own, options_.seed));
     }
 
-    // `count` messages to each rank for which `to(rank)`.
+    // Sends `count` messages to each rank for which to(rank) is true.
     template <class To>
     void sendAll(End& end, const To& to, std::uint64_t count, const SizeOf& sizeOf)
     {
@@ -550,7 +553,7 @@ private:
                     send(end, r, number, sizeOf(number));
     }
 
-    // `count` messages are expected from each rank for which `from(rank)`.
+    // Expects `count` messages from each rank for which from(rank) is true.
     template <class From>
     Ledger expect(const End& end, const From& from, std::uint64_t count, const SizeOf& sizeOf) const
     {
@@ -571,7 +574,7 @@ private:
             [&] { return ledger.missing(options_.timeLimit); });
     }
 
-    // How many of `total` messages each rank sends each other.
+    // How many of `total` messages each rank sends to each other rank.
     std::uint64_t share(int total) const
     {
         return static_cast<std::uint64_t>(std::max(1, size_ > 1 ? total / (size_ * (size_ - 1)) : 1));
@@ -613,7 +616,7 @@ private:
         const auto sizeOf = [&sizes](std::uint64_t number) { return sizes[static_cast<std::size_t>(number)]; };
         Ledger ledger = expect(*session_, everyone, sizes.size(), sizeOf);
         for (int shift = 1; shift < size_; ++shift) {
-            for (std::size_t i = 0; i < sizes.size(); ++i) { // small ones after large ones, and before
+            for (std::size_t i = 0; i < sizes.size(); ++i) { // small ones before and after large ones
                 const std::size_t number = i % 2 ? i / 2 : sizes.size() - 1 - i / 2;
                 send(*session_, (rank_ + shift) % size_, number, sizes[number]);
             }
@@ -643,7 +646,7 @@ private:
             }
             --running;
         };
-        // As a connection does that passes a message on.
+        // As in a connection that passes messages on.
         session_->mailbox.interruptOnReceive(true);
         meet();
         Ledger ledger = expect(*session_, everyone, count, sizeOf);
@@ -730,7 +733,7 @@ private:
         };
         using std::chrono::milliseconds;
         for (int i = 0; i < 3; ++i)
-            nap(milliseconds(1), soon_, ""); // for interrupts left over
+            nap(milliseconds(1), soon_, ""); // to use up interrupts that are left over
         nap(milliseconds(0), soon_, "");
         Clock::duration total{0};
         for (int i = 0; i < 10; ++i)
@@ -769,7 +772,7 @@ private:
         meet();
     }
 
-    // That nap() ends when a message is sent, and when one comes, shows only where another thread naps.
+    // Whether a nap ends when a message is sent, or when one comes, can be seen only if another thread naps.
     void checkNapOfSender()
     {
         if (!session_->poller)
@@ -784,7 +787,7 @@ private:
             meet();
             const auto before = Clock::now();
             for (std::uint64_t number = 0; sends && number < 3; ++number) {
-                idle(std::chrono::microseconds(number == 0 ? 10000 : 100)); // then one soon after another
+                idle(std::chrono::microseconds(number == 0 ? 10000 : 100)); // then in quick succession
                 for (int r = 0; r < size_; ++r)
                     if (r != rank_ && others(r))
                         send(*session_, r, number, small(number));
@@ -902,7 +905,7 @@ private:
 
     void checkAgain()
     {
-        std::vector<std::pair<int, Buffer>> kept; // a message may be read when its transport is no more
+        std::vector<std::pair<int, Buffer>> kept; // a message stays readable when its transport is gone
         for (int round = 0; round < 6; ++round) {
             End& end = make();
             begin(end);
@@ -947,7 +950,7 @@ private:
         }
     }
 
-    // The others wait for rank 0, which never calls stop(true). That it has failed they learn from its message.
+    // The others wait for rank 0, which never calls stop(true). They learn from its message that it has failed.
     void checkHopelessStop()
     {
         End& end = make();
@@ -979,7 +982,7 @@ private:
         begin(end);
         meet();
         sendAll(end, everyone, 20, mixed());
-        if (isSender(rank_, 0)) { // to ranks that have left
+        if (isSender(rank_, 0)) { // some messages go to ranks that have left
             idle(std::chrono::milliseconds(20));
             sendAll(end, everyone, 20, mixed());
             idle(std::chrono::milliseconds(20));
@@ -1015,17 +1018,18 @@ private:
 
     static constexpr std::chrono::milliseconds repeatAfter{100};
     Clock::time_point nextRepeat_;
-    std::string verdict_; // what was announced last
+    std::string verdict_; // the text announced last
     bool givesUp_ = false;
     std::vector<Peer> peers_;
 };
 
 } // namespace detail
 
-// Collective over `communicator`, of any size, though one rank alone shows little. Each rank gets the same cases, and a
-// case that failed anywhere has a message everywhere (as far as messages arrive). After a case that could not end the
-// others are not run. Every case has its time limit, also for calls that never return: those are left behind in their
-// thread, with their transport. The exceptions are the first constructor, and transports that only one thread may poll.
+// Runs all cases. Collective over `communicator`, which may have any size, though one rank alone shows little. Each
+// rank returns the same cases, and a case that failed anywhere has a message everywhere (as far as messages arrive).
+// After a case that could not end, the others are not run. Every case has a time limit, even if a call never returns:
+// such a call is left behind in its thread, with its transport. The time limit does not hold for the first constructor,
+// and for transports that only one thread may poll.
 template <class Transport>
 std::vector<ConformanceResult> checkTransport(const typename Transport::Communicator& communicator,
                                               const ConformanceOptions& options = {})

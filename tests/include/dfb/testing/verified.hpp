@@ -1,6 +1,6 @@
-// Verified: a tile operation of the library that checks itself: each finished tile, in all channels that the image has,
-// against the reference of the inputs that it got, as they were decoded. For tests and for users who want to see it;
-// slow. Dithered values are not the exact ones rounded, and are counted as wrong.
+// Verified: a tile operation of the library that checks itself. It compares each finished tile, in all channels that
+// the image has, with the reference for the decoded inputs of the tile. For tests, and for users who want proof; slow.
+// Dithered values are not the rounded exact ones, and count as wrong.
 //
 //   dfb::testing::Verification verification;      // one per rank
 //   DistributedFrameBuffer<dfb::testing::Verified<dfb::AlphaBlend>> fb(...);
@@ -42,7 +42,7 @@ inline AuxRow auxRowOf(const FinishedTile& out, int y)
             detail::idsOf(rowOf(out, detail::InstanceId, y))};
 }
 
-// Collects over tiles. From any thread.
+// Collects the reports of all tiles. Any thread may call the members.
 class Verification {
 public:
     void add(const ErrorReport& tile)
@@ -61,7 +61,7 @@ private:
     ErrorReport report_; // under mutex_
 };
 
-// `Base`: one of sort_last.hpp or image_parallel.hpp.
+// `Base`: an operation of sort_last.hpp or image_parallel.hpp.
 template <class Base>
 class Verified {
 public:
