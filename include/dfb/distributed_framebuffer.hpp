@@ -370,8 +370,8 @@ public:
     // The number of the frame that image() shows, as in FrameReport::frame; -1 if it is empty. Thread as above.
     std::int64_t imageFrame() const noexcept { return lastEnded_->imageFrame(); }
 
-    // On the display rank: whether image() has that finished tile. After a frame that ended well it has all; see
-    // FrameConfig::allowPartial. Thread as above.
+    // On the display rank: whether image() has that finished tile. After a frame that ended well it has all of them;
+    // see FrameConfig::allowPartial. Thread as above.
     bool isComplete(int tile) const { return lastEnded_->isComplete(tile); }
 
     // For programs without a progress thread (Progress::Caller) or without workers (CallerExecutor); otherwise it does

@@ -57,7 +57,7 @@ struct InputImage {
     const float* depth = nullptr;  // grows away from the camera
     std::ptrdiff_t rowPixels = 0;  // from a row to the next, of colour and depth; 0: the width of `region`
     bool bottomUp = false;         // the first row is the lowest, as in OpenGL
-    bool isBgra = false;           // bytes are blue, green, red, alpha
+    bool isBgra = false;           // pixels are blue, green, red, alpha
     bool hasStraightAlpha = false; // colours are not multiplied by alpha yet; 8-bit ones then travel as floats
     // A pixel at this depth or beyond is empty; 1 in OpenGL. Infinity: no limit.
     float farDepth = std::numeric_limits<float>::infinity();

@@ -30,7 +30,7 @@ struct PixelTile {
     Region region;
     float* color = nullptr;       // 4 a pixel, premultiplied linear RGBA
     const float* depth = nullptr; // 1 a pixel; null unless the image has depth
-    AuxRow aux{};                 // of all pixels; null if the image does not have it
+    AuxRow aux{};                 // for all pixels; a channel is null if the image does not have it
     std::int64_t frame = 0;       // its number
 
     std::size_t pixelCount() const noexcept

@@ -47,7 +47,7 @@ public:
         std::uint32_t source = 0;
         int place = 0; // 0: in front
     };
-    // By ascending source.
+    // Sorted by ascending source.
     const std::vector<Place>& places() const noexcept { return places_; }
 
     // Returns -1 if the source is not in the order.

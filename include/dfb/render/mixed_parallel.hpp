@@ -152,8 +152,8 @@ private:
         return costs;
     }
 
-    std::unordered_map<std::uint64_t, double> costs_;           // of the last frame
-    std::unordered_map<std::uint64_t, std::vector<int>> table_; // of this one: a rank per pass
+    std::unordered_map<std::uint64_t, double> costs_;           // cost of each pair in the last frame
+    std::unordered_map<std::uint64_t, std::vector<int>> table_; // of this frame: the rank for each pass
 };
 
 namespace detail {
@@ -165,7 +165,7 @@ DFB_DETECTS(has_plan_v,
 // The jobs of a mixed-parallel frame.
 struct MixedWork {
     std::vector<BrickInTile> pairs;
-    std::vector<int> passes;  // of each pair
+    std::vector<int> passes;  // how many passes each pair has
     std::vector<Job> jobs;    // of this rank; `item` is an index into `pairs`
     std::vector<int> perTile; // how many pairs each tile has
 
@@ -205,8 +205,8 @@ struct MixedWork {
 
 // The work of an OrderedLoop: that of a MixedParallelLoop in a known order.
 struct OrderedWork : MixedWork {
-    std::vector<int> place;             // of each brick, from the front
-    std::vector<int> firstPair;         // of each tile, or -1
+    std::vector<int> place;             // each brick's place in the order; 0: in front
+    std::vector<int> firstPair;         // where each tile's pairs begin, or -1
     std::vector<int> empty;             // the tiles that this rank owns and no brick projects to
     std::atomic<bool> anyHidden{false}; // in the last frame an input of this rank was hidden, or hid others
     std::vector<std::atomic<int>>

@@ -66,7 +66,7 @@ public:
         }
     }
 
-    // By ascending id.
+    // Sorted by ascending id.
     const std::vector<SharedBrick>& bricks() const noexcept { return bricks_; }
 
     // This rank.

@@ -48,7 +48,7 @@ struct FaultDecision {
     bool reorder = false, delay = false, duplicate = false, drop = false, corrupt = false;
     std::chrono::nanoseconds delayBy{0}, copyDelayBy{0};
     int overtakenBy = 0;
-    std::uint64_t random = 0; // for where to corrupt it
+    std::uint64_t random = 0; // decides where the message is corrupted
 };
 
 namespace detail {
@@ -156,8 +156,7 @@ public:
         else
             base_.send(destination, std::move(message));
         if (heldCount_ > 0)
-            base_.interrupt(); // poll() lets go what this message was to overtake, nap() learns of what it is to wake
-                               // for
+            base_.interrupt(); // poll() releases what this message has overtaken; nap() learns when to wake
     }
 
     bool poll()
