@@ -29,7 +29,7 @@ inline Ball ballOf(int number)
             0.9f};
 }
 
-// Where a ray enters a ball and leaves it, as distances along it; false if it misses.
+// Computes the distances along a ray at which it enters and leaves a ball. Returns false if the ray misses.
 inline bool hits(const Ball& ball, const dfb::Vec3& eye, const dfb::Vec3& direction, float& enter, float& leave)
 {
     const dfb::Vec3 way = ball.center - eye;
@@ -41,7 +41,7 @@ inline bool hits(const Ball& ball, const dfb::Vec3& eye, const dfb::Vec3& direct
     return true;
 }
 
-// The colour of a pixel whose ray goes through the ball, and its depth. Leaves them as they are if the ray misses.
+// Sets the colour and depth of a pixel whose ray goes through the ball. Leaves them as they are if the ray misses.
 inline void renderBall(const Ball& ball, const dfb::Vec3& eye, const dfb::Vec3& direction, float* rgba, float& depth)
 {
     float enter = 0, leave = 0;

@@ -1,7 +1,7 @@
-// A tile operation of your own, without a renderer: a field on three levels of refinement, as in simulations with
-// adaptive meshes. A patch may be on any rank. It announces how many finer patches refine it, on whatever rank they
-// are: level l is generation l of the tile's tree. The operation keeps the finest value of each pixel, and drops the
-// rest.
+// A tile operation of your own, without a renderer. It shows a field on three levels of refinement, as in simulations
+// with adaptive meshes. Patches are spread over all ranks. Each patch announces how many finer patches refine it,
+// whichever ranks have those: the patches of level l are generation l in the tree of a tile's inputs. The operation
+// keeps the finest value of each pixel, and drops the rest.
 //   mpirun -n 4 custom_tile_op        writes custom_tile_op.ppm, and compares it with the field as one process sees it
 
 #include <dfb/dfb.hpp>
@@ -27,7 +27,7 @@ public:
         level_.assign(images_.count(), -1);
     }
 
-    void add(dfb::Fragment&& fragment) // in any order
+    void add(dfb::Fragment&& fragment) // called in any order of the fragments
     {
         const int pass = fragment.header().pass, level = fragment.header().generation;
         fragment.forEachPixel([&](int x, int y, const float* rgba, float) {
@@ -43,7 +43,7 @@ public:
 
 private:
     dfb::PassImages images_;
-    std::vector<int> level_; // of the value that a pixel has
+    std::vector<int> level_; // level of the value that each pixel has
 };
 static_assert(dfb::is_tile_op_v<FinestLevel>);
 
@@ -54,7 +54,7 @@ double field(double x, double y)
     return std::exp(-r / 120) * std::sin(600 / (r + 12) + 2 * std::atan2(v, u));
 }
 
-// Patch (i, j) of a level is there if the field varies too much in it for the level above.
+// Patch (i, j) of a level exists if the field varies too much in it for the next coarser level.
 bool exists(int level, int i, int j)
 {
     if (level == 0)
@@ -70,7 +70,7 @@ bool exists(int level, int i, int j)
     return highest - lowest > 0.2;
 }
 
-// The colour of a pixel on a level: that of its cell's middle.
+// The colour of a pixel on a level is that of the middle of its cell.
 void colorOf(int level, int x, int y, float* rgba)
 {
     const int cell = cellSize[level];
@@ -87,7 +87,7 @@ int main(int argc, char** argv)
     using FrameBuffer = dfb::DistributedFrameBuffer<FinestLevel>;
     FrameBuffer fb(mpi.communicator(), {width, height, dfb::OutputFormat::SRGBA8});
     dfb::FrameConfig params;
-    params.timeout = std::chrono::milliseconds(10000); // a patch that was announced and does not come is an error then
+    params.timeout = std::chrono::milliseconds(10000); // if an announced patch does not come by then, it is an error
     auto frame = fb.begin(params);
     const auto tile = std::make_unique<FrameBuffer::Tile>();
     frame.guard([&] { // an exception comes out of end(), on all ranks

@@ -1,6 +1,6 @@
-// Bricks within each other: five glass shells around one point, dealt out to the ranks. A ray meets the outer shell,
-// the inner ones, and the outer shell again, so each brick sends two segments of a pixel. The picture shows the shells
-// one within the other, as if one rank had rendered all.
+// Bricks within each other: five concentric glass shells, dealt out to the ranks. A ray meets the outer shell, then the
+// inner ones, then the outer shell again, so a brick sends up to two segments of the ray for each pixel. The picture
+// shows the shells one within the other, as if one rank had rendered all.
 //   mpirun -n 4 deep    writes deep.ppm
 #include "ball.hpp"
 

@@ -16,7 +16,7 @@ namespace {
 
 constexpr int width = 640, height = 480;
 
-// Returns the pixels that glReadPixels() would give of the ball of this number.
+// Draws ball `number` into the image, in the form in which glReadPixels() would return it.
 void renderBall(int number, std::vector<std::uint8_t>& pixels, std::vector<float>& depths)
 {
     const float centerX = 190 + 85.0f * static_cast<float>(number % 4),
@@ -29,7 +29,7 @@ void renderBall(int number, std::vector<std::uint8_t>& pixels, std::vector<float
             const float square = dx * dx + dy * dy;
             if (square >= 1)
                 continue;
-            const float towards = std::sqrt(1 - square); // the normal's part along the view
+            const float towards = std::sqrt(1 - square); // component of the normal towards the viewer
             const auto i = static_cast<std::size_t>(y * width + x);
             const float depth = (distance - radius * towards) / 600;
             if (depth >= depths[i])

@@ -1,6 +1,6 @@
-// The whole scene on every rank: tiles are handed out on demand, because some take much longer than others. A pixel
-// operation runs on the owners of finished tiles, and darkens the corners of the image. The picture shows the
-// Mandelbrot set.
+// Every rank has the whole scene. Tiles are handed out to the ranks on demand, because some take much longer than
+// others. A pixel operation runs on the owners of finished tiles, and darkens the corners of the image. The picture
+// shows the Mandelbrot set.
 //   mpirun -n 4 image_parallel    writes image_parallel.ppm
 
 #include <dfb/dfb.hpp>
@@ -14,7 +14,7 @@ namespace {
 
 constexpr int width = 600, height = 400;
 
-// Runs once for each finished tile, several at once. A pixel operation may read and change all of its pixels.
+// The pixel operation. It runs once for each finished tile, on several tiles at once, and may change all their pixels.
 struct Vignette {
     void process(dfb::PixelTile& tile) const
     {

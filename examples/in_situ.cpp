@@ -1,8 +1,9 @@
-// A simulation that renders its fields while it runs: two substances that spread and react (Gray and Scott) on a
+// A simulation that renders its fields while it runs: two substances diffuse and react (the Gray-Scott model) on a
 // periodic grid. The grid is cut into slabs, whose number does not depend on the number of ranks: each rank holds some
-// consecutive slabs, or none. Every so many steps each rank renders its own slabs, and they become one picture.
+// consecutive slabs, or none. After every 80 steps (option --every) each rank renders its own slabs, and dfb composites
+// them into one picture.
 //   mpirun -n 4 in_situ        writes in_situ_0000.ppm and so on; in_situ --help has the options
-//   mpirun -n 4 in_situ --live        shows them in a browser, where they can be turned and the simulation be stopped
+//   mpirun -n 4 in_situ --live        shows the pictures in a browser, to turn them and to stop the simulation
 #include "live/interrupt.hpp"
 #include "live/live_view.hpp"
 
@@ -44,7 +45,7 @@ struct Field {
 
 class GrayScott {
 public:
-    // This rank has layers [begin, end), at least two or none; ranks `below` and `above` have those next to them.
+    // This rank has layers [begin, end): none, or at least two. Ranks `below` and `above` have the layers next to them.
     GrayScott(MPI_Comm comm, int n, int begin, int end, int below, int above)
         : comm_(comm), below_(below), above_(above), u_(n, begin, end), v_(u_), nextU_(u_), nextV_(u_)
     {
@@ -67,8 +68,8 @@ public:
     const Field& u() const { return u_; }
     const Field& v() const { return v_; }
 
-    // One step in time. A voxel is the same function of the same neighbours on whatever rank: so the fields are equal
-    // bit for bit on any number of ranks.
+    // One step in time. On any rank, a voxel is the same function of the same neighbours, so the fields are equal, bit
+    // for bit, on any number of ranks.
     void advance(dfb::Executor& executor)
     {
         const int begin = u_.begin, end = u_.end;
@@ -83,7 +84,7 @@ public:
         std::swap(v_, nextV_);
     }
 
-    // Fills ghosts for rendering: one layer is enough to interpolate values, gradients take two.
+    // Fills the ghosts for rendering: one layer is enough to interpolate values, but gradients need two.
     void prepareRendering()
     {
         if (u_.begin == u_.end)
@@ -93,8 +94,8 @@ public:
     }
 
 private:
-    // Sends the outermost layers and receives ghosts. A rank may be its own neighbour; and the same may be on both
-    // sides, which the tags tell apart.
+    // Sends the outermost layers and receives the ghosts. A rank may be its own neighbour, and the neighbours on both
+    // sides may be one rank; tags tell the messages of the two sides apart.
     void startExchange(int layers)
     {
         const int down = 0, up = 1, count = layers * u_.n * u_.n;
@@ -108,8 +109,8 @@ private:
         }
     }
 
-    // MPI_Waitall would spin: where ranks share a core, until the scheduler gives the core to the one that is waited
-    // for, some ms for each.
+    // MPI_Waitall would spin. Where ranks share a core, each would spin for some ms, until the scheduler gives the core
+    // to the rank that it waits for.
     void finishExchange()
     {
         int done = 0;
@@ -137,7 +138,8 @@ private:
         }
     }
 
-    // Of a row of voxels, over 18 neighbours: over 6 of them things would grow along the axes and become cubes.
+    // The Laplacian of a row of voxels, from 18 neighbours. With only 6, shapes would grow along the axes and become
+    // cubes.
     static void laplacian(const Field& field, int y, int z, float* result)
     {
         const int n = field.n, before = (y + n - 1) % n * n, here = y * n, behind = (y + 1) % n * n;
@@ -167,12 +169,12 @@ private:
 
 constexpr int width = 640, height = 480; // of the pictures, unless viewers want another size
 constexpr float fieldOfView = 32;        // vertical, in degrees
-constexpr float visible = 0.1f;          // values of v above this are
+constexpr float visible = 0.1f;          // values of v above this are visible
 constexpr float rayStep = 0.5f;          // voxels from sample to sample
 
-// The box around what can be seen in layers [begin, end): rays skip the rest, and tiles that it does not touch cost
-// nothing. Voxels lie at whole numbers; a sample takes the 8 around it, and its gradient those next to them. Without
-// anything to see, lower and upper are the same.
+// The box around all that is visible in layers [begin, end). Rays skip what is outside, and tiles that the box does not
+// touch cost nothing. Voxels lie at integer coordinates; a sample needs the 8 voxels around it, and its gradient those
+// next to these. If nothing is visible, lower and upper are equal.
 dfb::Box3 visibleBox(const Field& v, int begin, int end)
 {
     const float last = float(v.n - 2);
@@ -191,12 +193,12 @@ dfb::Box3 visibleBox(const Field& v, int begin, int end)
             {std::min(upper.x, last), std::min(upper.y, last), std::min(upper.z, beyond)}};
 }
 
-// Adds a sample behind what a pixel has.
+// Adds a sample behind those that a pixel already has.
 void addSample(float u, float v, const Vec3& gradient, const Vec3& way, const Vec3& light, float* rgba)
 {
     const float density = std::min(1.0f, (v - visible) / 0.12f);
     const float alpha = (1 - rgba[3]) * (1 - std::exp(-2 * rayStep * density * density));
-    // Where it is crowded little is left of both substances: dark clefts, bright ridges.
+    // In crowded places little is left of both substances: these are dark clefts, the others bright ridges.
     const float plenty = std::clamp((u + v - 0.6f) / 0.18f, 0.0f, 1.0f);
     const Vec3 cleft{0.05f, 0.01f, 0.15f}, flank{0.70f, 0.05f, 0.14f}, ridge{1.0f, 0.55f, 0.20f};
     Vec3 color = plenty < 0.5f ? cleft + 2 * plenty * (flank - cleft) : flank + (2 * plenty - 1) * (ridge - flank);
@@ -222,7 +224,7 @@ void renderSlab(const GrayScott& fields, const dfb::PerspectiveCamera& camera, c
     tile.forEachPixel([&](int column, int line, float* rgba, float& depth) {
         const Vec3 way = camera.direction(column + 0.5, line + 0.5, image.width(), image.height());
         float enter = 0, leave = 1e6f;
-        const auto clip = [&](float a, float b) { // in this order a NaN changes nothing
+        const auto clip = [&](float a, float b) { // with the arguments in this order, a NaN changes nothing
             enter = std::max(enter, std::min(a, b));
             leave = std::min(leave, std::max(a, b));
         };
@@ -231,8 +233,9 @@ void renderSlab(const GrayScott& fields, const dfb::PerspectiveCamera& camera, c
         clip((lower.z - eye.z) / way.z, (upper.z - eye.z) / way.z);
         if (!(enter < leave))
             return;
-        // Samples lie at whole steps from the eye, for all slabs, and belong to the slab whose half-open box they are
-        // in: where two meet, none is missed or taken twice. One step more than it takes is for rounding.
+        // In all slabs, samples lie at multiples of rayStep from the eye. A sample belongs to the slab whose half-open
+        // box it is in, so none is missed or taken twice where two slabs meet. The loop takes one step more than
+        // needed, because of rounding.
         const int last = int(leave / rayStep) + 1;
         for (int k = int(enter / rayStep); k <= last && rgba[3] < 0.995f; ++k) {
             const float distance = float(k) * rayStep;
@@ -314,19 +317,19 @@ Options parse(int argc, char** argv)
         options.out = "in_situ";
     if (options.size < 8 || options.size > 1024)
         throw std::invalid_argument("--size must be 8 to 1024");
-    if (options.slabs > options.size / 2) // ghosts come from the next slab alone
+    if (options.slabs > options.size / 2) // ghosts come from the adjacent slab only
         throw std::invalid_argument("--slabs must be half of --size at most: a slab has two layers or more");
     return options;
 }
 
 using FrameBuffer = dfb::DistributedFrameBuffer<dfb::AlphaBlend>;
 
-// Where a picture is seen from, and where its light comes from: from above, to the left.
+// The camera of a picture, and the direction to its light, which comes from above and the left.
 struct Sight {
     dfb::PerspectiveCamera camera;
     Vec3 light;
 
-    // `outward`: from what is looked at to the eye.
+    // `outward`: the direction from the target to the eye; (c, s): x and z of the same, if it were horizontal.
     Sight(const Vec3& target, const Vec3& outward, float distance, float c, float s)
         : camera(dfb::PerspectiveCamera::along(target + distance * outward, -1 * outward, {0, 1, 0}, fieldOfView)),
           light(dfb::normalize(outward + Vec3{0.6f * s, 0.7f, -0.6f * c}))
@@ -336,14 +339,14 @@ struct Sight {
 
 constexpr float wholeView = 2.4f; // the distance, in sides of the grid, from which all of it is in the image
 
-// From a slow orbit around a grid of n^3 voxels.
+// The view of a step, from a slow orbit around a grid of n^3 voxels.
 Sight orbit(int n, int step)
 {
     const float angle = 0.6f + 6e-4f * float(step), c = std::cos(angle), s = std::sin(angle);
     return {0.5f * float(n - 1) * Vec3{1, 1, 1}, dfb::normalize(Vec3{c, 0.5f, s}), wholeView * float(n), c, s};
 }
 
-// As the viewers want it.
+// The view that the viewers want.
 Sight wished(int n, const example::LiveCamera& camera)
 {
     constexpr double degree = 3.14159265358979323846 / 180;
@@ -354,12 +357,12 @@ Sight wished(int n, const example::LiveCamera& camera)
     return {target, {flat * c, float(std::sin(elevation)), flat * s}, float(camera.distance) * float(n), c, s};
 }
 
-// The wishes of the viewers of a live view, on all ranks. Without a live view there are none.
+// What the viewers of a live view want to see (their wishes), on all ranks. Without a live view there are none.
 class Viewers {
 public:
     Viewers(FrameBuffer& fb, const Options& options) : fb_(fb), isLive_(options.live.has_value()) {}
 
-    // Returns why there can be no live view, on all ranks; nothing if there is one or need be none. Collective.
+    // Opens the live view, if there is to be one. Returns on all ranks why it failed, or an empty string. Collective.
     std::string open(const Options& options)
     {
         if (!isLive_)
@@ -390,9 +393,9 @@ public:
         return {};
     }
 
-    // Listens, and calls show() where they want another picture of the same step. Returns when the simulation may go
-    // on: at once, or when they have paused it, not before they want that. Returns false if the job is to end.
-    // Collective, outside frames.
+    // Takes new wishes, and calls show() if the viewers want another picture of the same step. Returns true when the
+    // simulation may go on: at once, or, if they have paused it, when they let it go on. Returns false if the job is to
+    // end. Collective, outside frames.
     template <class Show>
     bool mayGoOn(bool isBetweenPictures, const Show& show)
     {
@@ -463,10 +466,10 @@ bool write(FrameBuffer& fb, const std::string& name)
     } catch (const std::runtime_error&) {
         isWritten = false;
     }
-    return fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 1; // the others cannot see it
+    return fb.allReduce({isWritten}, FrameBuffer::Reduce::Min)[0] == 1; // the other ranks cannot see whether it is
 }
 
-// Returns what went wrong, on all ranks; rank 0 has the best words for it.
+// Returns what went wrong, on all ranks, or an empty string. The message of rank 0 is the most precise.
 std::string run(MPI_Comm comm, const Options& options)
 {
     FrameBuffer fb(comm, {width, height, dfb::OutputFormat::SRGBA8});
@@ -482,7 +485,7 @@ std::string run(MPI_Comm comm, const Options& options)
     const int begin = firstSlab(fb.rank()), end = firstSlab(fb.rank() + 1);
     GrayScott simulation(comm, n, firstLayer(begin), firstLayer(end), holder(begin - 1), holder(end));
 
-    dfb::World world; // what there is to be seen of this rank's slabs
+    dfb::World world; // boxes around what is visible of this rank's slabs
     dfb::DataParallelLoop loop(fb, world);
     const auto render = [&](int step) {
         const example::LiveWishes& wishes = viewers.wishes();
@@ -494,7 +497,7 @@ std::string run(MPI_Comm comm, const Options& options)
         for (int slab = begin; slab < end; ++slab) {
             const dfb::Box3 box = visibleBox(simulation.v(), firstLayer(slab), firstLayer(slab + 1));
             if (box.lower.z < box.upper.z)
-                world.add({std::uint32_t(slab), box}); // under the same number on whatever rank it is
+                world.add({std::uint32_t(slab), box}); // a slab has the same number on any rank
         }
         dfb::FrameConfig params;
         params.background = {0.004f, 0.006f, 0.012f, 1};
@@ -540,8 +543,8 @@ std::string run(MPI_Comm comm, const Options& options)
 int main(int argc, char** argv)
 {
     dfb::MpiSession mpi(argc, argv);
-    // Not the world, in which there may be more than one of us: `mpirun -n 2 in_situ --out a : -n 2 in_situ --out b`
-    // runs two simulations, each with a framebuffer of its own.
+    // MPI_COMM_WORLD may hold several runs of this program: `mpirun -n 2 in_situ --out a : -n 2 in_situ --out b` runs
+    // two simulations. Each gets a communicator and a framebuffer of its own.
     const int* program = nullptr;
     int known = 0, rank = 0;
     MPI_Comm_get_attr(mpi.communicator(), MPI_APPNUM, &program, &known);

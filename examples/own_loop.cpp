@@ -1,5 +1,5 @@
-// A loop of your own, as Listing 3 of the paper: each rank renders its balls into all tiles that they cover. The
-// picture shows eight glass balls on a spiral.
+// A rendering loop of your own, as in Listing 3 of the paper: each rank renders its balls into all tiles that they
+// cover. The picture shows eight glass balls on a spiral.
 //   mpirun -n 4 own_loop          writes own_loop.ppm
 //   mpirun -n 4 own_loop fail     the last rank's renderer throws; each rank says so
 #include "ball.hpp"

@@ -15,7 +15,7 @@ namespace {
 
 constexpr int width = 360, height = 270;
 
-// A number in [0, 1) out of pixel and sample alone, so that each rank would draw the same.
+// A random number in [0, 1) that depends on its arguments only, so it is the same on every rank.
 float randomOf(std::uint64_t pixel, std::uint64_t sample, std::uint64_t dimension)
 {
     std::uint64_t h = (pixel * 4096 + sample) * 2 + dimension;
@@ -50,7 +50,7 @@ try {
                         return;
                     }
                     if (way.y >= 0)
-                        return; // beyond the horizon
+                        return; // above the horizon
                     const dfb::Vec3 floor = eye + (-eye.y / way.y) * way;
                     const float r = std::sqrt(randomOf(pixel, sample, 0)), a = 6.2831853f * randomOf(pixel, sample, 1);
                     const dfb::Vec3 toLamp = dfb::Vec3{-2 + r * std::cos(a), 5, 1 + r * std::sin(a)} - floor;

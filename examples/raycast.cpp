@@ -1,9 +1,11 @@
 // A volume renderer for several ranks, in one file. The volume is cut into bricks, and each rank reads and renders its
-// own. A pixel's ray collects light in each brick that it meets; the library sorts these colours by depth, and blends.
+// own. A pixel's ray collects light in each brick that it meets; the library sorts these colours by depth and blends
+// them.
 //   mpirun -n 4 raycast [VOLUME [FROM [BRICKS]]]      writes raycast.ppm
 // VOLUME is a file such as head_256x256x128_uint8.raw: sizes and type of the voxels (uint8, uint16 or float32) are in
-// its name, x is fastest. Without one a knot is rendered. BRICKS (8) does not depend on the number of ranks. Equal
-// bricks make an equal picture, bit for bit, however many ranks there are.
+// its name, x is fastest. Without a file a knot is rendered. Values below FROM (0.15; 0 to 1 is the whole range) are
+// transparent. BRICKS (8) does not depend on the number of ranks. With the same bricks the picture is the same, bit for
+// bit, on any number of ranks.
 #include <dfb/dfb.hpp>
 
 #include <algorithm>
@@ -51,7 +53,7 @@ Volume volumeOf(const std::string& path)
     return volume;
 }
 
-// A trefoil knot: how near the point is to it.
+// How near a point is to a trefoil knot, from 1 on the knot to 0 far away.
 float knot(float x, float y, float z)
 {
     static const auto points = [] {
@@ -71,10 +73,10 @@ float knot(float x, float y, float z)
     return std::exp(-nearest / 60);
 }
 
-// The voxels of one brick, and its ghosts.
+// The voxels of one brick and its ghost voxels.
 class BrickVoxels {
 public:
-    // The cells [lower, upper) of the volume. Reads no more of the file than that.
+    // The brick is cells [lower, upper) of the volume. Reads from the file only these voxels and the ghosts.
     BrickVoxels(const Volume& volume, const Index& lower, const Index& upper)
     {
         for (std::size_t a = 0; a < 3; ++a) {
@@ -105,7 +107,7 @@ public:
         return {*ends.first, *ends.second};
     }
 
-    // Trilinear interpolation. At the border of the volume the last voxel goes on.
+    // Trilinear interpolation. Beyond the border of the volume the values of the outermost voxels continue.
     float at(const dfb::Vec3& p) const
     {
         const float position[3] = {p.x, p.y, p.z};
@@ -147,7 +149,8 @@ private:
     std::vector<float> values_;
 };
 
-// Cuts the cells [lower, upper) into `count` bricks, always across the longest side. Calls `use(id, lower, upper)`.
+// Cuts the cells [lower, upper) into `count` bricks, or fewer if cells run out, always across the longest side. Calls
+// `use(id, lower, upper)`.
 template <class Use>
 void cut(const Index& lower, const Index& upper, int id, int count, const Use& use)
 {
@@ -166,12 +169,13 @@ void cut(const Index& lower, const Index& upper, int id, int count, const Use& u
     cut(middle, upper, id + half, count - half, use);
 }
 
-// Light along a ray within a brick. Samples lie at fixed distances from the eye, and each is in one brick only.
+// Collects light along a ray within a brick. Samples lie at fixed distances from the eye, and each is in one brick
+// only.
 struct RayCaster {
     const BrickVoxels& voxels;
     dfb::Box3 bounds;
     float lowest, highest; // of the whole volume
-    float from;            // values below are transparent, as parts of this range
+    float from;            // lower values are transparent; 0 is `lowest`, 1 `highest`
     static constexpr float step = 0.5f;
 
     void operator()(const dfb::Vec3& eye, const dfb::Vec3& direction, float* rgba, float& depth) const

@@ -23,7 +23,7 @@ try {
     for (int display = 0; display < layout.displayCount(); ++display)
         layout.ranks.push_back(display % mpi.size());
 
-    // The framebuffer and the wall share a connection; the framebuffer ends first.
+    // The framebuffer and the wall share a connection. The wall must outlive the framebuffer.
     const auto connection = dfb::connect<dfb::MpiTransport>(mpi.communicator());
     dfb::DisplayWall wall(connection, layout, dfb::OutputFormat::SRGBA8);
     dfb::DistributedFrameBuffer<dfb::AlphaBlend, dfb::ToWall> fb(connection, wall.frameBufferConfig(), {&wall});
