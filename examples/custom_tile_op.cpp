@@ -27,7 +27,7 @@ public:
         level_.assign(images_.count(), -1);
     }
 
-    void add(dfb::Fragment&& fragment) // called in any order of the fragments
+    void add(dfb::Fragment&& fragment) // the fragments come in any order
     {
         const int pass = fragment.header().pass, level = fragment.header().generation;
         fragment.forEachPixel([&](int x, int y, const float* rgba, float) {

@@ -109,8 +109,8 @@ private:
         }
     }
 
-    // MPI_Waitall would spin. Where ranks share a core, each would spin for some ms, until the scheduler gives the core
-    // to the rank that it waits for.
+    // MPI_Waitall would spin. Where ranks share a core, that takes some ms each time, until the scheduler gives the
+    // core to the rank that is waited for.
     void finishExchange()
     {
         int done = 0;

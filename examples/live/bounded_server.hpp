@@ -1,5 +1,5 @@
-// BoundedServer: cpp-httplib's server with limits that it does not have itself: how much a request may have, how long
-// it and its answer may take, how many connections there are.
+// BoundedServer: cpp-httplib's server with limits that it lacks: on the size of a request, on the time that a request
+// and its answer may take, and on the number of connections.
 #pragma once
 
 #include <httplib.h>
@@ -25,8 +25,8 @@ namespace example {
 
 class BoundedServer : public httplib::Server {
 public:
-    static constexpr std::size_t mostRequestBytes = 24 << 10; // with its headers
-    static constexpr std::size_t mostConnections = 48;        // served at once; others wait in the system
+    static constexpr std::size_t mostRequestBytes = 24 << 10; // including its headers
+    static constexpr std::size_t mostConnections = 48;        // served at once; the system queues others
     static constexpr std::chrono::seconds mostRequestTime{5}, mostAnswerTime{5}, mostIdleTime{2};
 
     BoundedServer()
@@ -34,15 +34,15 @@ public:
         new_task_queue = [] { return new Workers(mostConnections); };
         set_keep_alive_max_count(1000000);
         set_tcp_nodelay(true);
-        // Not SO_REUSEPORT, as is the default: with it a second job would share the port of the first.
+        // Replaces the default, SO_REUSEPORT, with which a second job would share the port of the first.
         set_socket_options([](socket_t socket) {
             const int yes = 1;
             setsockopt(socket, SOL_SOCKET, SO_REUSEADDR, &yes, sizeof yes);
         });
     }
 
-    // Ends all connections: where there are any, after `least`, in which requests are still answered, and after `most`
-    // also those that are in use. Any thread.
+    // Ends all connections. First waits up to `least` for clients to end theirs, while requests are still answered;
+    // then, until `most` has passed in all, for answers that are under way. Any thread.
     void hangUp(std::chrono::milliseconds least, std::chrono::milliseconds most)
     {
         std::unique_lock<std::mutex> lock(mutex_);
@@ -56,7 +56,8 @@ public:
 private:
     using Clock = std::chrono::steady_clock;
 
-    // A thread for each connection. While all are busy no connection is accepted: the job would run out of files.
+    // A thread for each connection. While all are busy no connection is accepted: otherwise the job could run out of
+    // file descriptors.
     class Workers : public httplib::ThreadPool {
     public:
         using ThreadPool::ThreadPool;
@@ -150,8 +151,8 @@ private:
         socket_t socket() const override { return socket_; }
 
     private:
-        // Whether `next` ends the name of a header for parts of an answer. Our page does not send it. cpp-httplib reads
-        // a list of ranges by recursion, 500 bytes of stack a character, and copies the answer for each of them.
+        // Whether `next` completes the name of the header `Range:`, which our page does not send. cpp-httplib parses a
+        // list of ranges by recursion, with 500 bytes of stack a character, and copies the answer for each range.
         bool asksForRanges(char next)
         {
             if (next == '\n')
@@ -177,7 +178,7 @@ private:
         socket_t socket_;
         std::array<char, 4096> buffer_{};
         std::size_t at_ = 0, end_ = 0, left_ = 0;
-        std::string line_; // its first characters
+        std::string line_; // the first characters of a line of the request
         Clock::time_point readUntil_, writeUntil_;
     };
 
@@ -213,7 +214,7 @@ private:
     }
 
     std::mutex mutex_;
-    std::condition_variable ended_; // a connection or an answer
+    std::condition_variable ended_; // a connection or an answer has ended
     std::set<socket_t> open_;
     int answering_ = 0;
     bool isHangingUp_ = false;

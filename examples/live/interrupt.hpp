@@ -1,4 +1,4 @@
-// Interrupt: Ctrl-C, or the signal by which a launcher ends a job, becomes a fact that a loop can ask for.
+// Interrupt: turns Ctrl-C, or the signal with which a launcher ends a job, into a flag that a loop can test.
 #pragma once
 
 #include <csignal>
@@ -6,8 +6,9 @@
 
 namespace example {
 
-// While one lives, SIGINT and SIGTERM are noted. A signal that comes more than two seconds after the first ends the
-// process as usual: then nobody has asked. (A terminal and a launcher may both send the first.)
+// While an object exists, SIGINT and SIGTERM set the flag. A signal that comes more than two seconds after the first
+// ends the process as usual, because the job has not reacted. (Earlier ones do not: both a terminal and a launcher may
+// send the first signal.)
 class Interrupt {
 public:
     Interrupt() : beforeInt_(install(SIGINT)), beforeTerm_(install(SIGTERM)) {}
@@ -23,7 +24,7 @@ public:
     static bool happened() { return first_ != 0; }
 
 private:
-    // When the first one came, in seconds of a clock that begins with 1; 0: none has.
+    // When the first signal came, in seconds of a clock that begins with 1; 0: none has come.
     static inline volatile std::sig_atomic_t first_ = 0;
 
     static void note(int signal)

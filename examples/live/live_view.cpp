@@ -42,7 +42,7 @@ std::string randomToken()
     return token;
 }
 
-// In a time that does not depend on where they differ.
+// Compares in a time that does not depend on where they differ.
 bool isSame(const std::string& a, const std::string& b)
 {
     unsigned differs = a.size() != b.size();
@@ -85,7 +85,7 @@ std::string pngOf(const std::uint8_t* rgba, int width, int height)
     return png;
 }
 
-// A picture that is shown, and what it is encoded as, for all viewers that ask for that.
+// A picture that is shown, and its JPEG encodings, which all viewers share.
 class Shown {
 public:
     Shown(std::uint64_t itsNumber, const std::uint8_t* rgba, int itsWidth, int itsHeight,
@@ -207,7 +207,7 @@ public:
             const LiveWishes now = current();
             if (now.number != number || now.ends || std::chrono::steady_clock::now() >= until)
                 return now;
-            // A signal wakes nobody.
+            // A signal does not wake this thread, so it looks every 100 ms.
             changed_.wait_until(lock,
                                 std::min(until, std::chrono::steady_clock::now() + std::chrono::milliseconds(100)));
         }
@@ -265,7 +265,7 @@ private:
     static constexpr std::chrono::seconds mostWait{8}; // for a picture
     static constexpr std::size_t mostBody = 4096;
 
-    // Under the lock.
+    // Needs the lock of mutex_.
     LiveWishes current() const
     {
         LiveWishes now = wishes_;
@@ -273,7 +273,7 @@ private:
         return now;
     }
 
-    // Under the lock of what is watched.
+    // Needs the lock of watchMutex_.
     void callIfMoved()
     {
         if (onMove_ && hasMoved(watched_, isOnlyIfSmaller_))
@@ -305,7 +305,7 @@ private:
         get("/picture.png", &Server::picture);
         get("/stats", &Server::stats);
         const auto post = [this](const char* path, void (Server::*answer)(const Json&, Response&)) {
-            // Read piece by piece: the library limits only bodies that say how long they are.
+            // Reads the body piece by piece, because the library limits only bodies that say how long they are.
             http_.Post(path, [this, answer](const Request&, Response& response, const httplib::ContentReader& read) {
                 guarded(response, [&] {
                     std::string body;
@@ -550,7 +550,7 @@ private:
     const bool hasSteps_;
     std::string url_;
 
-    mutable std::mutex mutex_; // of what follows
+    mutable std::mutex mutex_; // guards what follows
     mutable std::condition_variable changed_;
     std::optional<LiveScene> scene_; // none before open()
     LiveWishes wishes_;
@@ -563,7 +563,7 @@ private:
     std::atomic<std::uint64_t> look_{0}, smaller_{0}; // numbers of the last changes of the look, and to a smaller size
     std::atomic<bool> ends_{false};
 
-    std::mutex watchMutex_; // of these three; after the other
+    std::mutex watchMutex_; // guards these three; taken after mutex_
     std::uint64_t watched_ = 0;
     bool isOnlyIfSmaller_ = false;
     std::function<void()> onMove_;

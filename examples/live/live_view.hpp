@@ -1,8 +1,8 @@
 // LiveView: shows the pictures of a running job in browsers, and tells the job what their users want to see.
 //
-// One rank makes it, the one that has the image. It listens on 127.0.0.1 alone, and answers nobody who does not know
-// the random token in url(). Viewers fetch pictures when they are ready for one, so that a slow viewer gets fewer; all
-// that a viewer can do to the job is to change its wishes.
+// The rank that has the image makes it. It listens only on 127.0.0.1, and refuses requests without the random token in
+// url(). Viewers fetch a picture when they are ready for it, so a slow viewer gets fewer. All that a viewer can do to
+// the job is to change the wishes.
 #pragma once
 
 #include <dfb/frame.hpp>
@@ -23,11 +23,11 @@ namespace example {
 // Looks at `target`, from `distance` away: azimuth and elevation are as in LiveScene::axes.
 struct LiveCamera {
     double azimuth = 0, elevation = 0; // degrees
-    double distance = 0;               // in units of LiveScene::unit; 0: so that all is in the image
+    double distance = 0;               // in units of LiveScene::unit; 0: far enough to see everything
     std::array<double, 3> target{};    // in the world
 };
 
-// The wishes of the viewers. Its bytes may be sent to other ranks as they are.
+// What the viewers want to see (their wishes), in common for all of them. It can be sent to other ranks as bytes.
 struct LiveWishes {
     std::uint64_t number = 0; // grows with each change
     std::uint64_t look = 0;   // the number of the last change of camera or size
@@ -36,7 +36,7 @@ struct LiveWishes {
     std::int32_t samples = 1;           // per pixel while the camera rests
     std::int32_t isPaused = 0;
     std::int64_t steps = 0; // how often a single step was asked for
-    std::int32_t ends = 0;  // the job is to end: somebody has pressed the button, or Interrupt::happened()
+    std::int32_t ends = 0;  // the job is to end: a viewer has pressed the button, or Interrupt::happened()
 };
 static_assert(std::is_trivially_copyable_v<LiveWishes>);
 
@@ -52,12 +52,12 @@ struct LiveScene {
     int ranks = 1;
 };
 
-// A picture's data beside its pixels, for show().
+// What show() gets of a picture besides its pixels.
 struct LivePicture {
-    LiveWishes wishes;       // that it shows
+    LiveWishes wishes;       // the picture was made for these
     double distance = 0;     // of its camera
     int samples = 1;         // per pixel
-    std::string camera;      // as words of a command line; may be empty
+    std::string camera;      // as options of a command line; may be empty
     std::int64_t step = -1;  // of a simulation
     int tileSize = 0;        // of the framebuffer
     std::vector<int> owners; // rank of each tile, row by row
@@ -68,8 +68,8 @@ public:
     static constexpr int defaultPort = 8080;
 
     // Begins to listen. `port` 0: any port that is free; -1: the default port, or any if that is taken. `title` is
-    // shown on the page; `hasSteps`: there is a simulation that can be paused. Throws std::runtime_error if the port
-    // cannot be had, or if this program was built without what a live view needs.
+    // shown on the page; `hasSteps`: there is a simulation that can be paused. Throws std::runtime_error if the port is
+    // not available, or if this program was built without what a live view needs.
     static std::unique_ptr<LiveView> listen(const std::string& title, int port, bool hasSteps);
 
     LiveView() = default;
@@ -78,32 +78,33 @@ public:
     // Tells the viewers that the job has ended. Waits until their requests are answered, two seconds at most.
     virtual ~LiveView() = default;
 
-    // For a browser on this machine.
+    // The address to open in a browser on this machine.
     virtual const std::string& url() const = 0;
 
     // Viewers may have wishes from now on; `home` is what is shown until they have.
     virtual void open(const LiveScene& scene, const LiveWishes& home) = 0;
 
-    // Returns their wishes of this moment. Any thread.
+    // Returns the wishes at this moment. Any thread.
     virtual LiveWishes wishes() const = 0;
-    // Waits until they want something else than at `number`, or the job is to end, or for `atMost`.
+    // Waits until the wishes are others than those of this `number`, the job is to end, or `atMost` has passed. Returns
+    // the wishes.
     virtual LiveWishes waitForChange(std::uint64_t number, std::chrono::milliseconds atMost) const = 0;
 
     // Whether camera or size have changed since `look`, or the job is to end. With `onlyIfSmaller`: whether the size
-    // has become smaller since, as it does when somebody begins to turn a picture that takes long. Cheap. Any thread.
+    // has become smaller since, as it does when a viewer begins to turn a picture that takes long. Cheap. Any thread.
     virtual bool hasMoved(std::uint64_t look, bool onlyIfSmaller) const = 0;
-    // Runs `work`. If hasMoved() becomes true meanwhile, or is, `onMove` is called once, by any thread, unless it is
-    // for a signal, for which work() must look itself.
+    // Runs `work`. If hasMoved() is true or becomes true meanwhile, `onMove` is called once, by any thread. A signal
+    // during `work` does not cause that call: `work` must test for it itself.
     virtual void whileWatching(std::uint64_t look, bool onlyIfSmaller, const std::function<void()>& onMove,
                                const std::function<void()>& work) = 0;
 
-    // Shows 8-bit RGBA pixels, whose alpha is left out, and what the report says of them. Copies both; waits for no
-    // viewer. By one thread.
+    // Shows 8-bit RGBA pixels without their alpha, and what the report says about their frame. Copies both; waits for
+    // no viewer. Always the same thread.
     virtual void show(const std::uint8_t* rgba, int width, int height, const dfb::FrameReport& report,
                       LivePicture picture) = 0;
 };
 
-// The tiles of a framebuffer, for the picture.
+// Stores the size and the owners of a framebuffer's tiles in a picture.
 template <class FrameBuffer>
 void tellTiles(const FrameBuffer& fb, LivePicture& picture)
 {
@@ -112,9 +113,9 @@ void tellTiles(const FrameBuffer& fb, LivePicture& picture)
         picture.owners.push_back(fb.tileOwner(tile));
 }
 
-// Returns the wishes of the display rank's viewers, on all ranks, with `ends` if any rank is to end. `mine`: on the
-// display rank LiveView::wishes(), or what waitForChange() has returned; on the others only `ends` counts. Collective,
-// outside frames.
+// Returns the wishes of the display rank's viewers, on all ranks, with `ends` set if it is set on any rank. `mine` is,
+// on the display rank, what LiveView::wishes() or waitForChange() has returned; on the others only its `ends` counts.
+// Collective, outside frames.
 template <class FrameBuffer>
 LiveWishes shareWishes(FrameBuffer& fb, const LiveWishes& mine)
 {

@@ -1,4 +1,4 @@
-// LiveView where the packages that it needs are missing: it cannot be made.
+// LiveView for builds without the packages that it needs: listen() only throws.
 #include "live_view.hpp"
 
 #include <stdexcept>

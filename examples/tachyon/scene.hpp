@@ -1,4 +1,4 @@
-// A scene of Tachyon's, and its pixels in any part of the image. Of dfb it uses Region alone.
+// A scene of the ray tracer Tachyon, which renders any part of the image. Of dfb it uses only Region.
 #pragma once
 
 #include <dfb/image.hpp>
@@ -12,7 +12,7 @@
 
 inline constexpr int imageWidth = 480, imageHeight = 320;
 
-// Tachyon's scene: a spiral of balls over a floor that mirrors them. Not for two threads at once.
+// Tachyon's scene: a spiral of balls over a floor that mirrors them. One thread at a time may use it.
 class Scene {
 public:
     Scene()
@@ -33,11 +33,11 @@ public:
         }
     }
 
-    // Renders pixels [x0, x1) x [y0, y1) of the image, sampled at so much of a pixel from its middle. Returns red,
-    // green and blue of each; the first row is the lowest.
+    // Renders pixels [x0, x1) x [y0, y1) of the image, sampled `right` and `up` of the middle of each pixel, in pixels.
+    // Returns red, green and blue of each; the first row is the lowest.
     const std::vector<float>& render(const dfb::Region& part, double right = 0, double up = 0)
     {
-        // Exact in binary, so that the frustum of a tile has the very rays of the image's.
+        // Exact in binary, so that the rays of a tile's frustum are exactly those of the whole image.
         const double pixel = 5.0 / 2048, middleX = imageWidth / 2.0 - right, middleY = imageHeight / 2.0 + up;
         pixels_.resize(3 * static_cast<std::size_t>(part.width()) * static_cast<std::size_t>(part.height()));
         rt_resolution(scene_.get(), part.width(), part.height());

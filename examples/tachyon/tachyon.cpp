@@ -1,9 +1,9 @@
-// A ray tracer that others wrote, on the ranks of a job: Tachyon (package libtachyon-mt-0-dev). Every rank has the
-// whole scene. Each worker has a scene of Tachyon's to itself and renders the tiles that it is given, on demand. A tile
-// is a camera frustum of its own, and a sample moves the frustum by a part of a pixel. Tiles with edges get more
-// samples.
+// An existing ray tracer, Tachyon (package libtachyon-mt-0-dev), on the ranks of a job. Every rank has the whole scene.
+// Each worker thread has a Tachyon scene of its own and renders the tiles that it gets, on demand. Each tile is
+// rendered with its own camera frustum, and each sample moves the frustum by a part of a pixel. Tiles with edges get
+// more samples.
 //   mpirun -n 4 tachyon            writes tachyon.ppm
-//   mpirun -n 4 tachyon --check    also compares a frame with the whole image as Tachyon alone renders it: all bits
+//   mpirun -n 4 tachyon --check    also compares a frame with the whole image as Tachyon alone renders it, bit for bit
 #include "scene.hpp"
 
 #include <dfb/dfb.hpp>
@@ -24,7 +24,7 @@ Scene& myScene()
     return scene;
 }
 
-// Puts a part of the image as Tachyon renders it into a tile of that part.
+// Renders a tile with Tachyon. `right` and `up` are as in Scene::render().
 template <class Tile>
 void renderTile(Tile& tile, double right = 0, double up = 0)
 {
@@ -36,7 +36,8 @@ void renderTile(Tile& tile, double right = 0, double up = 0)
     });
 }
 
-// Whether one sample a pixel, put together from the tiles of all ranks, is Tachyon's own image, bit for bit.
+// Whether an image of one sample a pixel, made of the tiles of all ranks, equals the image of Tachyon alone, bit for
+// bit.
 bool isTachyonsImage(MPI_Comm communicator)
 {
     dfb::DistributedFrameBuffer<dfb::ImageParallel> fb(communicator,

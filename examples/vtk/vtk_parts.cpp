@@ -43,7 +43,7 @@ void addSurfaces(vtkRenderer* renderer, vtkImageData* part, vtkColorTransferFunc
     vtkNew<vtkOpenGLPolyDataMapper> mapper;
     mapper->SetInputConnection(contour->GetOutputPort());
     mapper->SetLookupTable(colors);
-    // Vertices as they are: VTK would move them by the middle of the part, and round.
+    // Keeps vertices as they are. Otherwise VTK would shift them by the middle of the part, and round.
     mapper->SetVBOShiftScaleMethod(vtkOpenGLVertexBufferObject::DISABLE_SHIFT_SCALE);
     vtkNew<vtkActor> actor;
     actor->SetMapper(mapper);
@@ -117,7 +117,7 @@ try {
     vtkNew<vtkRenderWindow> window;
     window->SetOffScreenRendering(1);
     window->SetSize(width, height);
-    window->SetMultiSamples(0); // or edges are blended with what is behind them in this window
+    window->SetMultiSamples(0); // otherwise edges are blended with what is behind them in this window
     window->SetAlphaBitPlanes(1);
     window->AddRenderer(renderer);
     window->Render();
@@ -136,7 +136,7 @@ try {
     dfb::InputImage image(rgba->GetPointer(0), isVolume ? nullptr : depths->GetPointer(0));
     image.bottomUp = true;
     image.farDepth = 1;
-    compositor.composite(image, static_cast<int>(place)); // the place counts for a volume only
+    compositor.composite(image, static_cast<int>(place)); // the place matters for a volume only
     if (compositor.isDisplayRank())
         dfb::writePpm(argv[2], compositor.image());
 } catch (const std::exception& e) {

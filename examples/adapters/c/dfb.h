@@ -12,9 +12,9 @@
 // communicator must call it, in the same order. What is wrong on one rank in a collective call, such as a null pointer
 // or a failing renderer, is an error on all ranks, with the rank and the reason in dfb_last_error(). Nobody hangs, and
 // the next picture can be made. Only the communicator and the framebuffer must be right on every rank: without them a
-// rank cannot tell the others. A rank that makes another call, or none, is waited for: set timeout_ms. One thread at a
-// time may call functions on a framebuffer. With MPI below MPI_THREAD_SERIALIZED it must be the one that has
-// initialised MPI. No exception leaves a function.
+// rank cannot tell the others. If a rank makes another call, or none, the others wait for it; timeout_ms limits how
+// long. One thread at a time may call functions on a framebuffer. With MPI below MPI_THREAD_SERIALIZED it must be the
+// one that has initialised MPI. No exception leaves a function.
 #ifndef DFB_H
 #define DFB_H
 
@@ -53,7 +53,8 @@ enum dfb_format {
     DFB_RGBA32F = 2 // floats, linear
 };
 
-// All ranks must give the same, but for `threads`. dfb_config_init() fills it.
+// All ranks must give the same values, except for `threads`. dfb_config_init() sets the defaults, the values after the
+// semicolons.
 typedef struct dfb_config {
     size_t struct_size; // of the dfb.h that the program was compiled with
     int width, height;  // of the picture in pixels, 1 to 65536
@@ -61,13 +62,14 @@ typedef struct dfb_config {
     int format;         // a dfb_format; DFB_SRGBA8
     int depth;          // 1: the picture has a depth for each pixel; 0
     int display_rank;   // the rank that gets the picture; 0
-    // Threads of this rank that render and composite. 1: none but the thread that calls, so a renderer need not be
-    // thread-safe. 0: one for each core that this rank has for itself. 1 by default.
+    // Threads of this rank that render and composite. 1: only the calling thread, so a renderer need not be
+    // thread-safe. 0: one for each core that this rank has for itself. Default: 1.
     int threads;
     float background[4]; // premultiplied linear RGBA behind everything; 0, 0, 0, 0
-    // 0: a picture may take for ever. Else the limit in milliseconds, from when this rank has drawn or given its part:
-    // DFB_FRAME_FAILED if it is not complete by then; DFB_TRANSPORT_FAILED after twice the time if a rank does not
-    // answer at all, as one that is lost. The error says whom it waited for. 0 by default. Other calls have no limit.
+    // The longest time for a picture in milliseconds, counted from when this rank has drawn or given its part. If the
+    // picture is not complete by then, the call returns DFB_FRAME_FAILED; if a rank does not answer at all, as when it
+    // is dead, DFB_TRANSPORT_FAILED after twice the time. The error says which rank it waited for. Default: 0, no
+    // limit. Other calls have no limit.
     int timeout_ms;
 } dfb_config;
 
@@ -80,15 +82,15 @@ void dfb_config_init_sized(dfb_config* config, size_t struct_size, int width, in
 // DFB_INVALID_ARGUMENT on all ranks if the configuration is wrong on any rank or differs between ranks. Backgrounds
 // or time-outs that differ fail each picture.
 int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
-// Does so with a handle of Fortran: that of `use mpi`, or the mpi_val of one of `use mpi_f08`.
+// The same with a Fortran handle: the one of `use mpi`, or the mpi_val of a communicator of `use mpi_f08`.
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer);
 
-// Ends a framebuffer, before MPI_Finalize(). Pointers to its picture are of no use then. Null is ignored. Collective;
-// waits for all ranks.
+// Destroys a framebuffer; call it before MPI_Finalize(). Pointers to its picture become invalid. Null is ignored.
+// Collective; waits for all ranks.
 void dfb_destroy(dfb_framebuffer* framebuffer);
 
 // Changes the size of the picture, which is empty then. Collective; waits for all ranks. DFB_INVALID_ARGUMENT on all
-// ranks, with nothing changed, if the size cannot be or differs between ranks.
+// ranks, with nothing changed, if the size is out of range or differs between ranks.
 int dfb_resize(dfb_framebuffer* framebuffer, int width, int height);
 
 // The place of this rank in the communicator, and the number of ranks; -1 without a framebuffer.
@@ -102,11 +104,12 @@ int dfb_height(const dfb_framebuffer* framebuffer);
 
 // ---- images that the ranks have rendered already
 
-// An image in memory of the program. dfb_input_init() fills it: there is nothing to show then.
+// An image in memory of the program. dfb_input_init() sets it to an input with nothing to show.
 typedef struct dfb_input {
     size_t struct_size; // of the dfb.h that the program was compiled with
-    // Set one of the two: 4 bytes or floats a pixel. 8-bit colours are blended as they are, level k as the float next
-    // to k / 255. If they are encoded for a display, ask for DFB_RGBA8, which does not encode them a second time.
+    // Set one of the two: 4 bytes or floats a pixel. 8-bit colours are blended as they are: level k counts as the float
+    // nearest to k / 255. If they are sRGB colours, ask for the format DFB_RGBA8, which does not encode them a second
+    // time.
     const uint8_t* rgba8;
     const float* rgba32f;
     const float* depth;     // a depth for each pixel, which grows away from the camera; null with DFB_IN_ORDER
@@ -116,26 +119,28 @@ typedef struct dfb_input {
     int has_straight_alpha; // 1: colours are not multiplied by alpha yet
     float far_depth;        // a pixel at this depth or beyond is empty; +infinity, in OpenGL 1
     // x0, y0, x1, y1: the part of the picture that the memory holds, [x0, x1) x [y0, y1). x counts from the left, y
-    // from the first row. Zeros: all of it. Another one without pixels: nothing to show.
+    // from the first row. All zeros: the whole picture. Any other empty part: nothing to show.
     int region[4];
-    // Pixels outside of this part of the picture are empty and not read; counted as `region`. All of it by default.
+    // Pixels outside of this part of the picture are empty and are not read. Coordinates as in `region`. Default: all
+    // of the picture.
     int valid[4];
 } dfb_input;
 
 #define dfb_input_init(input) dfb_input_init_sized(input, sizeof(dfb_input))
 void dfb_input_init_sized(dfb_input* input, size_t struct_size);
 
-// Makes one picture of the images of all ranks. `place`, with DFB_IN_ORDER: this rank's place in the order, 0 in front,
-// a different one on each rank; else, and for a rank with nothing to show, it does not matter. Null for `input`: this
-// rank could not make its image. The memory of the image is only read during the call. Collective; waits until the
-// picture is complete on the display rank. DFB_FRAME_FAILED on all ranks if the image of one is wrong or null.
+// Makes one picture of the images of all ranks. With DFB_IN_ORDER, `place` is this rank's place in the order: 0 is in
+// front, and each rank has a different one. Otherwise, and on a rank with nothing to show, `place` is ignored. A null
+// `input` means that this rank could not make its image. The memory of the image is only read during the call.
+// Collective; waits until the picture is complete on the display rank. DFB_FRAME_FAILED on all ranks if the image of
+// one is wrong or null.
 int dfb_composite(dfb_framebuffer* framebuffer, const dfb_input* input, int place);
 
 // ---- bricks of data that the ranks render
 
-// A convex part of the data, which overlaps no other, in an axis-aligned box of the program's unit of length.
+// A convex part of the data, which overlaps no other part, and its axis-aligned box, in the program's unit of length.
 typedef struct dfb_brick {
-    uint32_t id; // another one for each brick, over all ranks
+    uint32_t id; // a different one for each brick of all ranks
     float lower[3], upper[3];
 } dfb_brick;
 
@@ -151,15 +156,15 @@ typedef struct dfb_tile {
 
 // Fills those pixels of the tile whose rays meet the brick, as far as they are within its box. `brick` is the element
 // of the array that dfb_render() got. Returns 0, or another number if it failed: the picture fails on all ranks then,
-// with the brick and the number in the error. Called by the thread in dfb_render(), or with dfb_config::threads not 1
-// by several others at once. It must not call functions on the framebuffer.
+// with the brick and the number in the error. The thread that is in dfb_render() calls it; if dfb_config::threads is
+// not 1, several other threads call it at once. It must not call functions on the framebuffer.
 typedef int (*dfb_render_brick)(const dfb_brick* brick, const dfb_tile* tile, void* user);
 
 // Makes one picture of the bricks of all ranks. Calls render_brick(brick, tile, user) for each of this rank's `count`
 // bricks and each tile that it may cover; there may be none. The camera is a view matrix and a projection matrix,
 // perspective, off-axis or orthographic, column by column as OpenGL takes them; the numbers are rounded to floats. The
-// far plane cuts nothing off. Bricks and matrices are only read during the call, and are the program's to change before
-// the next. All ranks must give the same camera. Collective; waits until the picture is complete on the display rank.
+// far plane cuts nothing off. Bricks and matrices are read only during the call; the program may change them
+// afterwards. All ranks must give the same camera. Collective; waits until the picture is complete on the display rank.
 // DFB_FRAME_FAILED on all ranks if a renderer fails, or if bricks, matrices or pointers are wrong on one rank.
 // DFB_INVALID_ARGUMENT with DFB_IN_ORDER.
 int dfb_render(dfb_framebuffer* framebuffer, const dfb_brick* bricks, int count, const double view[16],
@@ -174,11 +179,11 @@ const uint8_t* dfb_image_rgba8(const dfb_framebuffer* framebuffer); // also for 
 const float* dfb_image_rgba32f(const dfb_framebuffer* framebuffer);
 const float* dfb_image_depth(const dfb_framebuffer* framebuffer);
 
-// Copies the picture to all ranks, where these functions return it then. Collective; waits for all ranks.
+// Copies the picture to all ranks. These functions then return it on each. Collective; waits for all ranks.
 int dfb_image_on_all_ranks(dfb_framebuffer* framebuffer);
 
-// The cost of the last picture that was made. Times are in milliseconds and of this rank, but for render_ms_max. The
-// other numbers are sums over all ranks.
+// The cost of the last picture that was made. Times are in milliseconds. They are of this rank, except for
+// render_ms_max. The other numbers are sums over all ranks.
 typedef struct dfb_report {
     int64_t frame;                  // its number
     double total_ms;                // from its begin to its end
@@ -191,7 +196,7 @@ typedef struct dfb_report {
     int64_t tiles_touched;          // of them, those that had an input
     int64_t non_finite_pixels;      // of inputs, with an infinity or NaN
     int64_t alpha_outside_pixels;   // of inputs, whose alpha is not within [0, 1]
-    int64_t order_undefined_pixels; // of the picture, where the depths of inputs said no order
+    int64_t order_undefined_pixels; // of the picture, where depths gave the inputs no order
     int64_t peak_memory_bytes;      // of messages and images, of the rank that has the most
     int threads;                    // that this rank worked with
 } dfb_report;

@@ -57,7 +57,8 @@ int guarded(const Body& body) noexcept
 
 [[noreturn]] void refuse(const std::string& text) { throw dfb::InvalidArgument(text); }
 
-// A struct of the program; throws InvalidArgument unless it is of the dfb.h that this was compiled with.
+// Returns a struct that the program gave. Throws InvalidArgument if its size is not that of the dfb.h that this was
+// compiled with.
 template <class Struct>
 const Struct& checked(const Struct* given, const char* name)
 {
@@ -70,7 +71,7 @@ const Struct& checked(const Struct* given, const char* name)
     return *given;
 }
 
-// ---- what the program gives, as the library has it
+// ---- the structs of dfb.h, converted to those of the library
 
 dfb::FrameBufferConfig configOf(const dfb_config& given)
 {
@@ -176,11 +177,11 @@ using BrickPicture =
 
 } // namespace
 
-// One connection for pictures of images and of bricks. The first kind is made at once, which compares the
-// configurations of the ranks; the second when it is needed.
+// Makes pictures of images and of bricks over one connection. The compositor of images is made at once, which compares
+// the configurations of the ranks; the framebuffer of bricks is made when it is first needed.
 struct dfb_framebuffer {
-    // Collective. `given` may be wrong, on any rank: all throw InvalidArgument then. So they do if one rank has no
-    // place to store the result at.
+    // Collective. All ranks throw InvalidArgument if `given` is wrong on any rank, or if any has no place to store the
+    // result at.
     dfb_framebuffer(std::shared_ptr<dfb::Connection> ranks, const dfb_config* given, bool hasPlace)
         : connection(std::move(ranks))
     {
@@ -196,7 +197,7 @@ struct dfb_framebuffer {
                 refuse("a timeout_ms of " + std::to_string(config.timeout_ms));
             frame.timeout = std::chrono::milliseconds(config.timeout_ms);
         } catch (const std::exception& e) {
-            // The library tells all ranks what an owner map has thrown on one.
+            // If an owner map throws on one rank, the library reports this on all ranks.
             frameBufferConfig = dfb::FrameBufferConfig(1, 1);
             frameBufferConfig.image.ownerMap = [text = reasonOf(e)](int, const dfb::TileLayout&, int) -> int {
                 throw std::invalid_argument(text);
@@ -234,7 +235,8 @@ struct dfb_framebuffer {
 
 namespace {
 
-// Calls body(framebuffer), which nothing may do while it is in another call, such as a renderer.
+// Calls body(framebuffer). It is an error if the framebuffer is in another call, as when a renderer calls a function on
+// it.
 template <class Body>
 int inFramebuffer(dfb_framebuffer* framebuffer, const Body& body) noexcept
 {
@@ -258,7 +260,7 @@ void newPicture(dfb_framebuffer& fb, bool showsBricks)
     fb.showsBricks = showsBricks;
 }
 
-// The picture that functions for one of its planes show; null if there is none.
+// The picture, for the functions that return its colour or depth; null if there is none.
 const dfb::Image* shownImage(const dfb_framebuffer* framebuffer)
 {
     if (!framebuffer || framebuffer->isBusy || framebuffer->image().empty())
@@ -313,7 +315,7 @@ int dfb_create(MPI_Comm communicator, const dfb_config* config, dfb_framebuffer*
 
 int dfb_create_fortran(MPI_Fint communicator, const dfb_config* config, dfb_framebuffer** framebuffer)
 {
-    int isInitialized = 0; // else the handle cannot be converted, and MPI_COMM_WORLD gets the error that says so
+    int isInitialized = 0; // if it is 0, the handle cannot be converted; create() then reports that
     MPI_Initialized(&isInitialized);
     return create(isInitialized ? MPI_Comm_f2c(communicator) : MPI_COMM_WORLD, config, framebuffer);
 }
